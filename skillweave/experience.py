@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """How one column of experience is joined with others, and which stores carry it."""
+    """Description of a column: how batches of it are joined, and which stores carry it."""
 
     fill: Any = 0
     """The value of rows that are not valid, and of environments without this column."""
@@ -31,7 +31,7 @@ class Column:
     rollout: bool = True
     """``Rollout`` has it."""
     raw: bool = False
-    """It says what happened, whoever learns from it; recorded only where a learner asks for it."""
+    """It is the same for every learner; recorded only where a learner needs it."""
 
 
 SCHEMA: dict[str, Column] = {
@@ -54,7 +54,7 @@ SCHEMA: dict[str, Column] = {
     "guide": Column(),  # (T, N, A) float32, logits of a ready selector's choice
     "overridden": Column(),  # (T, N) bool, a reflex acted instead of ``action``
     "call_start": Column(),  # (T, N) bool, a call starts here; for critics of skills
-    # What a skill's reward, termination and success are judged by again, later:
+    # To judge a skill's reward, termination and success again later:
     "env_reward": Column(raw=True),  # (T, N) float32, the environment's own
     "env_action": Column(raw=True, rollout=False),  # (T, N, …), in the environment's units
     "env_terminated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own end
@@ -63,16 +63,16 @@ SCHEMA: dict[str, Column] = {
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
 INFO = "info."
-"""The names of columns of ``info`` begin so, ``info.key``; they are recorded as raw columns are."""
+"""Prefix of the names of columns of ``info``: ``info.key``. They are recorded like raw columns."""
 
 
 def column(name: str) -> Column:
-    """Return a column of ``SCHEMA``, or that of a key of ``info``."""
+    """Return a column of ``SCHEMA``, or the column of a key of ``info``."""
     return Column(raw=True, rollout=False) if name.startswith(INFO) else SCHEMA[name]
 
 
 class Batch(Mapping[str, Array]):
-    """Columns of ``SCHEMA`` with the same lead axes (T, N): what one learner did.
+    """Columns of ``SCHEMA`` with the same lead axes (T, N): the rows of one learner.
 
     N = P·B: the environments of member 0 come first, then those of member 1, and so on. Where a
     valid row neither terminated nor was truncated, the next valid row of its environment, here or
@@ -104,13 +104,13 @@ class Batch(Mapping[str, Array]):
 
     @property
     def ended(self) -> Array:
-        """(T, N) bool, the trajectory ends here, by termination or truncation."""
+        """Rows (T, N) bool that end the trajectory, by termination or truncation."""
         ended: Array = self["terminated"] | self["truncated"]
         return ended
 
     @property
     def valid_rows(self) -> Array:
-        """(T, N) bool, rows of this learner."""
+        """Rows (T, N) bool of this learner."""
         valid = self.get("valid")
         return np.ones(self.lead, bool) if valid is None else valid
 
@@ -119,7 +119,7 @@ class Batch(Mapping[str, Array]):
         return Batch(**(self._columns | columns))
 
     def rows(self, part: slice) -> Batch:
-        """Return some of the T rows."""
+        """Return a slice of the T rows."""
         whole = {k: v if column(k).per_env else v[part] for k, v in self.items()}
         return Batch(**whole)
 
@@ -149,13 +149,13 @@ def _padded(x: Array, more: int) -> Array:
 
 
 def _joined(parts: list[Array | None], members: int, name: str) -> Array:
-    about = column(name)
-    axis = 0 if about.per_env else 1
+    described = column(name)
+    axis = 0 if described.per_env else 1
     example = next(part for part in parts if part is not None)
-    known = [np.full_like(example, about.fill) if p is None else p for p in parts]
-    if about.ragged:
-        known = padded_last_axis(known)
-    split = [x.reshape(*x.shape[:axis], members, -1, *x.shape[axis + 1 :]) for x in known]
+    filled = [np.full_like(example, described.fill) if p is None else p for p in parts]
+    if described.ragged:
+        filled = padded_last_axis(filled)
+    split = [x.reshape(*x.shape[:axis], members, -1, *x.shape[axis + 1 :]) for x in filled]
     whole = np.concatenate(split, axis + 1)
     return whole.reshape(*whole.shape[:axis], -1, *whole.shape[axis + 2 :])
 
@@ -197,14 +197,14 @@ class Rollout:
     guide: Tensor | None = None  # (P, T, B, A), logits of a ready selector's choice
     overridden: Tensor | None = None  # (P, T, B) bool, a reflex acted instead; None: nowhere
     call_start: Tensor | None = None  # (P, T, B) bool, a call starts here; for critics of skills
-    env_reward: Tensor | None = None  # (P, T, B), the environment's own, where it was asked for
-    reference: Reference | None = None  # the policy to stay near
+    env_reward: Tensor | None = None  # (P, T, B), the environment's own, where it is needed
+    reference: Reference | None = None  # the policy that the learner stays near
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
 
 @dataclass(slots=True)
 class Reference:
-    """The policy that a learner is to stay near."""
+    """The reference policy that a learner stays near."""
 
     params: Any | None  # ``ActingParams`` of P members; None: ``Rollout.guide`` is its choice
     coef: Tensor  # (P,), the cost of one nat of KL from it
@@ -228,13 +228,13 @@ class Sample:
     next_mask: Tensor | None  # (P, B, A) bool, allowed actions in ``next_obs``; None: all
     weight: Tensor | None  # (P, B) float32, importance weights; None where drawn uniformly
     index: Array  # (P, B) int64, which transitions these are, to give them new priorities
-    # Where an algorithm asks for them, the n − 1 observations between ``obs`` and ``next_obs``:
+    # Where an algorithm needs them, the n − 1 observations between ``obs`` and ``next_obs``:
     between_obs: Tensor | None = None  # (P, B, n − 1, *obs_shape)
     between_mask: Tensor | None = None  # (P, B, n − 1, A) bool, allowed actions; None: all
     between_discount: Tensor | None = None
     """(P, B, n − 1), the factor of a reward there: γ^Στ, or 0 where the rows ended before."""
     env_reward: Tensor | None = None
-    """(P, B) the environment's own in the first row, where it was asked for."""
+    """(P, B) the environment's own in the first row, where it is needed."""
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
     def split(self, batch: int) -> Iterator[Sample]:

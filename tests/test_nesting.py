@@ -455,7 +455,7 @@ WRONG = {
     "a reserved name": (lambda: declare(inside(name="selector")), "'selector', which names"),
     "no end": (
         lambda: declare(call_steps=None),
-        "skill 'inner' never stops|skill 'left'",
+        "skill 'inner' never ends|skill 'left'",
     ),
     "lengths of zero": (
         lambda: declare(inside().as_skill(call_steps=0)),

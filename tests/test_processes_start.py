@@ -60,7 +60,7 @@ def test_a_plain_script_trains_in_one_process_where_others_would_run_it_again(na
     said = run_program(tmp_path, ENV + method(name) + TRAIN.format(env="Slow"))
     assert "64 of 64 steps (100%)" in said
     assert said.count("__name__ == '__main__'") == 1
-    assert "EnvSpec(workers=2) asks for processes" in said
+    assert "EnvSpec(workers=2) uses processes" in said
     assert processes_in(tmp_path) == 1
 
 

@@ -72,5 +72,5 @@ class _FlatLearner(OneAgent):
             skill_scene(self._flat.spec), self.stage.seeds,
             manifest["eval_every"], manifest["eval_episodes"], self.stage.config.num_envs,
         )  # fmt: skip
-        self._open.callback(self.evaluation.close)
+        self._resources.callback(self.evaluation.close)
         return fresh

@@ -1,1 +1,1 @@
-"""Buffers: what was collected, in the form that algorithms learn from."""
+"""Buffers: stores of experience for on-policy learners and for replay."""

@@ -1,4 +1,4 @@
-"""Columns: what a replay store keeps of N environments, each observation once."""
+"""Storage of replayed transitions in columns, one for each environment; no observation twice."""
 
 from __future__ import annotations
 
@@ -18,28 +18,31 @@ from skillweave.experience import Batch
 from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array
 
-NOTHING, GOES_ON, TERMINATED = 0, 1, 2  # what lies in a slot; after GOES_ON the value counts
-INTEGERS = (np.uint8, np.int16, np.int32)  # what files can hold
+# Content of a slot. The value of the successor counts after GOES_ON, not after TERMINATED.
+NOTHING = 0
+GOES_ON = 1
+TERMINATED = 2
+INTEGERS = (np.uint8, np.int16, np.int32)  # types that checkpoint files can hold
 OPTIONAL = ("steps", "mask", "call")
 
 
 class Columns:
     """N rings of slots, one for each environment; the oldest transitions make room.
 
-    A slot holds an observation and what was done there; the next slot of its column holds what
-    followed. Where a trajectory ended, that is a boundary: a slot with the true successor alone,
-    and the next trajectory begins behind it. The newest slot of a column is a boundary, too, until
-    the trajectory goes on. Slots are numbered ``row · N + column``.
+    A slot holds an observation and the action taken there; the next slot of its column holds the
+    successor. Where a trajectory ended, that next slot is a boundary: it holds only the true
+    successor, and the next trajectory starts behind it. The newest slot of a column is a boundary,
+    too, until the trajectory goes on. Slots are numbered ``row · N + column``.
 
     Args:
         mask_size: number of discrete actions.
         each: bytes that every transition takes elsewhere.
-        keep_rewards: of calls, keep the reward of every step, so that any γ can be applied.
-        raw: names of raw columns of ``SCHEMA`` that are kept, too, as they come.
+        keep_rewards: store the reward of every step of a call, so that any γ can be applied.
+        raw: names of raw columns of ``SCHEMA`` that are stored unchanged, too.
 
     Raises:
-        TrainingError: it is larger than the free memory.
-        DeclarationError: it holds not even one row.
+        TrainingError: the storage is larger than the free memory.
+        DeclarationError: the capacity is less than one row.
     """
 
     def __init__(
@@ -62,35 +65,42 @@ class Columns:
         action = np.dtype(action_dtype)
         if mask_size is not None and action.kind in "iu":
             action = np.dtype(next(k for k in INTEGERS if mask_size - 1 <= np.iinfo(k).max))
-        item, shape = obs_dtype(observation_space), obs_shape(observation_space)
+        item = obs_dtype(observation_space)
+        shape = obs_shape(observation_space)
         kinds: dict[str, tuple[tuple[int, ...], Any]] = {
-            "obs": (shape, item), "action": (action_shape, action),
-            "reward": ((), np.float32), "kind": ((), np.uint8),
-        }  # fmt: skip
+            "obs": (shape, item),
+            "action": (action_shape, action),
+            "reward": ((), np.float32),
+            "kind": ((), np.uint8),
+        }
         each += sum(int(np.prod(s)) * np.dtype(d).itemsize for s, d in kinds.values())
-        each += 12 * keep_rewards  # where a call's rewards are, and at least one of them
+        each += 12 * keep_rewards  # the place of a call's rewards, and at least one of them
         what = f"a replay buffer of {capacity:,} transitions of {shape} {item}"
         check_memory(capacity, each, what, "buffer_size")
-        self.num_envs, self.rows = num_envs, capacity // num_envs + 1
+        self.num_envs = num_envs
+        self.rows = capacity // num_envs + 1
         self.slots = self.rows * num_envs
-        # By slot. "steps" comes with the first call not of 1 step, "mask" (bits) with a mask.
+        # By slot. The first call of several steps adds "steps"; the first mask adds "mask" (bits).
         self.data = {k: np.zeros((self.slots, *s), d) for k, (s, d) in kinds.items()}
         self.newest = np.full(num_envs, -1)
-        """(N,) the newest slot of each column, counted from its first one ever."""
+        """(N,) the newest slot of each column, counted from the first in the run."""
         self._column = np.arange(num_envs)
-        self._open = np.zeros(num_envs, bool)  # the trajectory goes on there
-        self._space, self._mask_size = observation_space, mask_size or 0
-        self._keeps_rewards, self.raw = keep_rewards, tuple(raw)
-        # The rewards of calls one after another; "call" says where those of a slot begin.
-        self._rewards, self._rewards_used = np.zeros(64 * keep_rewards, np.float32), 0
+        self._open = np.zeros(num_envs, bool)  # True where the trajectory goes on
+        self._space = observation_space
+        self._mask_size = mask_size or 0
+        self._keeps_rewards = keep_rewards
+        self.raw = tuple(raw)
+        # The rewards of calls one after another; "call" holds the first place of a slot's rewards.
+        self._rewards = np.zeros(64 * keep_rewards, np.float32)
+        self._rewards_used = 0
 
     @property
     def nbytes(self) -> int:
-        """Bytes that are reserved; what was never written takes no memory yet."""
+        """Number of reserved bytes; unwritten slots take no memory yet."""
         return sum(a.nbytes for a in (*self.data.values(), self._rewards))
 
     def used(self, first: int = 0, count: int | None = None) -> int:
-        """Rows that are written, of the longest of ``count`` columns from ``first`` on."""
+        """Return the rows written in the longest of ``count`` columns from ``first`` on."""
         last = None if count is None else first + count
         return min(int(self.newest[first:last].max()) + 1, self.rows)
 
@@ -98,60 +108,63 @@ class Columns:
         """Append rows.
 
         Returns:
-            In the order of time, the slots of new transitions and those of their successors, of
-            which some are transitions as well and the others boundaries; both (k,).
+            In the order of time, the slots of new transitions and the slots of their successors,
+            both (k,). A successor is another transition or a boundary.
         """
         most = self.rows // 2  # a row takes at most two slots
-        return [self._add(part) for part in _parts(batch, most)]
+        return [self._add(part) for part in _split_rows(batch, most)]
 
     def cut(self, columns: Array) -> None:
-        """End the open trajectories of ``columns`` (k,), whose environments begin anew."""
+        """End the open trajectories of ``columns`` (k,), whose environments were reset."""
         self._open[columns] = False
 
     def after(self, slot: Array) -> Array:
-        """The next slots of the columns of ``slot``."""
-        found: Array = slot + self.num_envs
-        found -= self.slots * (found >= self.slots)
-        return found
+        """Return the next slots of the columns of ``slot``."""
+        following: Array = slot + self.num_envs
+        following -= self.slots * (following >= self.slots)
+        return following
 
     def number(self, slot: Array) -> Array:
-        """The numbers of what lies in ``slot``, counted from the first ever; modulo ``slots``."""
+        """Return running numbers of the contents of ``slot``, counted from the run's first slot.
+
+        A number modulo ``slots`` is the slot.
+        """
         row = slot // self.num_envs
         laps = (self.newest.take(slot - row * self.num_envs) - row) // self.rows
-        found: Array = slot + laps * self.slots
-        return found
+        number: Array = slot + laps * self.slots
+        return number
 
     def reward(self, gamma: Array, slot: Array) -> Array:
-        """Rewards of transitions (P, B), float32; of calls Σγᵏrₖ."""
+        """Return rewards of transitions (P, B), float32; of calls Σγᵏrₖ."""
         if "call" not in self.data:
             return self.data["reward"].take(slot)
-        where, steps = self._places(slot.ravel())
-        begins = steps.cumsum() - steps
-        power = np.arange(len(where)) - begins.repeat(steps)
+        places, steps = self._places(slot.ravel())
+        offsets = steps.cumsum() - steps
+        power = np.arange(len(places)) - offsets.repeat(steps)
         factor = np.broadcast_to(np.float64(gamma), slot.shape).ravel().repeat(steps)
-        each = factor**power * self._rewards.take(where)
-        found: Array = np.add.reduceat(each, begins).reshape(slot.shape).astype(np.float32)
-        return found
+        each = factor**power * self._rewards.take(places)
+        reward: Array = np.add.reduceat(each, offsets).reshape(slot.shape).astype(np.float32)
+        return reward
 
     def power(self, gamma: Array, slot: Array) -> Array:
-        """γ^τ of transitions (P, B)."""
+        """Return γ^τ of transitions (P, B)."""
         if "steps" not in self.data:
             return np.broadcast_to(gamma, slot.shape)
         return np.asarray(gamma ** self.data["steps"].take(slot))
 
     def mask(self, slot: Array) -> Array | None:
-        """The actions allowed in the observations of ``slot``, (…, A) bool; None: all, always."""
+        """Return the actions allowed in ``slot``, (…, A) bool; None: no mask was ever stored."""
         if "mask" not in self.data:
             return None
         bits = self.data["mask"].take(slot, axis=0)
         return np.unpackbits(bits, axis=-1, count=self._mask_size).view(bool)
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from what ``written`` gave, of columns that were made with the same arguments.
+        """Restore the arrays that ``written`` of columns with the same arguments returned.
 
         Raises:
-            RunError: it is of other settings.
-            ValueError: a number in it is none that is written here.
+            RunError: the arrays belong to other settings.
+            ValueError: a number is out of range.
         """
         self.data["kind"][:] = NOTHING
         for name in OPTIONAL:
@@ -169,17 +182,18 @@ class Columns:
         check_columns(self.written(), self._space, self._mask_size)
 
     def written(self) -> dict[str, Array]:
-        """Views of all that was written, by name."""
+        """Return views of all that was written, by name."""
         used = self.used() * self.num_envs
-        found = {name: array[:used] for name, array in self.data.items()}
-        if "call" in found:
-            found["rewards"] = self._rewards[: self._rewards_used]
-        return found | {"newest": self.newest, "open": self._open}
+        views = {name: array[:used] for name, array in self.data.items()}
+        if "call" in views:
+            views["rewards"] = self._rewards[: self._rewards_used]
+        return views | {"newest": self.newest, "open": self._open}
 
     def _add(self, rows: Batch) -> tuple[Array, Array]:
-        """Append rows of which each column has room for all."""
-        data, valid, slot = self.data, rows.get("valid"), self._claim(rows)
-        mask, next_mask = rows.get("mask"), rows.get("next_mask")
+        """Append rows that fit into each column at once."""
+        data = self.data
+        valid, mask, next_mask = rows.get("valid"), rows.get("mask"), rows.get("next_mask")
+        slot = self._claim(rows)
         after = self.after(slot)
 
         def flat(x: Array) -> Array:
@@ -192,46 +206,50 @@ class Columns:
         if "mask" not in data and not (mask is None and next_mask is None):
             self._start("mask")
         # Where a trajectory goes on, a successor's slot is that of the next transition as well.
-        data["obs"][after], data["kind"][after] = flat(rows["next_obs"]), NOTHING
+        data["obs"][after] = flat(rows["next_obs"])
+        data["kind"][after] = NOTHING
         data["obs"][slot] = flat(rows["obs"])
-        data["action"][slot], data["reward"][slot] = flat(rows["action"]), flat(rows["reward"])
+        data["action"][slot] = flat(rows["action"])
+        data["reward"][slot] = flat(rows["reward"])
         if "steps" in data:
             data["steps"][slot] = flat(rows["steps"])
         if "call" in data:
-            data["kind"][slot] = NOTHING  # what is overwritten needs its rewards no more
+            data["kind"][slot] = NOTHING  # overwritten transitions need their rewards no more
             each = rows["rewards"] if "rewards" in rows else rows["reward"][..., None]
-            self._keep_rewards(slot, flat(each), flat(rows["steps"]))
+            self._store_rewards(slot, flat(each), flat(rows["steps"]))
         for name in (name for name in self.raw if name in rows):
             if name not in data:
                 self._start_raw(name, flat(rows[name]))
             data[name][slot] = flat(rows[name])
         if "mask" in data:
-            for where, x in (after, next_mask), (slot, mask):
-                data["mask"][where] = 255 if x is None else np.packbits(flat(x), axis=-1)
+            for slots, x in (after, next_mask), (slot, mask):
+                data["mask"][slots] = 255 if x is None else np.packbits(flat(x), axis=-1)
         data["kind"][slot] = GOES_ON + flat(rows["terminated"])
         return slot, after
 
     def _claim(self, rows: Batch) -> Array:
-        """The slots (k,) that valid rows take, in the order of time; moves the newest ones on."""
+        """Reserve slots (k,) for the valid rows, in the order of time."""
         valid, ended = rows.get("valid"), rows.ended
         place = (self.newest + ~self._open)[None]
         if len(ended) > 1:  # a slot for each row before, and for each end before
             before = np.ones_like(ended) if valid is None else valid
-            taken = before + (ended & before).astype(np.int64)
-            place = place + taken.cumsum(0) - taken
+            slots_needed = before + (ended & before).astype(np.int64)
+            place = place + slots_needed.cumsum(0) - slots_needed
         slot: Array = place % self.rows * self.num_envs + self._column
         if valid is None:
-            self.newest, self._open = place[-1] + 1, ~ended[-1]
+            self.newest = place[-1] + 1
+            self._open = ~ended[-1]
             return slot.ravel()
         column = np.flatnonzero(valid.any(0))
         last = len(valid) - 1 - valid[::-1, column].argmax(0), column
-        self.newest[column], self._open[column] = place[last] + 1, ~ended[last]
+        self.newest[column] = place[last] + 1
+        self._open[column] = ~ended[last]
         return slot[valid]
 
     def _start(self, name: str) -> None:
-        """Begin to store "steps", "mask" or "call".
+        """Start to store "steps", "mask" or "call".
 
-        Everything so far was of 1 step, allowed all, and had the reward of one step.
+        Every row so far had 1 step, allowed all actions, and had the reward of one step.
         """
         if name == "steps":
             self.data[name] = np.ones(self.slots, np.float32)
@@ -239,22 +257,25 @@ class Columns:
             assert self._mask_size, "masks need a mask_size"
             self.data[name] = np.full((self.slots, -(-self._mask_size // 8)), 255, np.uint8)
         else:
-            self.data[name], self._rewards_used = np.zeros(self.slots, np.int64), 0
-            kept = self.data["kind"].nonzero()[0]
-            self._keep_rewards(kept, self.data["reward"][kept, None], np.ones(len(kept), np.int64))
+            self.data[name] = np.zeros(self.slots, np.int64)
+            self._rewards_used = 0
+            slots = self.data["kind"].nonzero()[0]
+            self._store_rewards(
+                slots, self.data["reward"][slots, None], np.ones(len(slots), np.int64)
+            )
 
     def _start_raw(self, name: str, like: Array) -> None:
-        """Begin to store a raw column, of the shape and type of ``like`` (k, …).
+        """Start to store a raw column, of the shape and type of ``like`` (k, …).
 
         Raises:
-            TrainingError: it takes more than the free memory.
+            TrainingError: the column needs more than the free memory.
         """
         each = like.dtype.itemsize * math.prod(like.shape[1:])
         check_memory(self.slots, each, f"the column {name!r} of a replay buffer", "buffer_size")
         self.data[name] = np.zeros((self.slots, *like.shape[1:]), like.dtype)
 
-    def _keep_rewards(self, slot: Array, rewards: Array, steps: Array) -> None:
-        """Append the rewards (k, longest) of calls of ``steps`` (k,); none after those given."""
+    def _store_rewards(self, slot: Array, rewards: Array, steps: Array) -> None:
+        """Append the rewards (k, longest) of calls of ``steps`` (k,); missing ones are 0."""
         needed = int(steps.sum())
         if self._rewards_used + needed > len(self._rewards):
             self._compact(needed)
@@ -267,27 +288,28 @@ class Columns:
         self._rewards_used = end
 
     def _compact(self, needed: int) -> None:
-        """Drop the rewards of calls that were overwritten; grow where half are still needed."""
+        """Drop the rewards of overwritten calls; grow if more than half of the room is in use."""
         live = self.data["kind"].nonzero()[0] if self._rewards_used else np.zeros(0, np.int64)
-        where, steps = self._places(live)
-        size = 1 << (2 * (len(where) + needed) - 1).bit_length()
+        places, steps = self._places(live)
+        size = 1 << (2 * (len(places) + needed) - 1).bit_length()
         if size > len(self._rewards):
             what = f"the replay buffer's room for the rewards of {size:,} steps of calls"
             check_memory(size, 4, what, "buffer_size")
-        kept = np.zeros(max(size, len(self._rewards)), np.float32)
-        kept[: len(where)] = self._rewards[where]
+        rewards = np.zeros(max(size, len(self._rewards)), np.float32)
+        rewards[: len(places)] = self._rewards[places]
         self.data["call"][live] = steps.cumsum() - steps
-        self._rewards, self._rewards_used = kept, len(where)
+        self._rewards = rewards
+        self._rewards_used = len(places)
 
     def _places(self, slot: Array) -> tuple[Array, Array]:
-        """Where the rewards of calls (k,) are, one call after another, and their steps (k,)."""
+        """Return the places of the rewards of calls (k,), call after call, and their steps (k,)."""
         steps = self.data["steps"].take(slot).astype(np.int64)
-        begins = steps.cumsum() - steps
-        where = (self.data["call"].take(slot) - begins).repeat(steps)
-        return where + np.arange(len(where)), steps
+        offsets = steps.cumsum() - steps
+        first = (self.data["call"].take(slot) - offsets).repeat(steps)
+        return first + np.arange(len(first)), steps
 
 
-def _parts(batch: Batch, most: int) -> list[Batch]:
+def _split_rows(batch: Batch, most: int) -> list[Batch]:
     """Cut a batch into parts of at most ``most`` rows."""
     rows, _ = batch.lead
     if 0 < rows <= most:
@@ -296,14 +318,15 @@ def _parts(batch: Batch, most: int) -> list[Batch]:
 
 
 def copy_into(arrays: dict[str, Array], state: dict[str, Tensor]) -> None:
-    """Write what a checkpoint holds into arrays of the same shapes and types."""
+    """Copy the tensors of a checkpoint into arrays of the same shapes and types."""
     for name, array in arrays.items():
-        into, kept = to_tensor(array), state.get(name)
-        if kept is None or kept.shape != into.shape or kept.dtype != into.dtype:
-            found = "missing" if kept is None else f"{kept.dtype} {tuple(kept.shape)}"
+        into = to_tensor(array)
+        stored = state.get(name)
+        if stored is None or stored.shape != into.shape or stored.dtype != into.dtype:
+            actual = "missing" if stored is None else f"{stored.dtype} {tuple(stored.shape)}"
             raise RunError(
-                f"the checkpoint's replay buffer does not fit: {name!r} is {found}, where "
-                f"{into.dtype} {tuple(into.shape)} belongs; go on with the settings that it was "
-                "written with, or begin a new run"
+                f"the checkpoint's replay buffer does not fit: {name!r} is {actual}, where "
+                f"{into.dtype} {tuple(into.shape)} belongs; continue with the settings that it was "
+                "written with, or start a new run"
             )
-        into.copy_(kept)
+        into.copy_(stored)

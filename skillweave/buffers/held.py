@@ -1,4 +1,4 @@
-"""Whether rows that a checkpoint holds, of either store, can be learnt from."""
+"""Checks of the rows that a checkpoint holds, of either store, before a learner uses them."""
 
 from __future__ import annotations
 
@@ -14,24 +14,32 @@ from skillweave.spaces import ActionCodec, ObsCodec, obs_codec, obs_dtype, obs_s
 from skillweave.types import Array
 
 DTYPES = {
-    "reward": torch.float32, "steps": torch.int64, "terminated": torch.bool, "last": torch.bool,
-    "valid": torch.bool, "advantage": torch.float32, "episode_start": torch.bool,
-    "overridden": torch.bool, "call_start": torch.bool, "mask": torch.bool,
-    "dist_params": torch.float32, "guide": torch.float32, "recurrent_state": torch.float32,
-    "log_std": torch.float32, "env_reward": torch.float32,
-}  # fmt: skip
-"""Of all fields but observations and actions."""
+    "reward": torch.float32,
+    "steps": torch.int64,
+    "terminated": torch.bool,
+    "last": torch.bool,
+    "valid": torch.bool,
+    "advantage": torch.float32,
+    "episode_start": torch.bool,
+    "overridden": torch.bool,
+    "call_start": torch.bool,
+    "mask": torch.bool,
+    "dist_params": torch.float32,
+    "guide": torch.float32,
+    "recurrent_state": torch.float32,
+    "log_std": torch.float32,
+    "env_reward": torch.float32,
+}
+"""Types of all fields but observations and actions."""
 NEEDED = {"obs", "next_obs", "action", "reward", "steps", "terminated", "last", "valid"}
 ONE_ROW = ("recurrent_state", "log_std")
-"""Fields that have one row, however many there are of the others."""
+"""Fields that have one row, whatever the number of rows of the others."""
 VECTORS = ("mask", "dist_params", "guide", *ONE_ROW)
 """Fields that have several numbers for each row."""
-
-
 LARGEST_STEPS = 2**31
-"""No row has as many."""
+"""Upper limit of a row's steps, exclusive."""
 SLICE = 1 << 16
-"""Rows of a replay buffer that are looked at at once, so that no copy of all is made."""
+"""Rows of a replay buffer that are checked at once, so that no copy of all is made."""
 
 
 def check_held(
@@ -40,18 +48,19 @@ def check_held(
     observation_space: gym.Space[Any],
     codec: ActionCodec,
 ) -> None:
-    """Raise a ValueError where rows do not fit together, or into the spaces of who learns.
+    """Raise a ValueError where rows do not fit together, or into the learner's spaces.
 
     Args:
-        held: of each experience, fields (P, T, B, …).
+        held: the fields (P, T, B, …) of each batch.
         members: P.
-        codec: of the actions.
+        codec: the codec of the actions.
     """
     obs = to_tensor(np.zeros((1, *obs_shape(observation_space)), obs_dtype(observation_space)))
-    seen = obs_codec(observation_space)
+    observations = obs_codec(observation_space)
     for rows in held:
-        # Where all actions are allowed, an experience has no mask.
-        names, first = rows.keys() - {"mask"}, held[0].keys() - {"mask"}
+        # A batch in which all actions are allowed has no mask.
+        names = rows.keys() - {"mask"}
+        first = held[0].keys() - {"mask"}
         if names != first or not NEEDED <= names <= NEEDED | DTYPES.keys():
             raise ValueError(f"its rows hold {', '.join(sorted(rows))}")
         lead = rows["valid"].shape
@@ -60,20 +69,22 @@ def check_held(
         for name, x in rows.items():
             _check_field(name, x, lead, obs, codec)
         for name in ("obs", "next_obs"):
-            seen.check(rows[name])
+            observations.check(rows[name])
         codec.check(rows["action"])
         steps = rows["steps"]
         if not bool(((steps >= 1) & (steps < LARGEST_STEPS)).all()):
-            raise ValueError("a row of it took no step, or more than there are")
+            raise ValueError("a row of it has less than 1 step, or too many")
 
 
 def _check_field(
     name: str, x: Tensor, lead: tuple[int, ...], obs: Tensor, codec: ActionCodec
 ) -> None:
-    """Dtype, shape, and that all are numbers."""
-    dtype, item = DTYPES.get(name), tuple(x.shape[3:]) if name in VECTORS else ()
+    """Check a field's dtype and shape, and that its numbers are finite."""
+    dtype = DTYPES.get(name)
+    item = tuple(x.shape[3:]) if name in VECTORS else ()
     if name in ("obs", "next_obs"):
-        dtype, item = obs.dtype, tuple(obs.shape[1:])
+        dtype = obs.dtype
+        item = tuple(obs.shape[1:])
     elif name == "action":
         dtype = torch.int64 if codec.discrete else torch.float32
         width = len(codec.parts) if codec.discrete else codec.size
@@ -93,34 +104,38 @@ def check_columns(
     """Raise a ValueError where numbers of a replay buffer are out of range.
 
     Args:
-        written: as of ``Columns.written``.
-        actions: how many there are; 0: they are no numbers of actions.
+        written: the result of ``Columns.written``.
+        actions: the number of discrete actions; 0: actions are continuous.
     """
-    w, steps = written, written.get("steps", np.ones(1))
-    action, newest, held = w["action"], w["newest"], w["kind"] > 0
-    some = held.reshape(-1, len(newest)).any(0)  # of each column
-    checks = [
-        ("kind", (w["kind"] <= 2).all() and (some == (newest >= 0)).all()),
-        ("newest", ((newest >= -1) & (newest < 2**53)).all()),
-        ("action", not actions or action.dtype.kind not in "iu"
-         or ((action >= 0) & (action < actions)).all()),
-        ("steps", ((steps >= 1) & (steps < LARGEST_STEPS)).all()),
-        *((name, np.isfinite(x).all())
-          for name, x in w.items() if x.dtype.kind == "f" and name != "obs"),
-    ]  # fmt: skip
-    if "call" in w:
-        call, room = w["call"][held], len(w["rewards"])
-        checks.append(("call", ((call >= 0) & (call + steps[held] <= room)).all()))
-    if wrong := [name for name, right in checks if not right]:
+    steps = written.get("steps", np.ones(1))
+    kind, action, newest = written["kind"], written["action"], written["newest"]
+    transition = kind > 0
+    filled = transition.reshape(-1, len(newest)).any(0)  # (N,), columns with a transition
+    in_range = {
+        "kind": (kind <= 2).all() and (filled == (newest >= 0)).all(),
+        "newest": ((newest >= -1) & (newest < 2**53)).all(),
+        "action": not actions
+        or action.dtype.kind not in "iu"
+        or ((action >= 0) & (action < actions)).all(),
+        "steps": ((steps >= 1) & (steps < LARGEST_STEPS)).all(),
+    }
+    for name, x in written.items():
+        if x.dtype.kind == "f" and name != "obs":
+            in_range[name] = in_range.get(name, True) and np.isfinite(x).all()
+    if "call" in written:
+        call = written["call"][transition]
+        room = len(written["rewards"])
+        in_range["call"] = ((call >= 0) & (call + steps[transition] <= room)).all()
+    if wrong := [name for name, right in in_range.items() if not right]:
         raise ValueError(f"{wrong[0]!r} of its replay buffer is out of range")
-    _check_observations(w["obs"], newest, obs_codec(observation_space))
+    _check_observations(written["obs"], newest, obs_codec(observation_space))
 
 
 def _check_observations(obs: Array, newest: Array, codec: ObsCodec) -> None:
-    """Look at the observations of slots that were written to."""
+    """Check the observations of the slots that were written."""
     if not codec.may_be_wrong:
         return
-    rows = np.arange(len(obs) // len(newest))[:, None] <= newest
+    is_written = np.arange(len(obs) // len(newest))[:, None] <= newest
     for first in range(0, len(obs), SLICE):
         part = slice(first, first + SLICE)
-        codec.check(to_tensor(obs[part][rows.ravel()[part]]))
+        codec.check(to_tensor(obs[part][is_written.ravel()[part]]))

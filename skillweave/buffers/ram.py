@@ -1,4 +1,4 @@
-"""Checks of free memory before something large is made."""
+"""Checks of free memory before a large allocation."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-PROCESSES, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-"""Files of Linux with its memory, and with the limits of groups of processes."""
+PROCESSES = Path("/proc")
+GROUPS = Path("/sys/fs/cgroup")
+"""Folders of Linux with the memory of processes, and with the limits of control groups."""
 FILES = {
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     2: ("memory.max", "memory.current", "inactive_file"),
@@ -37,25 +38,25 @@ def check_memory(count: int, each: int, what: str, lower: str) -> None:
 
 
 def free_memory() -> int | None:
-    """Bytes that this process can still get at most, or None where the system does not say.
+    """Return the bytes that this process can still get, or None where the system reports none.
 
     In a container, or in a job of a cluster, that is often less than the machine has.
     """
-    known = [free for free in (_of_machine(), *_of_groups(), _of_process()) if free is not None]
-    return min(known, default=None)
+    limits = [free for free in (_of_machine(), *_of_groups(), _of_process()) if free is not None]
+    return min(limits, default=None)
 
 
 def _of_machine() -> int | None:
-    """Bytes that the machine can still give."""
-    if found := re.search(r"MemAvailable: *(\d+) kB", _text(PROCESSES / "meminfo")):
-        return int(found[1]) * 1024
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):  # macOS: all that it has
+    """Return the bytes that the machine can still give."""
+    if match := re.search(r"MemAvailable: *(\d+) kB", _text(PROCESSES / "meminfo")):
+        return int(match[1]) * 1024
+    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):  # macOS: all its memory
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return None
 
 
 def _of_groups() -> Iterator[int]:
-    """Yield what each control group that this process is in can still give (cgroups 1 and 2)."""
+    """Yield the bytes that each control group of this process can still give (cgroups 1, 2)."""
     for line in _text(PROCESSES / "self" / "cgroup").splitlines():
         _, kinds, name = line.split(":", 2)
         if kinds and "memory" not in kinds.split(","):
@@ -80,7 +81,7 @@ def _of_group(group: Path, names: tuple[str, str, str]) -> int | None:
 
 
 def _of_process() -> int | None:
-    """Bytes that ``ulimit -v`` leaves."""
+    """Return the bytes that ``ulimit -v`` leaves."""
     pages = _text(PROCESSES / "self" / "statm").split()
     if resource is None or not pages:
         return None
@@ -91,7 +92,7 @@ def _of_process() -> int | None:
 
 
 def _text(file: Path) -> str:
-    """Return what a file says; nothing where it is not there."""
+    """Return the text of a file; "" where it does not exist."""
     try:
         return file.read_text("utf-8")
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The rollout store: an on-policy learner's own rows, until it learns from them."""
+"""The rollout store: the rows of an on-policy learner until its next update."""
 
 from __future__ import annotations
 
@@ -16,37 +16,38 @@ from skillweave.types import Array, unprefixed
 
 
 class RolloutStore:
-    """Takes experience and gives it away once, as a ``Rollout``.
+    """Store of batches until a ``Rollout`` of them is taken, once.
 
-    N = P·B columns as in ``Experience``. In a rollout the valid rows of a column come first, one
-    after another. Where several experiences are collected, they lie side by side, as further
-    columns. Columns without a valid row are left out. Rows that are not valid repeat a valid one of
-    their member, so nothing there is out of range, and no NaN of a member that has diverged.
+    The store has N = P·B columns as in ``Batch``. In a rollout the valid rows of a column come
+    first. Several batches stand side by side, as further columns. Columns without a valid row are
+    left out. Rows that are not valid repeat a valid row of their member, so their values are in
+    range, and no NaN of a diverged member reaches the others.
 
     Args:
         members: P.
-        quota: valid rows that every member must have before it learns; 0: learn from each
-            experience.
+        quota: valid rows that every member must have before it learns; 0: learn from each batch.
         device: of the rollouts.
     """
 
     def __init__(self, members: int, quota: int = 0, device: str | torch.device = "cpu") -> None:
-        self._members, self._quota, self._device = members, quota, torch.device(device)
-        self._held: list[dict[str, Tensor]] = []  # columns (P, T, B, …)
+        self._members = members
+        self._quota = quota
+        self._device = torch.device(device)
+        self._batches: list[dict[str, Tensor]] = []  # columns (P, T, B, …)
 
     def add(self, batch: Batch, log_std: Tensor | None = None) -> None:
-        """Store a batch until it is learnt from.
+        """Store a batch until the next update.
 
         Arrays of one member are not copied: they must stay as they are until then.
 
         Args:
-            log_std: (P, 1, 1, A), of who acted in it, where it is no part of ``dist_params``.
+            log_std: (P, 1, 1, A), of the acting policy, where it is no part of ``dist_params``.
         """
         valid, last = batch.valid_rows, batch.ended
         if not valid.any():
             return
-        kept = {k: x for k, x in batch.items() if column(k).rollout}
-        rows = {k: x for k, x in kept.items() if not column(k).per_env}
+        columns = {k: x for k, x in batch.items() if column(k).rollout}
+        rows = {k: x for k, x in columns.items() if not column(k).per_env}
         rows |= {"last": last, "valid": valid}
         del rows["truncated"]
         if valid.all():
@@ -57,12 +58,12 @@ class RolloutStore:
             filled = np.flatnonzero(valid[0])
             rows["last"][valid.sum(0)[filled] - 1, filled] = True
             rows |= {"last": rows["last"] & valid, "valid": valid}
-        held = {k: self._by_member(x) for k, x in rows.items()}
-        for name in kept.keys() - rows.keys() - {"truncated"}:
-            held[name] = self._by_member(kept[name][None])
+        fields = {k: self._by_member(x) for k, x in rows.items()}
+        for name in columns.keys() - rows.keys() - {"truncated"}:
+            fields[name] = self._by_member(columns[name][None])
         if log_std is not None:
-            held["log_std"] = log_std
-        self._held.append(held)
+            fields["log_std"] = log_std
+        self._batches.append(fields)
 
     def rollout(
         self,
@@ -70,101 +71,110 @@ class RolloutStore:
         progress: float = 0.0,
         reference: Reference | None = None,
     ) -> Rollout | None:
-        """All that was collected since the last one; None: it is not enough yet.
+        """Return a rollout of all batches since the last one; None: they are not enough yet.
 
         Args:
             gamma: (P,), each member's discount of one step.
             progress, reference: of the ``Rollout``.
         """
-        if not self._held or (self._quota and self._valid_rows() < self._quota):
+        if not self._batches or (self._quota and self._valid_rows() < self._quota):
             return None
-        named = self._held[0] if len(self._held) == 1 else _side_by_side(self._held)
-        self._held, steps, factor = [], named.pop("steps"), gamma.cpu()[:, None, None]
+        fields = self._batches[0] if len(self._batches) == 1 else _side_by_side(self._batches)
+        self._batches = []
+        steps = fields.pop("steps")
+        factor = gamma.cpu()[:, None, None]
         factor = factor if (steps == 1).all() else factor**steps
-        named["discount"] = factor * ~named.pop("terminated")
-        named = _filled_columns(named)
-        if named["valid"].all():
-            del named["valid"]
-        parts: dict[str, Any] = {name: x.to(self._device) for name, x in named.items()}
-        parts |= {k: x[:, 0] for k, x in parts.items() if k in SCHEMA and SCHEMA[k].per_env}
-        return Rollout(**parts, reference=reference, progress=progress)
+        fields["discount"] = factor * ~fields.pop("terminated")
+        fields = _filled_columns(fields)
+        if fields["valid"].all():
+            del fields["valid"]
+        on_device: dict[str, Any] = {name: x.to(self._device) for name, x in fields.items()}
+        on_device |= {k: x[:, 0] for k, x in on_device.items() if k in SCHEMA and SCHEMA[k].per_env}
+        return Rollout(**on_device, reference=reference, progress=progress)
 
     def state(self) -> dict[str, Tensor]:
-        """Copies of what is held, to go on exactly; see ``load``."""
-        parts = {str(i): held for i, held in enumerate(self._held)}
-        return {f"{i}.{k}": x.clone() for i, held in parts.items() for k, x in held.items()}
+        """Return copies of the stored batches, to continue exactly; see ``load``."""
+        return {
+            f"{i}.{name}": x.clone()
+            for i, fields in enumerate(self._batches)
+            for name, x in fields.items()
+        }
 
     def load(
         self, state: dict[str, Tensor], observation_space: gym.Space[Any], codec: ActionCodec
     ) -> None:
-        """Go on from a ``state``, of who acts in these spaces.
+        """Restore a ``state``, of a learner in these spaces.
 
         Raises:
-            ValueError: it does not fit; see ``check_held``.
+            ValueError: the state does not fit; see ``check_held``.
         """
-        held: list[dict[str, Tensor]] = []
-        while rows := unprefixed(str(len(held)), state):
-            held.append(rows)
-        check_held(held, self._members, observation_space, codec)
-        self._held = held
+        batches: list[dict[str, Tensor]] = []
+        while rows := unprefixed(str(len(batches)), state):
+            batches.append(rows)
+        check_held(batches, self._members, observation_space, codec)
+        self._batches = batches
 
     def _valid_rows(self) -> int:
-        """Of the member that has the fewest."""
-        return int(torch.stack([held["valid"].sum((1, 2)) for held in self._held]).sum(0).min())
+        """Return the number of valid rows of the member that has the fewest."""
+        return int(
+            torch.stack([fields["valid"].sum((1, 2)) for fields in self._batches]).sum(0).min()
+        )
 
     def _by_member(self, x: Array) -> Tensor:
-        """(T, P·B, …) to (P, T, B, …)."""
-        found: Tensor = to_tensor(x).unflatten(1, (self._members, -1))
-        return found.transpose(0, 1).contiguous()
+        """Reshape (T, P·B, …) to (P, T, B, …)."""
+        split: Tensor = to_tensor(x).unflatten(1, (self._members, -1))
+        return split.transpose(0, 1).contiguous()
 
 
 def _valid_first(valid: Array, members: int) -> tuple[Array, Array]:
-    """Which rows (T, N) to take so that the valid ones of each column come first.
+    """Order rows (T, N) so that the valid ones of each column come first.
 
     Returns:
-        (D, N) int64, rows and columns as one number, where the fullest column has D valid rows;
-        and (D, N) bool, which of them are valid: the others repeat a valid one of their member,
-        or of any member if theirs has none.
+        Cells (D, N) int64, row and column as one number, where the fullest column has D valid
+        rows; and a mask (D, N) bool of the valid ones. The others repeat a valid row of their
+        member, or of any member if theirs has none.
     """
     count = valid.sum(0)
-    kept: Array = np.arange(count.max())[:, None] < count
-    row = np.argsort(~valid, axis=0, kind="stable")[: len(kept)]
+    is_valid: Array = np.arange(count.max())[:, None] < count
+    row = np.argsort(~valid, axis=0, kind="stable")[: len(is_valid)]
     cells = row * len(count) + np.arange(len(count))
-    first = np.where(kept[0], cells[0], valid.size).reshape(members, -1).min(1)
+    first = np.where(is_valid[0], cells[0], valid.size).reshape(members, -1).min(1)
     first = np.where(first < valid.size, first, first.min())
-    return np.where(kept, cells, first.repeat(len(count) // members)), kept
+    return np.where(is_valid, cells, first.repeat(len(count) // members)), is_valid
 
 
-def _filled_columns(named: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Fields (P, T, B, …) without the columns that hold no valid row.
+def _filled_columns(batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Remove the columns without a valid row from fields (P, T, B, …).
 
-    Members that have fewer others than the member with most keep some.
+    All members have as many columns as the member with the most filled ones, so some may remain.
     """
-    filled = named["valid"].any(1)
+    filled = batch["valid"].any(1)
     if filled.all():
-        return named
+        return batch
     order = filled.to(torch.int8).argsort(dim=1, descending=True, stable=True)
     order = order[:, : int(filled.sum(1).max())]
     member = torch.arange(len(order), device="cpu")[:, None]
     return {
         k: x if x.shape[2] == 1 else x.transpose(1, 2)[member, order].transpose(1, 2)
-        for k, x in named.items()
+        for k, x in batch.items()
     }
 
 
-def _side_by_side(held: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Several experiences as one: more columns, as many rows as the longest has."""
-    masks = [h["mask"] for h in held if "mask" in h]
-    if masks:  # without one, all is allowed
-        every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in held]
-        held = [{"mask": free} | h for free, h in zip(every, held, strict=True)]
-    if "log_std" in held[0]:  # each was acted with one of its own
-        held = [h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in held]
-    t = max(h["valid"].shape[1] for h in held)
-    return {k: torch.cat([_padded(k, h[k], t) for h in held], 2) for k in held[0]}
+def _side_by_side(batches: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Join batches: their columns side by side, with as many rows as the longest has."""
+    masks = [h["mask"] for h in batches if "mask" in h]
+    if masks:  # a batch without a mask allows all actions
+        every = [masks[0].new_ones(*h["valid"].shape, masks[0].shape[-1]) for h in batches]
+        batches = [{"mask": free} | h for free, h in zip(every, batches, strict=True)]
+    if "log_std" in batches[0]:  # each batch has its own
+        batches = [
+            h | {"log_std": h["log_std"].expand(-1, -1, h["valid"].shape[2], -1)} for h in batches
+        ]
+    t = max(h["valid"].shape[1] for h in batches)
+    return {k: torch.cat([_padded(k, h[k], t) for h in batches], 2) for k in batches[0]}
 
 
 def _padded(name: str, x: Tensor, t: int) -> Tensor:
-    """A field (P, T, B, …) with ``t`` rows: its first is repeated, but is not valid there."""
+    """Pad a field (P, T, B, …) to ``t`` rows: its first row is repeated, but not as valid."""
     more = x[:, :1].expand(-1, 0 if name in ONE_ROW else t - x.shape[1], *x.shape[2:])
     return torch.cat([x, torch.zeros_like(more) if name in ("valid", "last") else more], 1)

@@ -1,4 +1,4 @@
-"""A hierarchy's policy, put together from the policies of all who are in it."""
+"""Assembly of a hierarchy's policy from the policies of its selector and skills."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import own_guide, restricting_guide
+from skillweave.hierarchy.guidance import learning_guide, restricting_guide
 from skillweave.hierarchy.nesting import below, inner_of
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.skills import Skill
@@ -16,40 +16,40 @@ from skillweave.training.stage import CRITIC, SELECTOR
 from skillweave.types import Policy
 
 
-def assembled(declared: Declaration, found: Mapping[str, Policy]) -> HierarchyPolicy:
-    """The hierarchy of these policies, which are named by their paths."""
-    skills = declared.skill_set([policy_of(s, found) for s in declared.skills])
+def assembled(declared: Declaration, policies: Mapping[str, Policy]) -> HierarchyPolicy:
+    """Return the policy of a hierarchy from policies by path."""
+    skills = declared.skill_set([policy_of(s, policies) for s in declared.skills])
     if declared.together.interrupt:
-        skills = with_interruption(skills, found[CRITIC], declared.together.margin)
-    guide = restricting_guide(declared, found[SELECTOR].observation_space)
-    return HierarchyPolicy(found[SELECTOR], skills, guide)
+        skills = with_interruption(skills, policies[CRITIC], declared.together.margin)
+    guide = restricting_guide(declared, policies[SELECTOR].observation_space)
+    return HierarchyPolicy(policies[SELECTOR], skills, guide)
 
 
-def policy_of(skill: Skill, found: Mapping[str, Policy]) -> Policy:
-    """A skill's policy, put together where it is a hierarchy."""
+def policy_of(skill: Skill, policies: Mapping[str, Policy]) -> Policy:
+    """Return a skill's policy; assembled where the skill is a hierarchy."""
     inner = inner_of(skill)
-    return found[skill.name] if inner is None else assembled(inner, below(found, skill.name))
+    return policies[skill.name] if inner is None else assembled(inner, below(policies, skill.name))
 
 
-def can_act(skill: Skill, found: Mapping[str, Policy]) -> bool:
-    """Whether a skill can act already; a hierarchy, whether all in it can."""
+def can_act(skill: Skill, policies: Mapping[str, Policy]) -> bool:
+    """Return True if a skill, or every part of a hierarchy, has a policy already."""
     if (inner := inner_of(skill)) is None:
-        return skill.name in found
-    own = below(found, skill.name)
+        return skill.name in policies
+    inside = below(policies, skill.name)
     needed = [SELECTOR, *([CRITIC] if inner.together.interrupt else [])]
-    return all(name in own for name in needed) and all(can_act(s, own) for s in inner.skills)
+    return all(name in inside for name in needed) and all(can_act(s, inside) for s in inner.skills)
 
 
-def learning_set(declared: Declaration, found: Mapping[str, Policy]) -> SkillSet:
-    """The skills as they are while all learn together: without policies where they learn."""
+def learning_set(declared: Declaration, policies: Mapping[str, Policy]) -> SkillSet:
+    """Return the skills for learning together: without a policy where a skill learns."""
 
-    def acts(skill: Skill) -> Any:
+    def ready_part(skill: Skill) -> Any:
         if skill.policy is None:
             return None
         if (inner := inner_of(skill)) is None:
-            return found[skill.name]
-        own = below(found, skill.name)
-        selector = own[SELECTOR] if inner.ready_selector is not None else None
-        return UntrainedHierarchy(learning_set(inner, own), selector, own_guide(inner))
+            return policies[skill.name]
+        inside = below(policies, skill.name)
+        selector = inside[SELECTOR] if inner.ready_selector is not None else None
+        return UntrainedHierarchy(learning_set(inner, inside), selector, learning_guide(inner))
 
-    return declared.skill_set([acts(s) for s in declared.skills])
+    return declared.skill_set([ready_part(s) for s in declared.skills])

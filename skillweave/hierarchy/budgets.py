@@ -1,4 +1,4 @@
-"""Training steps of each stage: a hierarchy's total, split by how it learns."""
+"""Training steps of each stage: a hierarchy's total, split by its way of learning."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ def budgets_of(declared: Declaration, total: int | None = None) -> dict[str, int
         total: the part of an outer hierarchy's steps for this one; None: it is the outermost.
     """
     total = declared.steps or total or DEFAULT_STEPS
-    found: dict[str, int] = {}
+    budgets: dict[str, int] = {}
     if declared.learns_apart:
         apart = total // 2 if declared.learns_together else total
         share = apart / max(1, _shares(declared))
         for skill, inner in inner_hierarchies(declared.skills):
             part = round(share * _shares(inner))
-            found |= {f"{skill.name}/{k}": v for k, v in budgets_of(inner, part).items()}
+            budgets |= {f"{skill.name}/{k}": v for k, v in budgets_of(inner, part).items()}
         for skill in declared.skills:
             if skill.policy is None:
-                found[skill.name] = (
+                budgets[skill.name] = (
                     skill.steps or declared.apart.skill_steps or max(1, round(share))
                 )
         if isinstance(declared.selector, AlgorithmConfig):
             part = round(SELECTOR_SHARES * share)
-            found[SELECTOR] = declared.apart.selector_steps or max(1, part)
+            budgets[SELECTOR] = declared.apart.selector_steps or max(1, part)
     if declared.learns_together:
         part = total - total // 2 if declared.learns_apart else total
-        found[TOGETHER] = declared.together.steps or part
-    return found
+        budgets[TOGETHER] = declared.together.steps or part
+    return budgets
 
 
 def _shares(declared: Declaration) -> int:
@@ -58,7 +58,7 @@ def scale_budgets(declared: Declaration, factor: float, *, inner: bool = False) 
     """Multiply all training steps of a hierarchy by ``factor``, in place.
 
     Args:
-        inner: it is a skill of another hierarchy, whose total it shares if it sets none.
+        inner: True for a skill of another hierarchy; without its own total it shares the outer one.
     """
 
     def scaled(steps: int | None) -> int | None:

@@ -1,4 +1,4 @@
-"""Checks of what a hierarchy is declared with; the messages name the skill and the field."""
+"""Checks of a declared hierarchy's fields; the messages name the skill and the field."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from skillweave.training.stage import Target, target_of
 
 
 def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ...]:
-    """The skills, if a hierarchy can be made of them.
+    """Return the skills as a tuple, with hierarchies among them as skills.
 
     Raises:
-        DeclarationError: it cannot.
+        DeclarationError: no hierarchy can be made of them.
     """
     if isinstance(skills, str) or not isinstance(skills, Sequence):
         raise DeclarationError("skills must be a list of skills: skills=[Center(), ...]")
@@ -32,7 +32,7 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         skill.validate()
         fitted(AlgorithmSettings | None, skill.algorithm, f"skill {skill.name!r}: algorithm")
         check_target(skill)
-        if inner_of(skill) is None and ready_policy(skill) is not None:  # says if it cannot act
+        if inner_of(skill) is None and ready_policy(skill) is not None:  # raises if it cannot act
             _check_untrained(skill)
     names = [s.name for s in skills]
     for name in names:
@@ -51,14 +51,14 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
 
 
 _OF_TRAINING = ("algorithm", "steps", "task_weight", "target_return", "target_success")
-"""Attributes of a skill that say how it is trained."""
+"""Attributes of a skill that set its training."""
 
 
 def _check_untrained(skill: Skill) -> None:
-    """Raise a DeclarationError where a skill with a policy says how it is to be trained.
+    """Raise a DeclarationError where a skill with a policy has settings of its training.
 
-    A policy that is given later (to the object of a class, or in a subclass) takes the place of a
-    training: what was said of it before is no mistake.
+    A policy that is given later (to the object of a class, or in a subclass) replaces a training:
+    settings of it from before are no mistake.
     """
     given = _distance(skill, "policy")
     ignored = [
@@ -68,13 +68,13 @@ def _check_untrained(skill: Skill) -> None:
     ]
     if ignored:
         fields = " and ".join(ignored)
-        how = f"leave out {fields}"
+        advice = f"leave out {fields}"
         if not given:  # perhaps a function has made the object and set them
-            how += f" (or set them to None: {', '.join(f'skill.{f} = None' for f in ignored)})"
+            advice += f" (or set them to None: {', '.join(f'skill.{f} = None' for f in ignored)})"
         raise DeclarationError(
             f"skill {skill.name!r} has a policy, so it is not trained, and its {fields} would be "
-            f"ignored: {how}, or leave out policy to train it. What another run of "
-            "Skillweave has learnt can be trained further: leave out policy, and "
+            f"ignored: {advice}, or leave out policy to train it. To train a skill of another "
+            "run of Skillweave further, leave out policy and call "
             f"train(start_from={{{skill.name!r}: run}})"
         )
 
@@ -86,10 +86,10 @@ def _distance(skill: Skill, field: str) -> int:
 
 
 def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
-    """The reflexes, if they are a list of them.
+    """Return the reflexes as a tuple.
 
     Raises:
-        DeclarationError: they are not.
+        DeclarationError: the argument is no list of reflexes.
     """
     if isinstance(reflexes, str) or not isinstance(reflexes, Sequence):
         raise DeclarationError(
@@ -110,21 +110,19 @@ def check_calls(call_steps: int | Lengths | None, skills: Sequence[Skill]) -> No
     for skill in skills:
         if not (skill.max_steps or skill.call_steps or skill.defines("termination")):
             raise DeclarationError(
-                f"call_steps is None, but skill {skill.name!r} never stops by itself: give it "
+                f"call_steps is None, but skill {skill.name!r} never ends by itself: give it "
                 "max_steps or termination()"
             )
 
 
 def check_target(skill: Skill) -> Target | None:
-    """The target of a skill's stage.
+    """Return the target of a skill's stage.
 
     Raises:
-        DeclarationError: it has two, or asks for a success that is not defined.
+        DeclarationError: the skill has two targets, or has one of success without success().
     """
     where = f"skill {skill.name!r}"
     target = target_of(skill.target_return, skill.target_success, where)
     if target is not None and target.of == "success" and not skill.defines("success"):
-        raise DeclarationError(
-            f"{where} has a target_success, but does not say what success is: define success()"
-        )
+        raise DeclarationError(f"{where} has a target_success, but no success(): define success()")
     return target

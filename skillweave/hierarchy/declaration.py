@@ -46,7 +46,7 @@ CallSteps = Annotated[
     AtLeastOne | Lengths | None,
     Check("a whole number of at least 1, Lengths(1, ..., 128), or None"),
 ]
-"""How long calls may last."""
+"""Limits of a call's length."""
 SelectorValue = Annotated[
     AlgorithmConfig | ReadyValue,
     Check(
@@ -72,7 +72,7 @@ class Declaration(Nestable):
     skills: Sequence[Skill]
     """The skills that the selector chooses from; a hierarchy among them is trained inside."""
     call_steps: CallSteps = 40
-    """How long a skill acts before the selector decides again; None: until it stops by itself."""
+    """Steps of a skill before the selector decides again; None: until the skill ends by itself."""
     steps: AtLeastOne | None = None
     """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
     or ``together`` sets replaces that part and leaves the others as they are."""
@@ -81,18 +81,18 @@ class Declaration(Nestable):
     selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
     selector trains alone."""
     algorithm: AlgorithmSettings = field(default_factory=PPO)
-    """Trains every skill that names none of its own."""
+    """The algorithm of every skill that sets no other."""
     selector: SelectorValue = field(default_factory=PPO)
-    """Trains the selector; its γ is that of one environment step, and so its n_steps. Or a ready
+    """The algorithm of the selector; its γ and n_steps count environment steps. Or a ready
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
     reflexes: Sequence[Reflex] = ()
     """Rules that override the running skill's action, also while skills train."""
     apart: Apart = field(default_factory=Apart)
-    """Settings of learning apart: budgets, and where skills start."""
+    """Settings of learning apart: budgets, and the start of skills."""
     together: Together = field(default_factory=Together)
     """Settings of learning together: budget, the task's weight, interruption, exploration."""
     selection: Selection = field(default_factory=Selection)
-    """Settings of how the selector chooses: cost of a call, greedy or sampling."""
+    """Settings of the selector's choices: cost of a call, greedy or sampling."""
     guide: Guide | None = None
     """A ready selector that guides one that learns."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
@@ -100,16 +100,16 @@ class Declaration(Nestable):
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
     recorded = False
-    """It is of a run that was loaded without its code, and knows less than was declared."""
+    """True for a run that was loaded without its code; some of what was declared is missing."""
 
     def __post_init__(self) -> None:
         self.validate()
 
     def validate(self) -> None:
-        """Check every setting; training and loading do it again, as attributes may be set.
+        """Check every setting; training and loading call it again, as attributes may be set.
 
         Raises:
-            DeclarationError: something is wrong; the message names it.
+            DeclarationError: a setting is wrong; the message names it.
         """
         check_env(self.env)
         self.skills = checked_skills(self.skills, RESERVED)
@@ -129,42 +129,46 @@ class Declaration(Nestable):
 
     @property
     def is_data(self) -> bool:
-        """Whether acting needs none of the user's Python code, so a saved run says it all."""
+        """True if acting needs none of the user's Python code, so a saved run is complete."""
         code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
         plain = (inner.is_data if (inner := inner_of(s)) else s.policy is None for s in self.skills)
         ready = self.ready_selector is not None or not all(plain)
-        own = bool(self.reflexes) or self.guide is not None
-        return not code and not ready and not own and self.spec.is_data
+        functions = bool(self.reflexes) or self.guide is not None
+        return not code and not ready and not functions and self.spec.is_data
 
     @property
     def trains_from_data(self) -> bool:
-        """Whether training, too, needs none of the user's Python code."""
-        own = any(s.defines(m) for _, s in every_skill(self.skills) for m in s.methods)
-        return self.is_data and self.spec.engine == "auto" and not own
+        """True if training, too, needs none of the user's Python code."""
+        code = any(s.defines(m) for _, s in every_skill(self.skills) for m in s.methods)
+        return self.is_data and self.spec.engine == "auto" and not code
 
     def skill(self, name: str) -> Skill:
-        """The skill of this ``name``, or path.
+        """Return the skill of this ``name``, or path.
 
         Raises:
-            DeclarationError: there is none; the message lists them.
+            DeclarationError: no skill has that name; the message lists the names.
         """
-        found = dict(every_skill(self.skills))
-        if not isinstance(name, str) or name not in found:
-            raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(found)}")
-        return found[name]
+        skills = dict(every_skill(self.skills))
+        if not isinstance(name, str) or name not in skills:
+            raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(skills)}")
+        return skills[name]
 
     def budgets(self) -> dict[str, int]:
-        """Training steps of each stage, by its path."""
+        """Return the training steps of each stage, by its path."""
         return budgets_of(self)
 
     @property
     def choices(self) -> int:
-        """Of how many a selector's choice is one: skills, times lengths if these are chosen."""
+        """Number of a selector's choices: skills, times lengths if these are chosen, too."""
         lengths = self.call_steps.steps if isinstance(self.call_steps, Lengths) else (0,)
         return len(self.skills) * len(lengths)
 
     def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
-        """What a selector, its critic or a skill at ``path`` chooses from, given ``actions``."""
+        """Return the action space of a selector, critic or skill at ``path``.
+
+        Args:
+            actions: the environment's action space, on which skills act.
+        """
         node, _, name = path.rpartition("/")
         if name not in (SELECTOR, CRITIC):
             return actions
@@ -179,20 +183,20 @@ class Declaration(Nestable):
 
     @property
     def any_skill_learns(self) -> bool:
-        """Whether a skill learns, or where it is a hierarchy, anyone in it."""
-        inner = (inner_of(s) for s in self.skills)
+        """True if a skill learns, or a part of a skill that is a hierarchy."""
+        hierarchies = (inner_of(s) for s in self.skills)
         return any(s.policy is None for s in self.skills) or any(
-            h is not None and (h.ready_selector is None or h.any_skill_learns) for h in inner
+            h is not None and (h.ready_selector is None or h.any_skill_learns) for h in hierarchies
         )
 
     @property
     def learns_apart(self) -> bool:
-        """Whether there are stages in which one learns by itself."""
+        """True if a stage trains a skill or the selector apart."""
         return self.learn != "together" or not self.any_skill_learns
 
     @property
     def learns_together(self) -> bool:
-        """Whether there is a stage in which all learn together."""
+        """True if a stage trains all together."""
         return self.learn != "apart" and self.any_skill_learns
 
     def scale(self, factor: float) -> None:
@@ -215,7 +219,7 @@ class Declaration(Nestable):
         steps = self.total_steps or self.steps
         if not steps:
             raise DeclarationError(
-                "nothing of this hierarchy is trained, so the flat baseline has no budget: set "
+                "no part of this hierarchy is trained, so the flat baseline has no budget: set "
                 "steps"
             )
         config = algorithm or self.train_defaults.flat or seeing_all(self.algorithm)
@@ -224,7 +228,7 @@ class Declaration(Nestable):
     def skill_set(
         self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
     ) -> SkillSet:
-        """The ``skills`` (None: all) with their ``policies``, ready to be called."""
+        """Return the ``skills`` (None: all) with their ``policies``, ready to be called."""
         return SkillSet(
             tuple(self.skills if skills is None else skills),
             tuple(policies),
@@ -239,7 +243,7 @@ class Declaration(Nestable):
         """Make the environment once, and return its spaces.
 
         Raises:
-            DeclarationError: something does not fit it.
+            DeclarationError: a space, a setting or a policy does not fit.
         """
         spaces = self.spec.read_spaces()
         obs_codec(spaces.observation)
@@ -251,18 +255,18 @@ class Declaration(Nestable):
 
     @property
     def ready_selector(self) -> ReadySelector | None:
-        """The selector that is not trained; None: it is."""
+        """The ready selector; None: the selector is trained."""
         return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
     def ready_selectors(self) -> dict[str, Policy]:
-        """By path, the selectors that are not trained, on the environment's observations."""
+        """Return the ready selectors, by path, on the environment's observations."""
         hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
         if all(h is None or h.ready_selector is None for h in hierarchies):
             return {}
         return fitted_selectors(self, self.spec.spaces.observation)
 
     def ready_policies(self) -> dict[str, Policy]:
-        """By path, the policies of skills that are not trained, on the environment's spaces."""
+        """Return the ready policies of skills, by path, on the environment's spaces."""
         if all(s.policy is None for s in self.skills):
             return {}
         return fitted_policies(self, self.spec.spaces)

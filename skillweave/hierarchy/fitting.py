@@ -1,4 +1,4 @@
-"""What a hierarchy is declared with, fitted to its environment."""
+"""Checks and conversions that fit a declared hierarchy to its environment."""
 
 from __future__ import annotations
 
@@ -41,8 +41,13 @@ def check_settings(declared: Declaration, spaces: Spaces, path: str = "") -> Non
     if declared.train_defaults.flat is not None:
         check_spaces(declared.train_defaults.flat, space, "flat: ")
         read_by(declared.train_defaults.flat, spaces.observation, "flat: ")
-    own = (s.algorithm for s in declared.skills)
-    for config in (declared.algorithm, declared.selector, declared.train_defaults.flat, *own):
+    of_skills = (s.algorithm for s in declared.skills)
+    for config in (
+        declared.algorithm,
+        declared.selector,
+        declared.train_defaults.flat,
+        *of_skills,
+    ):
         if isinstance(config, AlgorithmConfig):
             check_rollout(config, spaces.observation)
     for reflex in declared.reflexes:
@@ -53,7 +58,7 @@ def check_settings(declared: Declaration, spaces: Spaces, path: str = "") -> Non
 
 
 def fitted_policies(declared: Declaration, spaces: Spaces) -> dict[str, Policy]:
-    """By path, the policies of skills that are not trained, on the environment's spaces."""
+    """Return the ready policies of skills, by path, on the environment's spaces."""
     return {
         path: fitted(policy, *spaces, f"skill {path!r}", declared.spec.name)
         for path, skill in every_skill(declared.skills)
@@ -64,11 +69,12 @@ def fitted_policies(declared: Declaration, spaces: Spaces) -> dict[str, Policy]:
 def fitted_selectors(
     declared: Declaration, observation_space: gym.Space[Any], path: str = ""
 ) -> dict[str, Policy]:
-    """By path, the selectors that are not trained, on these observations."""
-    found: dict[str, Policy] = {}
+    """Return the ready selectors, by path, on these observations."""
+    selectors: dict[str, Policy] = {}
     if (ready := declared.ready_selector) is not None:
-        choices, name = gym.spaces.Discrete(len(declared.skills)), path + SELECTOR
-        found[name] = fitted(ready, observation_space, choices, name, declared.spec.name)
+        choices = gym.spaces.Discrete(len(declared.skills))
+        name = path + SELECTOR
+        selectors[name] = fitted(ready, observation_space, choices, name, declared.spec.name)
     for skill, inner in inner_hierarchies(declared.skills):
-        found |= fitted_selectors(inner, observation_space, f"{path}{skill.name}/")
-    return found
+        selectors |= fitted_selectors(inner, observation_space, f"{path}{skill.name}/")
+    return selectors

@@ -1,4 +1,4 @@
-"""Ready selectors of a hierarchy: one that decides, or one that guides a selector that learns."""
+"""Ready selectors of a hierarchy, which decide alone or guide a selector that learns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_selection(declared: Declaration) -> None:
-    """Raise a DeclarationError where selector, guide and how they learn do not fit together."""
+    """Raise a DeclarationError where selector, guide and way of learning do not fit together."""
     if declared.ready_selector is None:
         if declared.guide is not None:
             _check_guide(declared)
@@ -32,16 +32,16 @@ def check_selection(declared: Declaration) -> None:
         "call_steps are Lengths": isinstance(declared.call_steps, Lengths),
         "a guide is given": declared.guide is not None,
     }
-    for what, asked in refused.items():
-        if asked:
-            raise DeclarationError(f"{what}, but the selector is ready: it does not learn")
+    for setting, is_set in refused.items():
+        if is_set:
+            raise DeclarationError(f"{setting}, but the selector is ready: it does not learn")
 
 
 def _check_guide(declared: Declaration) -> None:
     """Raise a DeclarationError where a guide could not guide."""
     guide = declared.guide
     assert guide is not None
-    ready_guide(declared)  # says which of its skills does not exist
+    ready_guide(declared)  # raises if one of its skills does not exist
     if guide.target_kl is not None and not isinstance(declared.selector, PPO):
         raise DeclarationError(
             f"the guide's target_kl is {guide.target_kl:g}, but the selector learns by "
@@ -57,8 +57,9 @@ def _check_guide(declared: Declaration) -> None:
         )
     elif not isinstance(declared.selector, PPO):
         raise DeclarationError(
-            f"a selector that learns by {type(declared.selector).__name__} asks what may be called "
-            "next, which a function or a tree says only at decisions: give an Automaton, or PPO"
+            f"a selector that learns by {type(declared.selector).__name__} needs the "
+            "skills allowed next, which a function or a tree returns only at decisions: give an "
+            "Automaton, or use PPO"
         )
     if guide.restrict and declared.together.interrupt:
         raise DeclarationError(
@@ -68,7 +69,7 @@ def _check_guide(declared: Declaration) -> None:
 
 
 def ready_guide(declared: Declaration) -> ReadySelector | None:
-    """The guide, among the skills of the hierarchy; None: there is none."""
+    """Return the guide for the skills of the hierarchy; None: no guide is declared."""
     if declared.guide is None:
         return None
     return ready_selector(declared.guide.selector, tuple(s.name for s in declared.skills))
@@ -77,48 +78,48 @@ def ready_guide(declared: Declaration) -> ReadySelector | None:
 def fitted_guide(
     declared: Declaration, observation_space: gym.Space[Any], path: str = ""
 ) -> ActiveGuide | None:
-    """The guide of a selector that learns, on these observations; None: there is none.
+    """Return the guide of a selector that learns, on these observations; None: it has none.
 
     Args:
         path: of the hierarchy, ``inner/`` for example.
 
     Raises:
-        SkillError: it fails on them.
+        SkillError: the guide fails on these observations.
     """
-    if (found := ready_guide(declared)) is None:
+    if (guide := ready_guide(declared)) is None:
         return None
     choices = gym.spaces.Discrete(len(declared.skills))
-    own = fitted(found, observation_space, choices, f"{path}guide", declared.spec.name)
+    selector = fitted(guide, observation_space, choices, f"{path}guide", declared.spec.name)
     assert declared.guide is not None
     tells = declared.guide.target_kl is not None
-    return ActiveGuide(cast(ReadySelector, own), declared.guide.restrict, tells)
+    return ActiveGuide(cast(ReadySelector, selector), declared.guide.restrict, tells)
 
 
 def restricting_guide(
     declared: Declaration, observation_space: gym.Space[Any], path: str = ""
 ) -> ActiveGuide | None:
-    """The guide that a selector keeps to after it has learnt; None: there is none."""
+    """Return the guide that restricts a selector after its training; None: it has none."""
     guide = fitted_guide(declared, observation_space, path)
     return replace(guide, tells=False) if guide is not None and guide.restricts else None
 
 
-def own_guide(declared: Declaration) -> ActiveGuide | None:
-    """The guide of a selector that learns; None: there is none."""
+def learning_guide(declared: Declaration) -> ActiveGuide | None:
+    """Return the guide of a selector that learns; None: it has none."""
     if declared.guide is None:
         return None
     return fitted_guide(declared, declared.spec.spaces.observation)
 
 
-def who_guides(declared: Declaration) -> ActiveGuide | None:
-    """Who is asked while the selector learns, or instead of it; None: nobody."""
+def active_guide(declared: Declaration) -> ActiveGuide | None:
+    """Return the selector that guides the learning one or decides in its place; None: no guide."""
     if declared.ready_selector is None:
-        return own_guide(declared)
+        return learning_guide(declared)
     ready = declared.ready_selectors()[SELECTOR]
     return ActiveGuide(cast(ReadySelector, ready), decides=True)
 
 
 def guide_entry(declared: Declaration) -> dict[str, Any]:
-    """What a run says of the guide of a trained selector; nothing where there is none."""
+    """Return the entry of a run for the guide of a trained selector; {} without a guide."""
     if declared.guide is None or (guide := ready_guide(declared)) is None:
         return {}
     return {
@@ -128,24 +129,24 @@ def guide_entry(declared: Declaration) -> dict[str, Any]:
     }
 
 
-def adopt_guide(declared: Declaration, told: Mapping[str, Any], where: str) -> None:
-    """Take over from a run how a selector keeps to its guide; ``told`` is its ``guide_entry``.
+def adopt_guide(declared: Declaration, entry: Mapping[str, Any], where: str) -> None:
+    """Apply the settings of the guide that a run records; ``entry`` is its ``guide_entry``.
 
     Raises:
-        RunError: of the run and the hierarchy one has a guide, and the other has none.
+        RunError: only one of the run and the hierarchy has a guide.
     """
-    check_guided(declared.guide is not None, "guide" in told, where)
+    check_guided(declared.guide is not None, "guide" in entry, where)
     if declared.guide is not None:
         declared.guide = replace(
-            declared.guide, restrict=told["guide_restrict"], target_kl=told["guide_kl"]
+            declared.guide, restrict=entry["guide_restrict"], target_kl=entry["guide_kl"]
         )
 
 
-def check_guided(mine: bool, theirs: bool, where: str) -> None:
-    """Raise a RunError where of two selectors one has a guide and the other has none."""
-    if mine != theirs:
+def check_guided(is_guided: bool, recorded: bool, where: str) -> None:
+    """Raise a RunError where only one of two selectors has a guide."""
+    if is_guided != recorded:
         has = ("no guide", "a guide")
         raise RunError(
-            f"{where}: the selector has {has[theirs]}, but that of this hierarchy has {has[mine]}: "
-            "declare guide= as it was, or train anew"
+            f"{where}: the selector has {has[recorded]}, but the selector of this hierarchy has "
+            f"{has[is_guided]}: declare guide= as it was, or train again"
         )

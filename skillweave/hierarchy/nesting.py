@@ -1,7 +1,7 @@
-"""Hierarchies as skills of hierarchies: how they are declared, checked and found again.
+"""Hierarchies as skills of hierarchies: declaration, checks and paths.
 
-A skill whose ``policy`` is a hierarchy is trained inside: its own skills and its own selector. Who
-is in it has a path: ``inner/skill``, ``inner/selector``.
+A skill whose ``policy`` is a hierarchy is trained inside: its own skills and its own selector. Each
+part of it has a path: ``inner/skill``, ``inner/selector``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ELSEWHERE = {
     "target_return": "selection=Selection(target_return=...)",
     "target_success": "selection=Selection(target_return=...)",
 }
-"""What of a skill a hierarchy says by itself, and where."""
+"""Attributes of a skill that a hierarchy sets itself, and the argument that sets them."""
 _ATTRIBUTES = ("call_steps", "max_steps", "color")
 
 
@@ -37,7 +37,7 @@ class Nestable:
     skills: Any
 
     def as_skill(self, name: str | None = None, **attributes: Any) -> Skill:
-        """This hierarchy as a skill that is trained inside another hierarchy.
+        """Return this hierarchy as a skill that is trained inside another hierarchy.
 
         ``skills=[Center(), inner]`` is short for ``skills=[Center(), inner.as_skill()]``.
 
@@ -55,25 +55,25 @@ class Nestable:
                     f"{self.name}.as_skill(): a skill that is a hierarchy takes no {short(field)}; "
                     f"it takes {', '.join(_ATTRIBUTES)}"
                 )
-        own = {"name": name or self.name, "policy": self}
-        skill: Skill = type("Hierarchy", (Skill,), own | attributes)()
+        defaults = {"name": name or self.name, "policy": self}
+        skill: Skill = type("Hierarchy", (Skill,), defaults | attributes)()
         return skill
 
 
 def inner_of(skill: Skill) -> Declaration | None:
-    """The hierarchy that a skill is; None: it is none, or one that was trained elsewhere."""
+    """Return the hierarchy that a skill is; None: it is a plain skill, or trained elsewhere."""
     return cast("Declaration", skill.policy) if isinstance(skill.policy, Nestable) else None
 
 
 def inner_hierarchies(skills: Iterable[Skill]) -> Iterator[tuple[Skill, Declaration]]:
-    """Those skills that are hierarchies, with these."""
+    """Yield the skills that are hierarchies, each with its hierarchy."""
     for skill in skills:
         if (inner := inner_of(skill)) is not None:
             yield skill, inner
 
 
 def every_skill(skills: Iterable[Skill], path: str = "") -> Iterator[tuple[str, Skill]]:
-    """All skills by their paths, those of a hierarchy after it."""
+    """Yield all skills with their paths; the skills of a hierarchy follow it."""
     for skill in skills:
         yield path + skill.name, skill
         if (inner := inner_of(skill)) is not None:
@@ -81,7 +81,7 @@ def every_skill(skills: Iterable[Skill], path: str = "") -> Iterator[tuple[str, 
 
 
 def every_hierarchy(declared: Declaration) -> Iterator[tuple[str, Declaration]]:
-    """A hierarchy, by an empty path, and all below it by theirs."""
+    """Yield a hierarchy with an empty path, and all hierarchies below it with their paths."""
     yield "", declared
     for name, skill in every_skill(declared.skills):
         if (inner := inner_of(skill)) is not None:
@@ -89,18 +89,18 @@ def every_hierarchy(declared: Declaration) -> Iterator[tuple[str, Declaration]]:
 
 
 def copied(declared: D) -> D:
-    """The same hierarchy, and the same below it: what is changed there is not changed here."""
-    found = copy.copy(declared)
-    found.skills = tuple(copy.copy(skill) for skill in declared.skills)
-    for skill, inner in inner_hierarchies(found.skills):
+    """Return a copy of a hierarchy, its skills and the hierarchies below it."""
+    whole = copy.copy(declared)
+    whole.skills = tuple(copy.copy(skill) for skill in declared.skills)
+    for skill, inner in inner_hierarchies(whole.skills):
         skill.policy = copied(inner)
-    return found
+    return whole
 
 
-def below(found: Mapping[str, T], name: str) -> dict[str, T]:
-    """What has paths that begin with ``name``, by the rest of the path."""
-    cut = len(name) + 1
-    return {k[cut:]: v for k, v in found.items() if k.startswith(f"{name}/")}
+def below(by_path: Mapping[str, T], name: str) -> dict[str, T]:
+    """Return the values whose paths begin with ``name``, by the rest of the path."""
+    start = len(name) + 1
+    return {k[start:]: v for k, v in by_path.items() if k.startswith(f"{name}/")}
 
 
 def check_nested(declared: Declaration) -> None:
@@ -110,7 +110,7 @@ def check_nested(declared: Declaration) -> None:
     """
     check_ends(declared)
     for skill, inner in inner_hierarchies(declared.skills):
-        # How many processes step it is said by the outermost one, for all.
+        # The outermost hierarchy sets the number of processes for all.
         if replace(inner.spec, workers=None) != replace(declared.spec, workers=None):
             raise DeclarationError(
                 f"{skill.name}: this hierarchy is a skill of another one, so both act in the same "
@@ -135,7 +135,7 @@ def check_nested(declared: Declaration) -> None:
 
 
 def _shown(one: Declaration, other: Declaration) -> str:
-    """An environment's name, or more where the names are the same."""
+    """Return an environment's name, or its whole specification where the names are equal."""
     return one.spec.name if one.spec.name != other.spec.name else short(one.spec)
 
 
@@ -146,9 +146,9 @@ def check_ends(declared: Declaration) -> None:
 
 def _check_ends(above: tuple[Any, ...], path: str) -> None:
     for skill, inner in inner_hierarchies(above[-1].skills):
-        here = f"{path}{skill.name}"
+        inner_path = f"{path}{skill.name}"
         if any(inner is other for other in above):
             raise DeclarationError(
-                f"{here} is a hierarchy that contains itself: it is among its own skills"
+                f"{inner_path} is a hierarchy that contains itself: it is among its own skills"
             )
-        _check_ends((*above, inner), f"{here}/")
+        _check_ends((*above, inner), f"{inner_path}/")

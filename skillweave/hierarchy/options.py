@@ -32,21 +32,22 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     ``info`` of a step, arrays over N environments: ``steps`` (τ), ``discount`` (γ^τ, or 0 where
     terminated), ``call_return`` (Σ rₖ), ``next_obs`` (the true successors, one array whatever the
     space: see ``spaces.pack``), and Gymnasium's ``final_obs``. Where initiation sets exist:
-    ``action_mask`` (N, S), and ``next_action_mask``, that of ``next_obs`` (all True where the
+    ``action_mask`` (N, S), and ``next_action_mask``, the mask of ``next_obs`` (all True where the
     episode terminated, or no skill may start).
 
     Args:
         engine: the environments; stepped in part where calls differ in length.
-        skills: what the actions mean.
+        skills: the meaning of the actions.
         gamma: γ of one primitive step.
-        seed: of the skills' own sampling, where they are not greedy. What a call draws follows
-            from it and from the number of calls before, so no generator's state must be kept.
+        seed: of the sampling of skills that are not greedy. The random numbers of a call depend on
+            it and on the number of earlier calls alone, so no generator's state is stored.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, engine: Engine, skills: SkillSet, gamma: float, seed: int = 0) -> None:
-        self.engine, self.skills = engine, skills
+        self.engine = engine
+        self.skills = skills
         self.num_envs = engine.num_envs
         self.single_observation_space = engine.observation_space
         self.single_action_space = gym.spaces.Discrete(skills.choices)
@@ -61,10 +62,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start every episode anew; one seed for all.
+        """Reset every environment.
 
         Args:
-            seed: one for all; None: chosen at random, or going on.
+            seed: one for all; None: continue from the last one.
             options: not used.
 
         Returns:
@@ -84,7 +85,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return unpack(self.single_observation_space, self._obs), info
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Run one call in each environment, whichever skills and however long.
+        """Run one call in each environment.
 
         Args:
             actions: (N,) int64, a skill for each environment.
@@ -103,55 +104,68 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self._calls += 1
         obs = self._obs
         next_obs = np.empty_like(obs)
-        reward, plain, discount = np.zeros(n), np.zeros(n), np.ones(n)
+        reward = np.zeros(n)
+        call_return = np.zeros(n)
+        discount = np.ones(n)
         steps = np.zeros(n, np.int64)
-        terminated, truncated = np.zeros(n, bool), np.zeros(n, bool)
-        rows, turns = np.arange(n), 0
+        terminated = np.zeros(n, bool)
+        truncated = np.zeros(n, bool)
+        rows = np.arange(n)
+        turns = 0
         while len(rows):
             turns = self._turn(turns, rows, skill)
-            here = obs if len(rows) == n else obs[rows]
+            rows_obs = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
-            action = self._player.act_in_calls(self._memory, rows, here, allowed, turn)
+            action = self._player.act_in_calls(self._memory, rows, rows_obs, allowed, turn)
             raw = self.engine.step(action, None if len(rows) == n else rows)
             reward[rows] += discount[rows] * raw.reward
-            plain[rows] += raw.reward
+            call_return[rows] += raw.reward
             discount[rows] *= self._gamma
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
-            over = self._observe(rows, here, action, raw, steps[rows])
+            over = self._observe(rows, rows_obs, action, raw, steps[rows])
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()
             else:
                 obs[rows] = raw.next_obs
             if ended.any():
-                terminated[rows], truncated[rows] = raw.terminated, raw.truncated
+                terminated[rows] = raw.terminated
+                truncated[rows] = raw.truncated
                 obs[rows[ended]] = self.engine.reset_some(rows[ended])
                 self._player.restart(self._memory, rows[ended])
                 over = over | ended
             if over.any():
                 rows = rows[~over]
-        self._obs, self._mask = obs, self.skills.mask(obs)
+        self._obs = obs
+        self._mask = self.skills.mask(obs)
         info = {
             "steps": steps,
             "discount": (discount * ~terminated).astype(np.float32),
-            "call_return": plain,
+            "call_return": call_return,
             "next_obs": next_obs,
             "skill": skill,
             **self._masks(next_obs, terminated, truncated),
             **self._final(next_obs, terminated | truncated),
         }
-        seen_obs = unpack(self.single_observation_space, obs)
-        return seen_obs, reward.astype(np.float32), terminated, truncated, info
+        unpacked = unpack(self.single_observation_space, obs)
+        return unpacked, reward.astype(np.float32), terminated, truncated, info
 
     def _observe(
         self, rows: Array, obs: Array, action: Array, raw: RawStep, elapsed: Array
     ) -> Array:
-        """Show a step of environments ``rows`` (k,) to their skills; (k,): the call is over."""
+        """Pass a step of environments ``rows`` (k,) to their skills; return ends of calls, (k,)."""
         step = Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            np.zeros(len(rows), bool), elapsed, raw.info,
-        )  # fmt: skip
+            obs,
+            action,
+            raw.next_obs,
+            raw.reward,
+            raw.terminated,
+            raw.truncated,
+            np.zeros(len(rows), bool),
+            elapsed,
+            raw.info,
+        )
         over: Array = self._player.observe(self._memory, rows, step) != CallEnd.RUNNING
         return over
 
@@ -160,18 +174,18 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.engine.close()
 
     def _masks(self, next_obs: Array, terminated: Array, truncated: Array) -> dict[str, Any]:
-        """Where skills may start, in what to act on next and in the true successors."""
+        """Return masks of the skills that may start: in the next observations and successors."""
         if self._mask is None:
             return {}
         mask = self._mask.copy()
         mask[terminated] = True
-        cut = np.flatnonzero(truncated & ~terminated)
-        if len(cut):
-            mask[cut] = self._player.allowed(self._memory, cut, next_obs[cut])
+        limited = np.flatnonzero(truncated & ~terminated)
+        if len(limited):
+            mask[limited] = self._player.allowed(self._memory, limited, next_obs[limited])
         return {"action_mask": self._mask, "next_action_mask": mask}
 
     def _final(self, next_obs: Array, ended: Array) -> dict[str, Any]:
-        """The last observations of the episodes that ended, as Gymnasium gives them."""
+        """Return the last observations of ended episodes, in Gymnasium's form."""
         if not ended.any():
             return {}
         final = np.full(self.num_envs, None, dtype=object)
@@ -180,10 +194,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return {"final_obs": final, "_final_obs": ended}
 
     def _turn(self, turns: int, rows: Array, skill: Array) -> int:
-        """One more step of the calls of ``skill`` that still run, in environments ``rows``.
+        """Return the number of turns after one more step of the calls of ``skill`` in ``rows``.
 
         Raises:
-            SkillError: there have been so many that nothing seems to end them.
+            SkillError: the calls are too long to end by themselves.
         """
         if turns >= LONGEST_EPISODE:
             name = self._named(skill[rows[0]])

@@ -1,4 +1,4 @@
-"""The selector with its skills: a policy like any other, so it can be a skill again."""
+"""The policy of a selector with its skills, which can be a skill of another hierarchy."""
 
 from __future__ import annotations
 
@@ -31,34 +31,41 @@ class HierarchyPolicy:
     def __init__(
         self, selector: Policy, skills: SkillSet, guide: ActiveGuide | None = None
     ) -> None:
-        self.selector, self.skills, self.guide = selector, skills, guide
+        self.selector = selector
+        self.skills = skills
+        self.guide = guide
         self.player = Player(skills, selector, guide)
         self.observation_space = selector.observation_space
         self.action_space = skills.policies[0].action_space
         self.labels = tuple(s.name for s in skills.skills)
 
     def source(self) -> dict[str, Any]:
-        """The checksum of all that it acts by, for a run that it is a skill of.
+        """Return a checksum of all that decides its actions, for a run with it as a skill.
 
-        Of the user's code (termination, reflexes) the names alone are in it.
+        The user's code (termination, reflexes) enters by its names alone.
         """
-        told = self.skills
-        parts = [source_of(policy) for policy in (self.selector, *told.policies)]
-        acts = [[part["kind"], part.get("sha256")] for part in parts]
-        limits = [[x for x in (s.call_steps,) if x is not None] for s in told.skills]
-        skills = [[s.name, s.max_steps, *own] for s, own in zip(told.skills, limits, strict=True)]
-        reflexes = [r.name for r in told.reflexes]
-        cuts = told.interruption
-        if cuts is not None and cuts.critic is not None:
-            acts.append([cuts.margin, source_of(cuts.critic).get("sha256")])
+        skill_set = self.skills
+        sources = [source_of(policy) for policy in (self.selector, *skill_set.policies)]
+        checksums = [[source["kind"], source.get("sha256")] for source in sources]
+        skills = [
+            [s.name, s.max_steps, *([] if s.call_steps is None else [s.call_steps])]
+            for s in skill_set.skills
+        ]
+        reflexes = [r.name for r in skill_set.reflexes]
+        interruption = skill_set.interruption
+        if interruption is not None and interruption.critic is not None:
+            critic = source_of(interruption.critic)
+            checksums.append([interruption.margin, critic.get("sha256")])
         if self.guide is not None:
-            acts.append(["guide", source_of(cast(Policy, self.guide.selector)).get("sha256")])
-        greedy = [told.greedy, told.greedy_selector]
-        whole = json.dumps([acts, skills, reflexes, told.lengths or told.call_steps, *greedy])
+            guide = source_of(cast(Policy, self.guide.selector))
+            checksums.append(["guide", guide.get("sha256")])
+        call_steps = skill_set.lengths or skill_set.call_steps
+        greedy = [skill_set.greedy, skill_set.greedy_selector]
+        whole = json.dumps([checksums, skills, reflexes, call_steps, *greedy])
         return {"sha256": checksum(whole.encode())}
 
     def start(self, n: int) -> Memory:
-        """Memory of ``n`` environments that wait for their first decision."""
+        """Return the memory of ``n`` environments that wait for their first decision."""
         return self.player.start(n)
 
     def act(
@@ -70,62 +77,66 @@ class HierarchyPolicy:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
+        """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
 
-        ``memory`` is of n environments; ``rng`` is the source of chance, where it samples.
+        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
 
-        ``deterministic`` is about the selector, ``SkillSet.greedy`` about the skills. A selector
-        that was kept because it samples (``SkillSet.greedy_selector``) samples in any case.
+        ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
+        selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
         """
         memory = {k: v.copy() for k, v in memory.items()}
         turn = Turn(deterministic, rng)
         return self.player.act(memory, np.arange(len(obs)), obs, mask, turn), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """The ``memory`` after a ``step``: notice where calls are over."""
+        """Return the ``memory`` after a ``step``; calls that are over end in it."""
         memory = {k: v.copy() for k, v in memory.items()}
         self.player.observe(memory, np.arange(len(step.reward)), step)
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
-        """(n,) int64, by the ``memory`` the running skill."""
+        """Return the running skills in a ``memory``, (n,) int64."""
         return memory["skill"]
 
     def acts(self, memory: Memory, row: int = 0) -> str:
-        """By the ``memory``, the path of who acts in environment ``row``: ``inner/skill``."""
+        """Return the path of the skill that acts in ``row`` of the ``memory``: ``inner/skill``."""
         i = int(memory["skill"][row])
-        name, policy = self.labels[i], self.skills.policies[i]
+        name = self.labels[i]
+        policy = self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
             return name
         return f"{name}/{policy.acts(unprefixed(str(i), memory), row)}"
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
-    """The same skills, whose calls are cut where a trained critic would rather decide anew."""
+    """Return the skills with calls that end where a trained critic prefers a new decision."""
     return replace(skills, interruption=Interruption(critic.heads, margin, critic))
 
 
 class SkillAlone:
-    """One skill as it acts under a selector that chooses no other: with the reflexes in force.
+    """Policy of one skill without a selector, with the reflexes in force.
 
-    It acts from an episode's start to its end, also where its own initiation set or ends say
-    otherwise. Its memory is that of the skill's policy.
+    It acts from an episode's start to its end, whatever its initiation set and ends. Its memory is
+    the memory of the skill's policy.
 
     Args:
         skills: the skill and those beside it.
         name: of the skill.
-        path: what reports call it; "": its name.
+        path: its name in reports; "": the skill's name.
     """
 
     def __init__(self, skills: SkillSet, name: str, path: str = "") -> None:
         at = [s.name for s in skills.skills].index(name)
-        self.skill, self.path = skills.skills[at], path or name
-        self.policy, self.reflexes = skills.policies[at], skills.reflexes
+        self.skill = skills.skills[at]
+        self.path = path or name
+        self.policy = skills.policies[at]
+        self.reflexes = skills.reflexes
         self.observation_space = self.policy.observation_space
         self.action_space = self.policy.action_space
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
-        self.start, self.observe = self.policy.start, self.policy.observe
+        self.start = self.policy.start
+        self.observe = self.policy.observe
         self.acting = self.policy.acting
 
     def act(
@@ -137,7 +148,7 @@ class SkillAlone:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The skill's actions, or those of the reflexes where one holds."""
+        """Return the skill's actions, or a reflex's action where its condition holds."""
         action, memory = self.policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
         action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
         return action, memory

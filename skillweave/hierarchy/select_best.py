@@ -1,6 +1,6 @@
-"""Which hierarchy a run ends with, of those it could end with: episodes of all of them decide.
+"""Choice of the hierarchy that a run ends with: episodes of all candidates are compared.
 
-The episodes are played by the engine of training, in one process: in a pool, where there is one.
+The episodes are played by the engine of training, in one process: in a pool, where it has one.
 """
 
 from __future__ import annotations
@@ -25,13 +25,15 @@ from skillweave.training.stage_log import Listener
 
 SEEDS = 1_000
 """Seeds of these episodes start here: people use smaller ones."""
-MOST, LEAST = 100, 20
-"""Episodes of each candidate."""
+MOST = 100
+"""Most episodes of each candidate."""
+LEAST = 20
+"""Fewest episodes of each candidate, whatever their share."""
 SHARE = 0.1
-"""Share of the stage's steps that the episodes of a candidate may take, if LEAST do."""
+"""Share of the stage's steps that the episodes of a candidate may take."""
 CLEARLY = 2.0
-"""Standard errors by which a sampling selector must be better to be kept in place of a greedy one,
-which users expect."""
+"""Standard errors by which a sampling selector must be better than a greedy one to replace it;
+users expect a greedy one."""
 
 
 def select_best(
@@ -44,7 +46,7 @@ def select_best(
 ) -> Policies:
     """Return the best of a hierarchy's policies before and after learning together.
 
-    The run records which was kept.
+    The run records the choice.
 
     Args:
         nodes: the names on the way to the hierarchy, where it is a skill of another one.
@@ -54,8 +56,8 @@ def select_best(
         episodes = _episodes(entry)
         for listener in listeners:
             listener.message(
-                f"{entry['name']}: {episodes} episodes of each kind are played, to find out "
-                "whether skills and selector should be greedy"
+                f"{entry['name']}: playing {episodes} episodes of each kind, to decide whether "
+                "skills and selector should be greedy"
             )
         scores = _scores(declaration, run, before, after, nodes, episodes)
         means = {name: score.mean for name, score in scores.items()}
@@ -87,11 +89,11 @@ def _scores(
     entry = run.stage("/".join((*nodes, TOGETHER)))
     spec, seed = declaration.spec, SEEDS + int(run.manifest["seed"])
     num_envs = entry["algorithm"]["num_envs"]
-    longest = None
+    max_steps = None
     if not entry["final"].get("length"):
-        # No episode has ended: nobody has learnt from longer ones than these.
-        longest = max(1, entry["steps"] // num_envs)
-    learnt = _inside(after, nodes)
+        # No episode has ended, so no policy has learnt from longer ones than these.
+        max_steps = max(1, entry["steps"] // num_envs)
+    trained = _inside(after, nodes)
 
     def score(hierarchy: Declaration, policies: Policies) -> Evaluation:
         policy = assembled(hierarchy, policies)
@@ -101,24 +103,24 @@ def _scores(
             episodes=episodes,
             seed=seed,
             num_envs=num_envs,
-            max_steps=longest,
+            max_steps=max_steps,
             engine=spec.engine,
         )
 
     def sampling(name: str) -> Evaluation:
-        return score(with_sampling(declaration, *SAMPLING[name]), learnt)
+        return score(with_sampling(declaration, *SAMPLING[name]), trained)
 
-    found = {"greedy": sampling("greedy")}
+    scores = {"greedy": sampling("greedy")}
     skills_open, selector_open = open_choices(declaration)
     if entry["greedy_judged"] and skills_open:
-        found["skills_sample"] = sampling("skills_sample")
+        scores["skills_sample"] = sampling("skills_sample")
     if entry["greedy_judged"] and selector_open:
-        better = max(found, key=lambda name: found[name].mean)  # of equals the first
+        better = max(scores, key=lambda name: scores[name].mean)  # of equals the first
         name = "selector_samples" if better == "greedy" else "both_sample"
-        found[name] = sampling(name)
+        scores[name] = sampling(name)
     if entry["compared"]:
-        found["before"] = score(settled(declaration, run, nodes), _inside(before, nodes))
-    return found
+        scores["before"] = score(settled(declaration, run, nodes), _inside(before, nodes))
+    return scores
 
 
 def _best(scores: Mapping[str, Evaluation]) -> str:
@@ -136,27 +138,27 @@ def _best(scores: Mapping[str, Evaluation]) -> str:
 def settled(
     declaration: Declaration, run: RunDirectory, nodes: tuple[str, ...] = ()
 ) -> Declaration:
-    """Return a copy in which it is decided for all whether they are greedy, as the run records it.
+    """Return a copy with every choice of greedy or sampling set as the run records it.
 
     Args:
         nodes: the names on the way to the hierarchy, where it is a skill of another one.
     """
-    found = copied(declaration)
-    for path, own in every_hierarchy(found):
+    whole = copied(declaration)
+    for path, hierarchy in every_hierarchy(whole):
         names = (*nodes, *(path.split("/") if path else ()))
-        _decide(own, *_sampling(run, names))
-    return found
+        _set_sampling(hierarchy, *_sampling(run, names))
+    return whole
 
 
 def with_sampling(declaration: Declaration, skills: bool, selector: bool) -> Declaration:
     """Return a copy whose ``skills`` and ``selector`` sample wherever it leaves that open."""
-    found = copied(declaration)
-    for _, own in every_hierarchy(found):
-        _decide(own, skills, selector)
-    return found
+    whole = copied(declaration)
+    for _, hierarchy in every_hierarchy(whole):
+        _set_sampling(hierarchy, skills, selector)
+    return whole
 
 
-def _decide(declared: Declaration, skills: bool, selector: bool) -> None:
+def _set_sampling(declared: Declaration, skills: bool, selector: bool) -> None:
     """Set whether skills and selector sample, where a hierarchy leaves that open; in place."""
     choice = declared.selection
     declared.selection = replace(
@@ -167,7 +169,7 @@ def _decide(declared: Declaration, skills: bool, selector: bool) -> None:
 
 
 def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
-    """Return whether skills and selector sample, by the latest stage in which all learnt."""
+    """Return two flags, skills and selector sample, by the latest stage in which all learnt."""
     stages: dict[str, Mapping[str, Any]] = {s["name"]: s for s in run.manifest["stages"]}
     for depth in range(len(names) + 1):
         entry = stages.get("/".join((*names[:depth], TOGETHER)))
@@ -177,13 +179,13 @@ def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
             if to_be_judged(entry):
                 continue
             return True, False  # not evaluated: skills act as they did while the selector learnt
-        if (kept := entry["kept"]["kept"]) != "before":
-            return SAMPLING[kept]
+        if (choice := entry["kept"]["kept"]) != "before":
+            return SAMPLING[choice]
     return False, False
 
 
 def _inside(policies: Policies, nodes: tuple[str, ...]) -> Policies:
-    """Return those of a hierarchy below."""
+    """Return the policies of a hierarchy below, by the rest of their paths."""
     for name in nodes:
         policies = below(policies, name)
     return policies

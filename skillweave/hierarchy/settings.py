@@ -33,8 +33,8 @@ class Apart:
     takes none."""
     start_calls: AtLeastOne | None = None
     """While a skill trains, its episodes begin after up to this many calls of the skills that can
-    act already, a number drawn for each episode: it learns where it will be called. None: it
-    starts as soon as it may."""
+    act already, a number drawn for each episode: it learns in the states in which it will be
+    called. None: it starts as soon as it may."""
     search_steps: AtLeastOne | None = None
     """Reset an episode in which the skill cannot start within this many steps. For environments of
     several kinds, where some have nothing for the skill. None: the episode goes on."""
@@ -47,7 +47,7 @@ class Apart:
 @checked_settings
 @dataclass(frozen=True)
 class Selection:
-    """Settings of how the selector chooses and how skills act under it.
+    """Settings of the selector's choices, and of the skills under it.
 
     Raises:
         DeclarationError: a value is out of its range.

@@ -1,4 +1,4 @@
-"""Training what a run says, and loading what it learnt: a hierarchy, or one plain agent."""
+"""Training by a run's manifest, and loading the result: a hierarchy, or one plain agent."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def manifest(
     """Return the content of a new run's ``run.json``.
 
     Args:
-        flat: of the flat baseline: with its own settings, or with these.
+        flat: a manifest of the flat baseline: with its own settings, or with these.
         how: evaluation and checkpoints; None: the declaration's defaults.
     """
     how = how or declaration.train_defaults
@@ -77,14 +77,14 @@ def manifest(
     }
 
 
-@torch_threads(1)  # a loop sets its own; all else must not depend on how many there are
+@torch_threads(1)  # a loop sets its own; the rest must not depend on the number of threads
 def train(
     declaration: Declaration | PlainAgent,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
     make_learner: MakeLearner = agents_of,
 ) -> Policy:
-    """Train, or finish training, what the run says; returns the policy."""
+    """Train, or finish training, the stages of a run; return the policy."""
     if run.manifest["kind"] == "agent":
         agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
         (stage,) = agent.stages()
@@ -93,35 +93,35 @@ def train(
     ready = _ready(declaration, run)
     for name, policy in ready.items():
         keep_policy(run, name, policy)
-    found = _trained(declaration, run, listeners, ready, make_learner)
-    return assembled(settled(declaration, run), found)
+    policies = _trained(declaration, run, listeners, ready, make_learner)
+    return assembled(settled(declaration, run), policies)
 
 
 def _trained(
     declaration: Declaration,
     run: RunDirectory,
     listeners: tuple[Listener, ...],
-    known: Policies,
+    policies: Policies,
     make_learner: MakeLearner,
     nodes: tuple[str, ...] = (),
     as_skill: Skill | None = None,
 ) -> Policies:
-    """By path, everyone who can act after the stages of a hierarchy and of those below it.
+    """Return all policies after the stages of a hierarchy and of those below it, by path.
 
     Args:
-        known: who can act before.
+        policies: the policies before.
         nodes: the names on the way to the hierarchy, where it is a skill of another one.
-        as_skill: that skill.
+        as_skill: the hierarchy as a skill.
     """
     if declaration.learns_apart:
         for skill, inner in inner_hierarchies(declaration.skills):
-            where = (*nodes, skill.name)
-            known = _trained(inner, run, listeners, known, make_learner, where, skill)
+            below = (*nodes, skill.name)
+            policies = _trained(inner, run, listeners, policies, make_learner, below, skill)
     stages = own_stages(settled(declaration, run, nodes), as_skill)
     for name in reversed(nodes):
         stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
-    before = train_stages(apart, run, listeners, known, make_learner)
+    before = train_stages(apart, run, listeners, policies, make_learner)
     if len(apart) == len(stages):
         return before
     after = train_stages(stages[len(apart) :], run, listeners, before, make_learner)
@@ -129,54 +129,58 @@ def _trained(
 
 
 def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
-    """The policy of a finished run."""
+    """Return the policy of a finished run."""
     if run.manifest["kind"] == "agent":
         return load_agent_of(run)
     assert isinstance(declaration, Declaration)
     ready = _ready(declaration, run)
-    found = ready | _learnt(run)
+    policies = ready | _learnt(run)
     if run.unjudged:
         raise RunError(
-            f"{run.path}: all is learnt, but which of the hierarchies that it could end with is "
-            f"the best was not judged yet; {resume_words(run)}"
+            f"{run.path}: all is trained, but the best of the hierarchies that it could end with "
+            f"was not judged yet; {resume_words(run)}"
         )
-    absent = [s.name for s in declaration.skills if not can_act(s, found)]
+    absent = [s.name for s in declaration.skills if not can_act(s, policies)]
     if absent:
         raise RunError(
             f"{run.path}: {', '.join(map(repr, absent))} did not learn there: declare the skills "
             "with the policies that they had when it was trained"
         )
-    policy = assembled(settled(declaration, run), found)
+    policy = assembled(settled(declaration, run), policies)
     check_parts(declaration, policy, str(run.path))
     return policy
 
 
 def _learnt(run: RunDirectory) -> dict[str, Policy]:
-    """By name, everyone who learnt in a finished run, as they were in the end."""
-    found: dict[str, Policy] = {}
+    """Return the trained policies of a finished run, by path."""
+    policies: dict[str, Policy] = {}
     for entry in run.manifest["stages"]:
         if entry.get("kept", {}).get("kept") != "before":
-            found |= run.load_policies(entry["name"])
-    return found
+            policies |= run.load_policies(entry["name"])
+    return policies
 
 
 def _ready(declaration: Declaration, run: RunDirectory) -> dict[str, Policy]:
-    """By path, the ready policies as they were when the run began, those of selectors too."""
+    """Return the ready policies and selectors as they were when the run started, by path."""
     ready = declaration.ready_policies()
-    found = {name: recorded_policy(run, name, policy) for name, policy in ready.items()}
+    policies = {name: recorded_policy(run, name, policy) for name, policy in ready.items()}
     for name, policy in declaration.ready_selectors().items():
-        told = _told_of(run, name.removesuffix(SELECTOR).removesuffix("/"))
-        where = f"{run.path}: the selector" + ("" if name == SELECTOR else f" {name}")
-        found[name] = as_recorded(policy, told.get(SELECTOR), lambda: None, where)
-    for path, own in every_hierarchy(declaration):
-        if own.guide is not None and own.guide.restrict and (guide := ready_guide(own)) is not None:
-            where = f"{run.path}: the guide" + (f" of {path}" if path else "")
-            as_recorded(guide, _told_of(run, path).get("guide"), lambda: None, where)
-    return found
+        entry = _entry_of(run, name.removesuffix(SELECTOR).removesuffix("/"))
+        described = f"{run.path}: the selector" + ("" if name == SELECTOR else f" {name}")
+        policies[name] = as_recorded(policy, entry.get(SELECTOR), lambda: None, described)
+    for path, hierarchy in every_hierarchy(declaration):
+        if (
+            hierarchy.guide is not None
+            and hierarchy.guide.restrict
+            and (guide := ready_guide(hierarchy)) is not None
+        ):
+            described = f"{run.path}: the guide" + (f" of {path}" if path else "")
+            as_recorded(guide, _entry_of(run, path).get("guide"), lambda: None, described)
+    return policies
 
 
-def _told_of(run: RunDirectory, path: str) -> dict[str, Any]:
-    """What the run says of a hierarchy: of itself, or of one below."""
+def _entry_of(run: RunDirectory, path: str) -> dict[str, Any]:
+    """Return a run's entry of the hierarchy at ``path``; "": the outermost."""
     if not path:
         return run.manifest
     entries: list[dict[str, Any]] = run.manifest["skills"]
@@ -184,16 +188,16 @@ def _told_of(run: RunDirectory, path: str) -> dict[str, Any]:
 
 
 def _selector_entry(declaration: Declaration) -> dict[str, Any]:
-    """Where a ready selector comes from, or the guide of a trained one."""
+    """Return the entry of a ready selector's source, or of a trained one's guide."""
     selector = declaration.ready_selector
     return guide_entry(declaration) if selector is None else {SELECTOR: source_of(selector)}
 
 
 def _learns_together(declaration: Declaration, path: str) -> bool:
-    """Whether a skill that is a hierarchy learns together with its own skills at any time."""
+    """Return True if a skill that is a hierarchy learns together with its own skills."""
     return any(
-        own.learns_together
-        for node, own in every_hierarchy(declaration)
+        hierarchy.learns_together
+        for node, hierarchy in every_hierarchy(declaration)
         if not node or f"{path}/".startswith(f"{node}/")
     )
 
@@ -211,14 +215,16 @@ def _skill_entry(path: str, skill: Skill, *, together: bool) -> dict[str, Any]:
 
 
 def _hierarchy_entry(declaration: Declaration, *, together: bool) -> dict[str, Any]:
-    """What a run says of a hierarchy, be it itself or one below.
+    """Return a run's entry of a hierarchy, the outermost or one below.
 
     Args:
-        together: all in it learn together at any time; else skills and selector are greedy by
+        together: all its parts learn together in a stage; else skills and selector are greedy by
             default.
     """
-    selection, apart = declaration.selection, declaration.apart
-    skills, selector = selection.greedy_skills, selection.greedy_selector
+    selection = declaration.selection
+    apart = declaration.apart
+    skills = selection.greedy_skills
+    selector = selection.greedy_selector
     return {
         **calls_to_json(declaration.call_steps),
         "learn": declaration.learn,

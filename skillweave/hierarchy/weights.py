@@ -35,7 +35,10 @@ from skillweave.types import Policy
 
 
 def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Policy) -> None:
-    """Write skills and selector, or a plain agent; of ready policies what a run copies too."""
+    """Write the weights of skills and selector, or of a plain agent.
+
+    Ready policies are written in as far as a run copies them.
+    """
     place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.json_kwargs}
     if isinstance(policy, AgentPolicy):
         weights, description = policy.to_file()
@@ -46,14 +49,14 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
     tensors: dict[str, Tensor] = {}
     parts: dict[str, Any] = {}
     ready: dict[str, Any] = {}
-    for name, trained, own in _parts_of(declaration, policy):
+    for name, trained, part in _parts_of(declaration, policy):
         if trained:
-            assert isinstance(own, AgentPolicy)
-            weights, parts[name] = own.to_file()
+            assert isinstance(part, AgentPolicy)
+            weights, parts[name] = part.to_file()
             tensors |= {f"{name}/{k}": v for k, v in weights.items()}
             continue
-        ready[name] = source_of(own)
-        if isinstance(own, Foreign) and (content := own.content()) is not None:
+        ready[name] = source_of(part)
+        if isinstance(part, Foreign) and (content := part.content()) is not None:
             tensors[f"{name}/content"] = torch.tensor(
                 np.frombuffer(content, np.uint8), device="cpu"
             )
@@ -74,34 +77,34 @@ def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Pol
 def _parts_of(
     declaration: Declaration, policy: HierarchyPolicy, path: str = ""
 ) -> Iterator[tuple[str, bool, Policy]]:
-    """All who act in a hierarchy: path, whether they were trained in it, policy."""
+    """Yield all policies of a hierarchy as (path, trained in it, policy)."""
     trained = not isinstance(policy.selector, ReadySelector)
     yield path + SELECTOR, trained, policy.selector
-    cuts = policy.skills.interruption
-    if cuts is not None and cuts.critic is not None:
-        yield path + CRITIC, True, cuts.critic
-    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+    interruption = policy.skills.interruption
+    if interruption is not None and interruption.critic is not None:
+        yield path + CRITIC, True, interruption.critic
+    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
         inner = inner_of(skill)
         if inner is None:
-            yield path + skill.name, skill.policy is None, own
+            yield path + skill.name, skill.policy is None, of_skill
         else:
-            assert isinstance(own, HierarchyPolicy)
-            yield from _parts_of(inner, own, f"{path}{skill.name}/")
+            assert isinstance(of_skill, HierarchyPolicy)
+            yield from _parts_of(inner, of_skill, f"{path}{skill.name}/")
 
 
 def _hierarchies_of(
     declaration: Declaration, policy: HierarchyPolicy, path: str = ""
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """By path, how a hierarchy calls its skills, and how those below it do."""
-    yield path, _how(declaration, policy)
-    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
+    """Yield the headers of a hierarchy and of those below it, by path."""
+    yield path, _calls_header(declaration, policy)
+    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
         if (inner := inner_of(skill)) is not None:
-            assert isinstance(own, HierarchyPolicy)
-            yield from _hierarchies_of(inner, own, f"{path}/{skill.name}".removeprefix("/"))
+            assert isinstance(of_skill, HierarchyPolicy)
+            yield from _hierarchies_of(inner, of_skill, f"{path}/{skill.name}".removeprefix("/"))
 
 
-def _how(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
-    """How a hierarchy calls its skills."""
+def _calls_header(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
+    """Return the header entries of a hierarchy's way to call its skills."""
     guide = _restricting(declaration)
     return {
         **calls_to_json(declaration.call_steps),
@@ -113,13 +116,13 @@ def _how(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
 
 
 def _restricting(declaration: Declaration) -> ReadySelector | None:
-    """Return the guide that restricts the selector; None: there is none."""
+    """Return the guide that restricts the selector; None: it has none."""
     guide = declaration.guide
     return ready_guide(declaration) if guide is not None and guide.restrict else None
 
 
 class InnerHeader(TypedDict):
-    """What the file says of how a hierarchy calls its skills."""
+    """Header entries of a hierarchy's way to call its skills."""
 
     call_steps: AtLeastOne | None
     call_lengths: NotRequired[list[AtLeastOne]]
@@ -127,11 +130,11 @@ class InnerHeader(TypedDict):
     greedy_skills: bool
     greedy_selector: bool
     guide: NotRequired[Source]
-    """Of the ready selector that restricts the trained one."""
+    """The source of the ready selector that restricts the trained one."""
 
 
 class HierarchyHeader(InnerHeader):
-    """What the file of a hierarchy's weights says of them."""
+    """Header of the file of a hierarchy's weights."""
 
     kind: str
     env: str
@@ -140,16 +143,16 @@ class HierarchyHeader(InnerHeader):
     skills: list[str]
     parts: dict[str, dict[str, Any]]
     ready: dict[str, Source]
-    """Of skills by path, and of selectors."""
+    """Sources of ready skills and selectors, by path."""
     hierarchies: dict[str, InnerHeader]
-    """By path, skills that are hierarchies; their own skills are among all ``skills``."""
+    """Headers of skills that are hierarchies, by path; their own skills are in ``skills``, too."""
 
 
 def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header of a file of a hierarchy's weights, or of a plain agent's.
+    """Return the tensors and the header of a file of a hierarchy's or a plain agent's weights.
 
     Raises:
-        RunError: the file is damaged, or holds something else.
+        RunError: the file is damaged, or of another kind.
     """
     tensors, header = read_tensors(path)
     if header.get("kind") == "agent" and "algorithm" in header:
@@ -171,7 +174,7 @@ def open_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def read_agent(
     spec: EnvSpec, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
 ) -> AgentPolicy:
-    """A plain agent from what ``open_weights`` found in ``path``.
+    """Return a plain agent from the tensors and header that ``open_weights`` read.
 
     Raises:
         RunError: the file is damaged, or belongs to another environment.
@@ -184,7 +187,7 @@ def read_agent(
 
 
 def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | AgentPolicy:
-    """The inverse of ``write_weights``; the declaration takes over the file's call length.
+    """Return the policy that ``write_weights`` wrote; apply the file's call settings.
 
     Raises:
         RunError: the file is damaged, or belongs to other skills or another environment.
@@ -193,82 +196,90 @@ def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | Agen
     if header["kind"] == "agent":
         return read_agent(declaration.spec, tensors, header, path)
     skills = dict(every_skill(declaration.skills))
-    names, inner = list(skills), {name for name, _ in every_hierarchy(declaration) if name}
-    told = header["hierarchies"]
-    if header["skills"] != names or header["env"] != declaration.spec.name or set(told) != inner:
-        theirs = ", ".join(header["skills"])
+    names = list(skills)
+    inner = {name for name, _ in every_hierarchy(declaration) if name}
+    inner_headers = header["hierarchies"]
+    if (
+        header["skills"] != names
+        or header["env"] != declaration.spec.name
+        or set(inner_headers) != inner
+    ):
+        recorded_skills = ", ".join(header["skills"])
         raise RunError(
-            f"{path} is of skills {theirs[:300]} on {header['env'][:100]}, but the "
+            f"{path} is of skills {recorded_skills[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
         )
 
     def part(name: str) -> AgentPolicy:
-        own = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")}
+        weights = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")}
         if name not in header["parts"]:
             raise RunError(f"{path} holds no weights of {name!r}")
-        return AgentPolicy.from_file(own, header["parts"][name], f"{path} ({name})")
+        return AgentPolicy.from_file(weights, header["parts"][name], f"{path} ({name})")
 
     def copied(name: str) -> bytes | None:
         content = tensors.get(f"{name}/content")
         return None if content is None else content.contiguous().numpy().tobytes()
 
-    found: dict[str, Policy] = {}
-    ready, recorded = declaration.ready_policies(), header["ready"]
+    policies: dict[str, Policy] = {}
+    ready = declaration.ready_policies()
+    recorded = header["ready"]
     for name, policy in ready.items():
-        read, where = partial(copied, name), f"{path}: skill {name!r}"
-        found[name] = as_recorded(policy, recorded.get(name), read, where)
-    for name, own in every_hierarchy(declaration):
-        node, where = f"{name}/" if name else "", f"{path}: {name}" if name else str(path)
-        how = told[name] if name else header
-        adopt_calls(own, how)
-        check_selector(own.ready_selector is not None, node + SELECTOR in recorded, where)
-        for other in [SELECTOR, *([CRITIC] if own.together.interrupt else [])]:
+        read = partial(copied, name)
+        where = f"{path}: skill {name!r}"
+        policies[name] = as_recorded(policy, recorded.get(name), read, where)
+    for name, hierarchy in every_hierarchy(declaration):
+        node = f"{name}/" if name else ""
+        where = f"{path}: {name}" if name else str(path)
+        entry = inner_headers[name] if name else header
+        adopt_calls(hierarchy, entry)
+        check_selector(hierarchy.ready_selector is not None, node + SELECTOR in recorded, where)
+        for other in [SELECTOR, *([CRITIC] if hierarchy.together.interrupt else [])]:
             if node + other not in recorded:
-                found[node + other] = part(node + other)
-        _check_guide(own, how.get("guide"), where)
+                policies[node + other] = part(node + other)
+        _check_guide(hierarchy, entry.get("guide"), where)
     for name, policy in declaration.ready_selectors().items():
-        found[name] = as_recorded(policy, recorded[name], lambda: None, f"{path}: the {name}")
+        policies[name] = as_recorded(policy, recorded[name], lambda: None, f"{path}: the {name}")
     for name, skill in skills.items():
         if skill.policy is None:
-            found[name] = part(name)
-    whole = assembled(declaration, found)
+            policies[name] = part(name)
+    whole = assembled(declaration, policies)
     check_parts(declaration, whole, str(path))
     return whole
 
 
-def _check_guide(declaration: Declaration, told: dict[str, Any] | None, where: str) -> None:
+def _check_guide(declaration: Declaration, source: dict[str, Any] | None, where: str) -> None:
     """Raise a RunError where the selector was trained under another guide."""
     guide = _restricting(declaration)
-    check_guided(guide is not None, told is not None, where)
+    check_guided(guide is not None, source is not None, where)
     if guide is not None:
-        as_recorded(guide, told, lambda: None, f"{where}: the guide")
+        as_recorded(guide, source, lambda: None, f"{where}: the guide")
 
 
-def adopt_calls(declaration: Declaration, told: Mapping[str, Any]) -> None:
-    """Take over how a hierarchy calls its skills."""
-    declaration.call_steps = calls_from_json(told)
-    kinds = {name: told[name] for name in ("greedy_skills", "greedy_selector")}
+def adopt_calls(declaration: Declaration, entry: Mapping[str, Any]) -> None:
+    """Apply a recorded way to call skills to a hierarchy."""
+    declaration.call_steps = calls_from_json(entry)
+    kinds = {name: entry[name] for name in ("greedy_skills", "greedy_selector")}
     declaration.selection = replace(declaration.selection, **kinds)
-    margin = told.get("interrupt")
+    margin = entry.get("interrupt")
     declaration.together = replace(declaration.together, interrupt=margin is not None)
     if margin is not None:
         declaration.together = replace(declaration.together, margin=margin)
 
 
-def check_selector(mine: bool, theirs: bool, where: str) -> None:
-    """Raise a RunError where of two selectors one is ready and the other is trained."""
-    if mine != theirs:
+def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
+    """Raise a RunError where one selector is ready and the other is trained."""
+    if is_ready != recorded:
         kinds = ("a trained selector", "a ready one (a function, an automaton or a tree)")
         raise RunError(
-            f"{where} has {kinds[theirs]}, but this hierarchy has {kinds[mine]}: declare the "
-            "selector as it was, or train anew"
+            f"{where} has {kinds[recorded]}, but this hierarchy has {kinds[is_ready]}: declare the "
+            "selector as it was, or train again"
         )
 
 
 def check_parts(declaration: Declaration, policy: HierarchyPolicy, where: str) -> None:
-    """Raise a RunError where a policy is not of the spaces that its place asks for.
+    """Raise a RunError where a policy has not the spaces of its place.
 
-    Selectors choose among their skills; skills all see and do what the first of them does.
+    Selectors choose among their skills; all skills have the spaces of the first.
     """
     first = policy.skills.policies[0]
     wanted = {"observation_space": first.observation_space, "action_space": first.action_space}
@@ -284,16 +295,16 @@ def _check_parts(
 ) -> None:
     choices = gym.spaces.Discrete(declaration.choices)
     places = {SELECTOR: (policy.selector, wanted | {"action_space": choices})}
-    for skill, own in zip(declaration.skills, policy.skills.policies, strict=True):
-        places[skill.name] = own, wanted
+    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
+        places[skill.name] = of_skill, wanted
         if (inner := inner_of(skill)) is not None:
-            assert isinstance(own, HierarchyPolicy)
-            _check_parts(inner, own, wanted, where, f"{path}{skill.name}/")
-    for name, (own, spaces) in places.items():
+            assert isinstance(of_skill, HierarchyPolicy)
+            _check_parts(inner, of_skill, wanted, where, f"{path}{skill.name}/")
+    for name, (part, spaces) in places.items():
         for kind, space in spaces.items():
-            found = getattr(own, kind)
-            if not same_space(found, space):
+            actual = getattr(part, kind)
+            if not same_space(actual, space):
                 raise RunError(
                     f"{where}: the policy in the place of {path + name!r} has {kind} "
-                    f"{shown(found)}, but {shown(space)} belongs there"
+                    f"{shown(actual)}, but {shown(space)} belongs there"
                 )

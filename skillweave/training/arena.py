@@ -1,4 +1,4 @@
-"""Episodes of a learner in the environments that it learns in, to see how good it is."""
+"""Evaluation episodes of a learner in the environments of its training."""
 
 from __future__ import annotations
 
@@ -20,31 +20,33 @@ from skillweave.types import Array
 def episodes_of(
     policy: AgentPolicy, arena: Collector, seeds: Seeds, first: int = 0, count: int | None = None
 ) -> Array:
-    """What one episode in each environment came to, acting greedily, as ``Collected.episodes``.
+    """Play one greedy episode in each environment; return rows like ``Collected.episodes``.
 
     Args:
-        first: the number of the first episode. An episode starts by its number, so that several
-            rounds in few environments have the starts of one round in many.
-        count: of how many environments, the first of the arena; None: of all.
+        first: the number of the first episode. An episode's start depends on its number alone, so
+            several rounds in few environments have the same starts as one round in many.
+        count: the number of environments, the first of the arena; None: all.
 
     Returns:
-        (n, 4), n at least 1; environments where a skill could never start are left out.
+        (n, 4), n at least 1; environments in which a skill could never start are left out.
     """
     algorithm, engine = policy.algorithm, arena.engine
     if first or count not in (None, arena.num_envs):
         engine = cast(Engine, _Round(engine, first, count or arena.num_envs))
-    # Each round has random streams of its own.
-    acts, draws = (seeds / k / first if first else seeds / k for k in ("act", "global"))
+    # Each round has its own random streams.
+    acting_seeds, global_seeds = (
+        seeds / k / first if first else seeds / k for k in ("act", "global")
+    )
     player = arena.like(engine, Acting([(algorithm, 1)], engine.num_envs))
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
-    request = Request(0, (params,), gamma, acts, greedy=True)
+    request = Request(0, (params,), gamma, acting_seeds, greedy=True)
     limit = longest_evaluation(engine.time_limit)
-    # Several threads wait for each other, for ever on a busy machine.
-    with torch_threads(1), global_generators(draws):
-        found: Array = player.play(request, seeds / "start", limit)
-    began: Array = ~np.isnan(found[:, RETURN])
-    return found[began]
+    # Several threads wait for each other, forever on a busy machine.
+    with torch_threads(1), global_generators(global_seeds):
+        episodes: Array = player.play(request, seeds / "start", limit)
+    has_started: Array = ~np.isnan(episodes[:, RETURN])
+    return episodes[has_started]
 
 
 class _Round:
@@ -55,14 +57,16 @@ class _Round:
     """
 
     def __init__(self, engine: Engine, first: int, num_envs: int) -> None:
-        self._engine, self._first, self.num_envs = engine, first, num_envs
+        self._engine = engine
+        self._first = first
+        self.num_envs = num_envs
         self._rows = np.arange(num_envs)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._engine, name)
 
     def reset(self, seed: int) -> Array:
-        """Start the episodes, all from one seed; observations (num_envs, *obs_shape)."""
+        """Start the episodes from one seed; return observations (num_envs, *obs_shape)."""
         engine, first = self._engine, self._first
         if not isinstance(engine, GymnasiumEngine):
             return engine.reset((Seeds(seed) / first).integer())[: self.num_envs]
@@ -70,9 +74,9 @@ class _Round:
         return engine.reset_some(self._rows, seeds)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; None: in these."""
+        """Act in environments ``ids``; None: in all of this round."""
         return self._engine.step(action, self._rows if ids is None else ids)
 
     def mask(self) -> Array | None:
-        """(num_envs, A) bool, the actions allowed now; None: all always are."""
+        """Return the allowed actions (num_envs, A) bool; None: all are, always."""
         return allowed_rows(self._engine.mask(), self._rows)

@@ -1,4 +1,4 @@
-"""What happened in each episode of an evaluation, call by call, for reports."""
+"""Log of each episode of an evaluation, call by call, for reports."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import AGENT
 from skillweave.training.play import Played
-from skillweave.training.skill_report import ENDS, Judged, judged_step, played_below
+from skillweave.training.skill_report import ENDS, StepOutcome, judge_step, played_below
 from skillweave.types import Array, Policy
 
 
 @dataclass
 class Call:
-    """One call of a skill; of a plain agent, the whole episode is one."""
+    """One call of a skill; the whole episode for a plain agent."""
 
     skill: int
     """A row of ``CallLog.labels``."""
     start: int
     """Steps of the episode before it."""
     obs: Array
-    """What the selector saw when it decided, (*obs_shape)."""
+    """The observation of the selector's decision, (*obs_shape)."""
     steps: int = 0
     why: str | None = None
-    """``own``, ``limit``, ``interrupted`` or ``episode``, as in ``ENDS``; None: not known."""
+    """``own``, ``limit``, ``interrupted`` or ``episode``, as in ``ENDS``; None: unknown."""
     reward: float = 0.0
     """Sum of the environment's reward, not discounted."""
     own: float | None = None
-    """Sum of the skill's own reward; None: not known."""
+    """Sum of the skill's own reward; None: unknown."""
     succeeded: bool | None = None
-    """What its ``success`` says of its last step; None: it defines none."""
+    """Result of the skill's ``success`` for the last step; None: it defines none."""
 
 
 @dataclass
@@ -43,13 +43,13 @@ class EpisodeLog:
     """One episode."""
 
     seed: int
-    """Given the same actions, it can be played again."""
+    """The episode's seed; with the same actions it can be played again."""
     calls: list[Call] = field(default_factory=list)
     actions: list[Array] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
-    """The environment's, of each step."""
+    """The environment's reward of each step."""
     cut: bool = False
-    """Nothing had ended it when it became too long."""
+    """True if it was cut at the step limit without an end."""
 
     @property
     def total(self) -> float:
@@ -58,9 +58,9 @@ class EpisodeLog:
 
 
 class CallLog:
-    """Writes down the calls of episodes as ``evaluate(..., watch=log.add)`` plays them.
+    """Recorder of the calls of episodes: ``evaluate(..., watch=log.add)``.
 
-    Where a skill is a hierarchy, the calls are those of its own skills, by their paths.
+    Where a skill is a hierarchy, the calls of its own skills are recorded, by their paths.
 
     Args:
         seeds: of the episodes, in order.
@@ -74,57 +74,58 @@ class CallLog:
         self.episodes = [EpisodeLog(seed) for seed in seeds]
 
     def add(self, played: Played) -> None:
-        """Write down one step of each environment."""
+        """Record one step of each environment."""
         if played.acting is None:
             self._write(played, np.zeros(len(played.episode), np.int64), None)
         else:
             self._add(played, self._root)
 
     def _add(self, played: Played, level: _Level) -> None:
-        """Write down a step of environments in which the skills of a level act."""
+        """Record a step of environments in which the skills of a level act."""
         assert played.acting is not None
-        judged = None if level.skills is None else judged_step(level.skills, played)
+        outcome = None if level.skills is None else judge_step(level.skills, played)
         leaf = np.array([level.numbers.get(i, 0) for i in range(len(level.labels))])[played.acting]
-        here = ~np.isin(played.acting, list(level.below))
-        self._write(played, leaf, judged, np.flatnonzero(here))
+        is_leaf = ~np.isin(played.acting, list(level.below))
+        self._write(played, leaf, outcome, np.flatnonzero(is_leaf))
         for i, below in level.below.items():
             if len(rows := np.flatnonzero(played.acting == i)):
                 self._add(played_below(played, i, rows), below)
 
     def _write(
-        self, played: Played, leaf: Array, judged: Judged | None, rows: Array | None = None
+        self, played: Played, leaf: Array, outcome: StepOutcome | None, rows: Array | None = None
     ) -> None:
-        """Write down a step of ``rows`` (m,), None: all; ``leaf`` (k,) acts in it."""
+        """Record a step of ``rows`` (m,), None: all; ``leaf`` (k,) are the acting skills."""
         for j in range(len(played.episode)) if rows is None else rows:
             episode = self.episodes[played.episode[j]]
             last = episode.calls[-1] if episode.calls else None
-            # A policy of another kind does not say where calls begin.
-            begun = played.begun is not None and bool(played.begun[j])
-            if last is None or begun or last.skill != leaf[j]:
-                if last is not None and judged is not None and last.why is None:
-                    last.why = ENDS[CallEnd.LIMIT]  # its hierarchy was called no more
+            # A policy of another kind does not report starts of calls.
+            starts = played.call_start is not None and bool(played.call_start[j])
+            if last is None or starts or last.skill != leaf[j]:
+                if last is not None and outcome is not None and last.why is None:
+                    last.why = ENDS[CallEnd.LIMIT]  # its hierarchy was not called again
                 start = len(episode.rewards)
                 episode.calls.append(Call(int(leaf[j]), start, np.array(played.step.obs[j])))
-            call, reward = episode.calls[-1], float(played.reward[j])
+            call = episode.calls[-1]
+            reward = float(played.reward[j])
             episode.actions.append(np.array(played.step.action[j]))
             episode.rewards.append(reward)
             episode.cut = bool(played.cut[j])
             call.steps += 1
             call.reward += reward
-            if judged is not None:
-                self._add_judged(call, judged, int(j))
+            if outcome is not None:
+                self._add_outcome(call, outcome, int(j))
             elif played.over[j]:
                 call.why = ENDS[CallEnd.EPISODE]
 
-    def _add_judged(self, call: Call, judged: Judged, j: int) -> None:
-        """Write down what the running skill says of a step."""
+    def _add_outcome(self, call: Call, outcome: StepOutcome, j: int) -> None:
+        """Add a step's outcome to the running call."""
         skill = self.skills[call.skill]
         if not isinstance(skill, RecordedSkill):
-            call.own = (call.own or 0.0) + float(judged.reward[j])
-        if judged.why[j] != CallEnd.RUNNING:
-            call.why = ENDS[CallEnd(int(judged.why[j]))]
+            call.own = (call.own or 0.0) + float(outcome.reward[j])
+        if outcome.why[j] != CallEnd.RUNNING:
+            call.why = ENDS[CallEnd(int(outcome.why[j]))]
             if skill.defines("success"):
-                call.succeeded = bool(judged.succeeded[j])
+                call.succeeded = bool(outcome.succeeded[j])
 
 
 class _Level:
@@ -132,24 +133,27 @@ class _Level:
 
     Args:
         path: of the skills: empty, or ``inner/`` for example.
-        first: the number of the first of them that is no hierarchy, among all.
+        first: the number, among all leaves, of this level's first.
     """
 
     def __init__(self, policy: Policy, path: str = "", first: int = 0) -> None:
-        self.labels, self._path, self.skills = policy.labels, path, skills_below(policy)
+        self.labels = policy.labels
+        self._path = path
+        self.skills = skills_below(policy)
         self.numbers: dict[int, int] = {}
-        """By a skill's number, its number among all."""
+        """Numbers among all leaves, by the number at this level."""
         self.below: dict[int, _Level] = {}
         for i, name in enumerate(self.labels):
-            own = None if self.skills is None else self.skills.policies[i]
-            if own is not None and skills_below(own) is not None:
-                self.below[i] = _Level(own, f"{path}{name}/", first)
+            inner = None if self.skills is None else self.skills.policies[i]
+            if inner is not None and skills_below(inner) is not None:
+                self.below[i] = _Level(inner, f"{path}{name}/", first)
                 first += len(list(self.below[i].leaves()))
             else:
-                self.numbers[i], first = first, first + 1
+                self.numbers[i] = first
+                first += 1
 
     def leaves(self) -> Iterator[tuple[str, Skill | None]]:
-        """The skills that act, by their paths; None: of a policy of another kind."""
+        """Yield the acting skills with their paths; None: the policy is of another kind."""
         for i, name in enumerate(self.labels):
             if i in self.below:
                 yield from self.below[i].leaves()

@@ -1,4 +1,4 @@
-"""A user's function that sees each report of training and each checkpoint, and may stop a stage."""
+"""A user's function that receives reports and checkpoints of training, and can stop a stage."""
 
 from __future__ import annotations
 
@@ -53,16 +53,17 @@ class TrainCallback:
 
     Args:
         function: checked by ``check_callback``.
-        run: what trains.
+        run: the run that trains.
     """
 
     def __init__(self, function: Callback, run: RunDirectory) -> None:
-        self._function, self._run = function, run
+        self._function = function
+        self._run = run
         self.stopped = False
-        """The function has returned False in this stage."""
+        """True after the function returned False in this stage."""
 
     def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on."""
+        """Prepare for a stage that starts or continues."""
         self.stopped = False
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -74,10 +75,10 @@ class TrainCallback:
         self._call("checkpoint", name, steps, metrics)
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over; no event."""
+        """Do nothing: the end of a stage is no event."""
 
     def message(self, text: str) -> None:
-        """Messages are no events."""
+        """Do nothing: a message is no event."""
 
     def _call(
         self,
@@ -88,9 +89,9 @@ class TrainCallback:
     ) -> None:
         event = self._event(kind, name, steps, metrics)
         try:
-            answer = self._function(event)
+            result = self._function(event)
         except Exception as error:
-            # The same exception, so that Optuna and others still catch their own.
+            # Raise the same exception, so that Optuna and others still catch their own.
             where = place(error)
             error.add_note(
                 "The callback of train() raised this"
@@ -99,7 +100,7 @@ class TrainCallback:
                 + resume_words(self._run, "callback=callback")
             )
             raise
-        if isinstance(answer, bool | np.bool_) and not answer:
+        if isinstance(result, bool | np.bool_) and not result:
             self.stopped = True
 
     def _event(

@@ -32,7 +32,7 @@ def check_env(env: object) -> None:
     if is_batched(env):
         raise refuse_batched(short(env))
     if isinstance(env, EnvSpec):
-        _ = env.json_kwargs  # says which of them a run cannot record
+        _ = env.json_kwargs  # raises for kwargs that a run cannot record
 
 
 def check_rollout(config: AlgorithmConfig | None, space: gym.Space[Any]) -> None:

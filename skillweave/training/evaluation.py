@@ -1,6 +1,6 @@
-"""Evaluation: whole episodes on Gymnasium's own environment, each from a seed of its own.
+"""Evaluation: whole episodes in Gymnasium's own environments, each from its own seed.
 
-Or in a pool, which is faster, and where all episodes begin from one seed.
+A pool of environments is faster; all its episodes start from one seed.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ class Evaluation:
     """Scores of whole episodes; ``str()`` is a line for people.
 
     Raises:
-        DeclarationError: there is not one length for each return, or no episode at all.
+        DeclarationError: the numbers of returns and lengths differ, or there is no episode.
     """
 
     returns: tuple[float, ...]  # of each episode, in the environment's own reward
     lengths: tuple[AtLeastOne, ...]  # of each episode, in steps
     threshold: float | None  # the environment's reward_threshold
     skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
-    cut: Count = 0  # episodes that nothing had ended when they were cut
+    cut: Count = 0  # episodes that were cut at the step limit without an end
     succeeded: Count | None = None
-    """Episodes that succeeded by ``info["success"]`` of their last step; None: it is not there."""
+    """Episodes that succeeded by ``info["success"]`` of their last step; None: without that key."""
     reflexes: dict[str, Count] = field(default_factory=dict)
     """Steps in which each reflex acted, by its path."""
     alone: str | None = None
-    """The skill that acted alone; its report counts one call in each episode. None: all acted."""
+    """The skill that acted alone, with one call in each episode; None: the whole policy acted."""
 
     def __post_init__(self) -> None:
         if not self.returns or len(self.returns) != len(self.lengths):
@@ -94,18 +94,18 @@ class Evaluation:
 
     @property
     def success_rate(self) -> float | None:
-        """Share of episodes that succeeded; None: the environment does not say."""
+        """Share of episodes that succeeded; None: unknown."""
         return None if self.succeeded is None else self.succeeded / len(self.returns)
 
     def to_json(self) -> dict[str, Any]:
-        """The summary as plain JSON."""
+        """Return the summary as plain JSON."""
         returns = np.array(self.returns)
         n = len(returns)
         std = float(returns.std(ddof=1)) if n > 1 else 0.0
         half = float(1.96 * std / np.sqrt(n))
         total = all_steps(self.skills)
         skills = {name: report.to_json(total) for name, report in self.skills.items()}
-        found = {
+        summary = {
             "episodes": n,
             "mean": self.mean,
             "std": std,
@@ -127,10 +127,10 @@ class Evaluation:
                 for name, steps in self.reflexes.items()
             },
         }
-        return found if self.alone is None else found | {"skill": self.alone}
+        return summary if self.alone is None else summary | {"skill": self.alone}
 
     def for_people(self) -> str:
-        """``str()``, and for a hierarchy a table of its skills, and what looks like a mistake."""
+        """Return ``str()``, and for a hierarchy a table of its skills and hints of mistakes."""
         skills = [skill_table(self.skills)] if self.skills else []
         reflexes = reflex_lines(self.reflexes, sum(self.lengths))
         return printable("\n".join([str(self), *skills, *reflexes, *hints(self.skills)]))
@@ -141,9 +141,9 @@ class Evaluation:
     def _repr_html_(self) -> str:
         """Return the same as ``for_people``, for notebooks."""
         head, *rows = skill_rows(self.skills)
-        parts = [table(head, rows)] if rows else []
-        told = [*reflex_lines(self.reflexes, sum(self.lengths)), *hints(self.skills)]
-        return joined([paragraph(self), *parts, *map(paragraph, told)])
+        tables = [table(head, rows)] if rows else []
+        lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *hints(self.skills)]
+        return joined([paragraph(self), *tables, *map(paragraph, lines)])
 
     def __str__(self) -> str:
         j = self.to_json()
@@ -169,18 +169,20 @@ class Evaluation:
 
 
 def interquartile_mean(values: Array) -> float:
-    """Mean of the middle half (Agarwal et al. 2021); the ends of the half count in part."""
+    """Return the mean of the middle half (Agarwal et al. 2021); its ends count in part."""
     return float(interquartile_means(values))
 
 
 def interquartile_means(values: Array) -> Array:
-    """The same over the first axis of an array (n, …): (…)."""
+    """Return interquartile means over the first axis of an array (n, …): (…)."""
     x = np.sort(np.asarray(values, float), axis=0)
     n = len(x)
-    cut = n / 4
-    weight = np.clip(np.minimum(np.arange(1, n + 1) - cut, n - cut - np.arange(n)), 0.0, 1.0)
-    found: Array = np.tensordot(weight, x, axes=1) / weight.sum()
-    return found
+    quarter = n / 4
+    weight = np.clip(
+        np.minimum(np.arange(1, n + 1) - quarter, n - quarter - np.arange(n)), 0.0, 1.0
+    )
+    means: Array = np.tensordot(weight, x, axes=1) / weight.sum()
+    return means
 
 
 @checked_names
@@ -199,30 +201,31 @@ def evaluate(
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
     Args:
-        policy: who acts; one made elsewhere (``from_function``) takes the environment's spaces.
+        policy: the acting policy; one of ``from_function`` gets the environment's spaces.
         env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
-        seed: picks the episodes; the same seed gives the same starts to every policy.
-        deterministic: act greedily, else sample. Skills of a hierarchy that was kept because they
-            sample do so in any case. A step's random numbers are drawn for all environments
-            together, so that what is sampled differs with ``num_envs``.
+        seed: of the episodes; the same seed gives the same starts to every policy.
+        deterministic: act greedily, else sample. Skills of a hierarchy that was chosen because
+            they sample do so in any case. A step's random numbers are drawn for all environments
+            together, so samples differ with ``num_envs``.
         num_envs: environments side by side, as many as exist at once; does not change the result
             of a greedy policy. None: ``USUAL_ENVS``. In a pool there is one for each episode, so
             at most 65,536.
-        max_steps: an episode that nothing has ended by then is cut, and counted as such; None:
-            as many as the environment's own time limit, or 10,000 where none is known.
-        watch: is shown every step that is played.
+        max_steps: an episode without an end by then is cut, and counted as such; None: the
+            environment's own time limit, or 10,000 where none is known.
+        watch: called with every step that is played.
         engine: "sync": Gymnasium's own environments; "envpool": a pool of EnvPool's; "auto": a
-            pool where there can be one. That is faster, and the episodes are other ones.
+            pool where possible. A pool is faster, and plays other episodes.
 
     Returns:
-        Returns, lengths, and what each skill did.
+        Returns, lengths, and a report of each skill.
 
     Raises:
         PolicyError: the policy was made for other spaces.
-        DeclarationError: there is no such engine.
-        EnvError: the environment cannot be made, or there is no pool of it.
+        DeclarationError: the engine does not exist.
+        EnvError: the environment cannot be made, or not in a pool.
     """
-    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
+    episodes = whole_number(episodes, "episodes", 1)
+    seed = whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
@@ -240,7 +243,7 @@ def _evaluate(
     limit: int | None,
     watch: Callable[[Played], None] | None,
 ) -> Evaluation:
-    longest, threshold, pooled = _about(spec)
+    default_limit, threshold, pooled = _describe(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
     try:
         spaces = envs.observation_space, envs.action_space
@@ -250,7 +253,7 @@ def _evaluate(
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS
-        starts = SeededEpisodes(envs, seeds, limit or longest)
+        starts = SeededEpisodes(envs, seeds, limit or default_limit)
         first = starts.obs[:1].copy()
         moments = play(
             policy,
@@ -258,16 +261,16 @@ def _evaluate(
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        found = replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
+        evaluation = replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
         if not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
-        return found
+        return evaluation
     finally:
         envs.close()
 
 
-def _about(spec: EnvSpec) -> tuple[int, float | None, bool]:
-    """The longest episode, the return at which it is solved, and whether there is a pool."""
+def _describe(spec: EnvSpec) -> tuple[int, float | None, bool]:
+    """Return an environment's longest episode, reward threshold, and True if it is in a pool."""
     env = spec.make()
     try:
         threshold = env.spec.reward_threshold if env.spec else None
@@ -280,7 +283,7 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
     """Warn if the seed of the first episode does not start it again in a used environment.
 
     Args:
-        first: the observation (1, *obs_shape) that it began with.
+        first: its first observation (1, *obs_shape).
     """
     try:
         again = envs.reset_some(np.zeros(1, np.int64), [seed])
@@ -290,14 +293,14 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
         notice(
             f"{name}: reset(seed={seed}) starts another episode than it did in the same "
             "environment before. Scores depend on how many episodes an environment has played "
-            "already, and so on num_envs. Let reset() forget what was, and draw from "
-            "self.np_random alone; or give each episode an environment of its own: "
+            "already, and so on num_envs. Let reset() clear all state, and draw random numbers "
+            "from self.np_random alone; or use one environment for each episode: "
             "num_envs=episodes"
         )
 
 
 def episode_seeds(seed: int, episodes: int) -> list[int]:
-    """The seeds that an evaluation's episodes start from; training uses none of them."""
+    """Return the seeds of an evaluation's episodes; training uses none of them."""
     return [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
 
 
@@ -307,8 +310,10 @@ def _scored(
     moments: Iterator[Played],
     watch: Callable[[Played], None] | None,
 ) -> Evaluation:
-    """The scores of episodes as they are played."""
-    returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
+    """Play all episodes and return their scores."""
+    returns = np.zeros(episodes)
+    lengths = np.zeros(episodes, np.int64)
+    cut = 0
     alone, tally = tally_of(policy, episodes)
     reflexes = ReflexTally(policy)
     success = np.full(episodes, np.nan)
@@ -318,9 +323,9 @@ def _scored(
         cut += int(played.cut.sum())
         tally.add(played)
         reflexes.add(played)
-        told = told_success(played.step.info, len(played.rows))
-        if told is not None:
-            success[played.episode[played.over]] = told[played.over]
+        succeeded = told_success(played.step.info, len(played.rows))
+        if succeeded is not None:
+            success[played.episode[played.over]] = succeeded[played.over]
         if watch is not None:
             watch(played)
     return Evaluation(
@@ -336,11 +341,11 @@ def _scored(
 
 
 def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:
-    for kind, mine, theirs in (
+    for kind, of_policy, of_env in (
         ("observation", policy.observation_space, observation),
         ("action", policy.action_space, action),
     ):
-        if not same_space(mine, theirs):
+        if not same_space(of_policy, of_env):
             raise PolicyError(
-                f"the policy was made for the {kind} space {mine}, but {name} has {theirs}"
+                f"the policy was made for the {kind} space {of_policy}, but {name} has {of_env}"
             )

@@ -20,13 +20,14 @@ from skillweave.runs.trackers import steps_of, trackers_of
 from skillweave.settings import Count
 from skillweave.training.evaluation import Evaluation
 
-SCORE, SAMPLED = "evaluation.json", "evaluation-sampled.json"
+SCORE = "evaluation.json"
+SAMPLED = "evaluation-sampled.json"
 CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_rate"}
-"""What trackers are sent of each skill, and where it stands in its report."""
+"""Charts of each skill for trackers, and the key of its report that each shows."""
 
 
 class EvaluationFile(TypedDict):
-    """What the file holds."""
+    """Content of the file."""
 
     run: NotRequired[str]
     made: str
@@ -45,32 +46,32 @@ class SavedEvaluation:
     evaluation: Evaluation
 
     def to_json(self) -> dict[str, Any]:
-        """The summary as plain JSON, with how it was made."""
-        how = {"made": self.made, "seed": self.seed, "deterministic": self.deterministic}
-        return how | self.evaluation.to_json()
+        """Return the summary as plain JSON, with time, seed and kind of the evaluation."""
+        header = {"made": self.made, "seed": self.seed, "deterministic": self.deterministic}
+        return header | self.evaluation.to_json()
 
 
 def save_evaluation(
     run: RunDirectory, evaluation: Evaluation, seed: int, deterministic: bool
 ) -> None:
-    """Write it into the run, in place of the one before, and send it to the run's trackers.
+    """Write an evaluation into the run, in place of the previous one, and send it to the trackers.
 
-    One that samples on request (``deterministic=False``) replaces only the one that sampled before.
+    An evaluation that samples on request (``deterministic=False``) replaces only one of its kind.
 
     Raises:
-        RunError: the disk is full or cannot be written; what was there is intact. Or the
-            run is one of ``from_hub``.
+        RunError: the disk is full or cannot be written; the previous file is intact. Or
+            the run is one of ``from_hub``.
     """
     must_be_own(run.path)
-    found = EvaluationFile(
+    content = EvaluationFile(
         made=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         seed=seed,
         deterministic=deterministic,
         evaluation=evaluation,
     )
     if "id" in run.manifest:
-        found["run"] = run.manifest["id"]
-    plain = {**found, "evaluation": asdict(evaluation)}
+        content["run"] = run.manifest["id"]
+    plain = {**content, "evaluation": asdict(evaluation)}
     write_json(run.path / _name(deterministic), plain, make_directories=False)
     _track(run, evaluation)
 
@@ -81,11 +82,11 @@ def _name(deterministic: bool) -> str:
 
 
 def _track(run: RunDirectory, evaluation: Evaluation) -> None:
-    """Charts of the whole policy: its return, and of each skill usage, call length and success."""
+    """Send charts to the trackers: the return; of each skill usage, call length and success."""
     scores = {"return_mean": evaluation.mean}
-    told = evaluation.to_json()["skills"]
+    skills = evaluation.to_json()["skills"]
     for kind, key in CHARTS.items():
-        scores |= {f"{kind}/{k}": v[key] for k, v in told.items() if v[key] is not None}
+        scores |= {f"{kind}/{k}": v[key] for k, v in skills.items() if v[key] is not None}
     with trackers_of(run) as trackers:
         for tracker in trackers:
             tracker.stage("evaluation", 0)
@@ -105,12 +106,12 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     if not path.exists():
         return None
     data = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
-    found: EvaluationFile = fit(EvaluationFile, data, str(path))
+    content: EvaluationFile = fit(EvaluationFile, data, str(path))
     names = {entry["name"] for entry in run.manifest.get("skills", [])}
-    ours = found.get("run") == run.manifest.get("id")
-    told = {name.partition("/")[0] for name in found["evaluation"].skills}
-    if not ours or not told <= names:  # a ready hierarchy's own skills are not the run's
+    ours = content.get("run") == run.manifest.get("id")
+    top_level = {name.partition("/")[0] for name in content["evaluation"].skills}
+    if not ours or not top_level <= names:  # a ready hierarchy's own skills are not the run's
         raise RunError(f"{path} belongs to another run; delete it, and evaluate again")
     return SavedEvaluation(
-        found["made"], found["seed"], found["deterministic"], found["evaluation"]
+        content["made"], content["seed"], content["deterministic"], content["evaluation"]
     )

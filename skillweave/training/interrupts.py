@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM while a stage trains: the first one asks for a checkpoint, the next stops.
+"""Ctrl-C and SIGTERM while a stage trains: the first requests a checkpoint, the next stops.
 
-Only the main thread receives signals, and only signals that Python or the system would handle by
-default are taken over: a program that has a handler of its own keeps it.
+Only the main thread receives signals, and only signals with the default handler of Python or the
+system are handled here: a program keeps its own handlers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _received: list[str] = []  # names of signals, while they are deferred
 def deferred(until: str) -> Iterator[None]:
     """Let the first interrupt set ``requested`` and the second one raise KeyboardInterrupt.
 
-    An interrupt that nothing has stopped for by the end raises KeyboardInterrupt then.
+    An interrupt that is still unhandled at the end raises KeyboardInterrupt then.
 
     Args:
         until: when training stops, for the message.
@@ -56,10 +56,10 @@ def deferred(until: str) -> Iterator[None]:
 
 
 def requested() -> bool:
-    """Return whether training is to save and stop."""
+    """Return True if training is to save and stop."""
     return bool(_received)
 
 
 def stop() -> NoReturn:
-    """Stop for the interrupt that came."""
+    """Raise KeyboardInterrupt for a deferred interrupt."""
     raise KeyboardInterrupt

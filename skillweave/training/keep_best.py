@@ -13,11 +13,11 @@ from skillweave.types import prefixed, unprefixed
 
 
 class KeepBest:
-    """The best evaluation of a stage so far, and what all its learners had learnt then.
+    """The best evaluation of a stage so far, with the learners' states at that time.
 
     Args:
-        of: what decides: the mean return, or the share of episodes that succeed (of equal ones the
-            mean return). Of equal evaluations the latest counts, as it has learnt for longer.
+        of: the criterion: the mean return, or the share of episodes that succeed (then the mean
+            return). Of equal evaluations the latest counts, as it learnt from more steps.
     """
 
     def __init__(self, of: Literal["return", "success"]) -> None:
@@ -25,31 +25,32 @@ class KeepBest:
         self.steps = 0
         """Environment steps of the stage at this evaluation."""
         self.metrics: dict[str, float] = {}
-        """Of this evaluation; empty: there was none."""
+        """Metrics of this evaluation; empty: none yet."""
         self.states: dict[str, Any] = {}
-        """By name, whole states of learners, on the CPU."""
+        """Whole states of the learners, by name, on the CPU."""
 
     @property
     def value(self) -> float:
-        """What the best evaluation found."""
+        """The best evaluation's value of the criterion."""
         return self.metrics[f"eval_{self.of}"]
 
     def see(
         self, evaluation: Mapping[str, float], steps: int, states: Callable[[], dict[str, Any]]
     ) -> None:
-        """Take an evaluation into account; an empty one is none.
+        """Compare an evaluation with the best so far; an empty one is skipped.
 
         Args:
             evaluation: its metrics.
             steps: of the stage.
-            states: returns what learners have learnt now.
+            states: returns the present states of the learners.
         """
         value = evaluation.get(f"eval_{self.of}", math.nan)
         if math.isnan(value):  # no evaluation, or none of its episodes could start
             return
         if self.metrics and self._rank(evaluation) < self._rank(self.metrics):
             return
-        self.steps, self.metrics = steps, dict(evaluation)
+        self.steps = steps
+        self.metrics = dict(evaluation)
         # Learners change their tensors in place.
         self.states = {name: _copied(state) for name, state in states().items()}
 
@@ -57,17 +58,17 @@ class KeepBest:
         return metrics[f"eval_{self.of}"], metrics["eval_return"]
 
     def header(self) -> dict[str, Any]:
-        """Return what the header of a checkpoint holds."""
+        """Return the entries for the header of a checkpoint."""
         if not self.metrics:
             return {}
         return {"kept_best": {"steps": self.steps, "metrics": self.metrics}}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what a checkpoint holds beside the header."""
-        found: dict[str, Tensor] = {}
+        """Return the tensors for a checkpoint."""
+        tensors: dict[str, Tensor] = {}
         for name, state in self.states.items():
-            found |= prefixed(f"best.{name}", vars(state))
-        return found
+            tensors |= prefixed(f"best.{name}", vars(state))
+        return tensors
 
     def load(
         self,
@@ -76,21 +77,22 @@ class KeepBest:
         like: Mapping[str, Any],
         where: str,
     ) -> None:
-        """Go on from a checkpoint.
+        """Restore the best evaluation from a checkpoint.
 
         Args:
             header: of the checkpoint.
             extra: its tensors beside the state.
-            like: by name, states of the shapes that the learners have.
+            like: states of the learners' shapes, by name.
             where: the run, for messages.
         """
         if (best := header.get("kept_best")) is None:
             return
-        self.steps, self.metrics = int(best["steps"]), dict(best["metrics"])
+        self.steps = int(best["steps"])
+        self.metrics = dict(best["metrics"])
         saved = unprefixed("best", dict(extra))
         self.states = {
-            name: state_from(unprefixed(name, saved), own, f"{where}: the best of {name}")
-            for name, own in like.items()
+            name: state_from(unprefixed(name, saved), example, f"{where}: the best of {name}")
+            for name, example in like.items()
         }
 
 

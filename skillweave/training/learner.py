@@ -1,7 +1,7 @@
-"""Learners: what they keep of experience, and when they learn from it.
+"""Learners: storage of experience, and updates from it.
 
-A loop knows of one interface: ``request`` says what collectors are to do next, ``take`` keeps what
-they found, ``learn`` turns it into new parameters.
+A loop uses one interface: ``request`` returns the next task of the collectors, ``take`` stores the
+result, ``learn`` updates the parameters.
 """
 
 from __future__ import annotations
@@ -29,95 +29,103 @@ class Stack:
     state: Any  # of P members
 
     def __post_init__(self) -> None:
-        self.algorithm.check_state(self.state)  # it may be one that was read from a file
+        self.algorithm.check_state(self.state)  # the state may come from a file
 
     @property
     def members(self) -> int:
-        """P."""
+        """Number of members, P."""
         return len(self.state.params)
 
 
 class Learner(Protocol):
-    """Stacks that learn from what they did."""
+    """Stacks that learn from their own experience."""
 
     @property
     def stacks(self) -> Sequence[Stack]:
-        """Side by side."""
+        """The stacks, side by side."""
         ...
 
     overlap: bool
-    """It may learn on a thread of its own, while the next experience is collected."""
+    """True if it may learn on a separate thread while the next experience is collected."""
     report_every: int
     """Environment steps between reports; 0: after every update."""
     threads: int
 
     def request(self, update: int, steps: int, progress: float) -> Request:
-        """What collectors are to do next."""
+        """Return the next task of the collectors."""
         ...
 
     def take(self, batches: Mapping[str, Batch]) -> None:
-        """Store what was collected by the latest request, by path; "" where there is one."""
+        """Store the batches of the latest request, by path; "" for a single learner."""
         ...
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
-        """Learn what is due; metrics (P,), none where nothing was."""
+        """Make the updates that are due; return metrics (P,), {} where none was due."""
         ...
 
     def cut(self, columns: Array) -> None:
-        """The environments of ``columns`` (k,) begin anew."""
+        """End the open trajectories of ``columns`` (k,), whose environments were reset."""
         ...
 
     def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
-        """Return what going on exactly needs beside the states of the stacks.
+        """Return the tensors that an exact continuation needs beside the states of the stacks.
 
         Args:
-            requested: the latest request is not yet answered; the parameters it acts by are a part
-                of this, as with overlap they are one update older than the states.
-            replay: with replay buffers, if the settings save them.
+            requested: the latest request is still unanswered; its acting parameters are included,
+                as with overlap they are one update older than the states.
+            replay: include replay buffers, if the settings save them.
         """
         ...
 
     def load(self, kept: dict[str, Tensor]) -> None:
-        """The inverse of ``kept``."""
+        """Restore the tensors that ``kept`` returned."""
         ...
 
 
 class RolloutLearner:
-    """One stack that learns from its latest rollout, then forgets it.
+    """Learner of one stack from its latest rollout, which is used once.
 
     Args:
-        quota: valid rows that each member collects before it learns; 0: what there is.
+        quota: valid rows that each member collects before it learns; 0: any number.
     """
 
     report_every = 0
 
     def __init__(self, stack: Stack, seeds: Seeds, quota: int = 0) -> None:
-        self.stacks, self._stack, self._seeds = (stack,), stack, seeds
+        self.stacks = (stack,)
+        self._stack = stack
+        self._seeds = seeds
         config = stack.algorithm.config
-        self.overlap, self.threads = bool(config.overlap), int(config.threads)
+        self.overlap = bool(config.overlap)
+        self.threads = int(config.threads)
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
         self.reference: Reference | None = None
-        """The policy that it is to stay near, if there is one."""
-        self._progress = 0.0  # where the rollout began, so that the first has the whole rate
+        """The reference policy that it stays near; None: without one."""
+        self._progress = 0.0  # at the start of the rollout, so that the first has the whole rate
         self._resumed: ActingParams | None = None  # of the first request after a checkpoint
 
     def request(self, update: int, steps: int, progress: float) -> Request:
-        """A rollout of ``n_steps`` environment steps of each environment."""
+        """Return a request for a rollout of ``n_steps`` steps of each environment."""
         algorithm, state = self._stack.algorithm, self._stack.state
-        params, self._resumed = self._resumed or algorithm.acting_params(state, progress), None
-        seeds = self._seeds / "collect" / update
-        self._asked = params, progress
-        rows, gamma = algorithm.config.n_steps, state.gamma.cpu().numpy()
-        return Request(rows, (params,), gamma, seeds, record=algorithm.raw)
+        params = self._resumed or algorithm.acting_params(state, progress)
+        self._resumed = None
+        self._requested = params, progress
+        return Request(
+            algorithm.config.n_steps,
+            (params,),
+            state.gamma.cpu().numpy(),
+            self._seeds / "collect" / update,
+            record=algorithm.raw,
+        )
 
     def take(self, batches: Mapping[str, Batch]) -> None:
-        """Keep a rollout, and what it was collected with."""
-        params, self._progress = self._asked
+        """Store a rollout, with the exploration noise of its acting policy."""
+        params, self._progress = self._requested
         log_std = params.views.get("actor.log_std")
         self._store.add(batches[""], None if log_std is None else log_std[:, None])
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
-        """An update, where there was something to learn from."""
+        """Make an update if the store has enough rows."""
         stack = self._stack
         gamma, reference = stack.state.gamma, self.reference
         rollout = self._store.rollout(gamma, self._progress, reference)
@@ -134,18 +142,18 @@ class RolloutLearner:
         return metrics
 
     def cut(self, columns: Array) -> None:
-        """Nothing to do: trajectories end with each experience."""
+        """Do nothing: trajectories end with each batch."""
 
     def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
-        """Rows of which there are not enough yet, what a nat of divergence costs, who acts next."""
+        """Return stored rows, the KL coefficient, and the next acting parameters."""
         reference = self.reference
         coef = {} if reference is None else {"reference_coef": reference.coef.cpu().clone()}
-        params, _ = self._asked
+        params, _ = self._requested
         acting = prefixed("acting", params.state()) if requested else {}
         return self._store.state() | coef | acting
 
     def load(self, kept: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint kept."""
+        """Restore the tensors of a checkpoint."""
         algorithm = self._stack.algorithm
         acting = unprefixed("acting", kept)
         self._resumed = acting_of(self._stack, acting) if acting else None
@@ -153,7 +161,7 @@ class RolloutLearner:
         if self.reference is not None:
             coef = kept["reference_coef"]
             if coef.shape != self.reference.coef.shape or not bool(coef.isfinite().all()):
-                raise ValueError(f"the price of divergence is {coef.tolist()}")
+                raise ValueError(f"the KL coefficient is {coef.tolist()}")
             self.reference.coef = coef.to(self.reference.coef.device)
 
 
@@ -161,11 +169,11 @@ def acting_of(stack: Stack, saved: dict[str, Tensor]) -> ActingParams:
     """Return the acting parameters of a stack whose state was ``saved``.
 
     Raises:
-        ValueError: it does not fit.
+        ValueError: the tensors do not fit.
     """
-    found: ActingParams = stack.algorithm.acting_params(stack.state, 0.0)
-    found.load(saved)
-    return found
+    params: ActingParams = stack.algorithm.acting_params(stack.state, 0.0)
+    params.load(saved)
+    return params
 
 
 def keep_to_guide(learner: Learner, target_kl: float | None) -> None:
@@ -189,10 +197,10 @@ def adapted(coef: Tensor, kl: Tensor, target_kl: float) -> Tensor:
 
 
 def member_seeds(seeds: Seeds, name: str, members: int, update: int, first: int = 0) -> list[Seeds]:
-    """A node of the seed tree for each member from ``first`` on."""
+    """Return a node of the seed tree for each member from ``first`` on."""
     return [seeds / name / (first + member) / update for member in range(members)]
 
 
 def crossed(every: int, before: int, after: int) -> bool:
-    """Whether a multiple of ``every`` lies between ``before`` and ``after``, or is ``after``."""
+    """Return True if a multiple of ``every`` is above ``before``, up to ``after``."""
     return after // every > before // every

@@ -1,13 +1,12 @@
-"""The loop of all training: collect, keep, learn, report, and now and then a checkpoint.
+"""The loop of all training: collect, store, learn, report, and write checkpoints.
 
-Where the learner may, learning overlaps with collecting: while it learns from one experience on a
-thread of its own, the next one is collected with the parameters from before. The lag is always
-exactly one update, so a run is as reproducible as without it.
+Where the learner allows it, learning overlaps with collecting: while the learner updates on a
+separate thread, the next batch is collected with the previous parameters. The lag is always exactly
+one update, so a run is as reproducible as without overlap.
 
-A checkpoint changes nothing: rows are requested, updates made and reports written in the same order
-with checkpoints at any places, or with none. The next rows are already requested when one is
-written, so it holds the parameters by which they are collected, too, and an update's metrics that
-are not reported yet.
+A checkpoint changes nothing: requests, updates and reports come in the same order with checkpoints
+at any places, or with none. The next rows are already requested when a checkpoint is written, so it
+also holds the parameters that collect them, and the metrics of an update without a report.
 """
 
 from __future__ import annotations
@@ -33,24 +32,24 @@ from skillweave.training.learner import Learner, crossed
 from skillweave.types import Array, prefixed, unprefixed
 
 CHECKPOINT_SECONDS = 60.0
-"""A checkpoint is written when the latest one is this old."""
+"""Age of the latest checkpoint in seconds at which the next one is written."""
 CHECKPOINT_SHARE = 0.05
 """The largest share of time for checkpoints by time; large ones are written less often."""
 
 
 @dataclass
 class Report:
-    """What is to be reported of an update that was begun."""
+    """Pending report of an update that has started."""
 
     update: int  # its number, from 1 on
-    steps: int  # when it is done
-    due: bool  # it is to be reported
-    summary: dict[str, float]  # of the episodes, when it began
+    steps: int  # at its end
+    due: bool  # it is written
+    summary: dict[str, float]  # of the episodes, at its start
 
 
 @dataclass
 class Progress:
-    """Where training stands."""
+    """Counts and pending metrics of a stage's training."""
 
     update: int = 0
     steps: int = 0  # environment steps
@@ -58,12 +57,12 @@ class Progress:
     reported: int = 0
     """Environment steps at the latest report."""
     report: Report | None = None
-    """Of the latest update, where it is not reported yet."""
+    """Report of the latest update, until it is written."""
     metrics: dict[str, Tensor] = field(default_factory=dict)
-    """The latest of each, (P,), since the latest report."""
+    """Latest value of each metric, (P,), since the latest report."""
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint needs beside ``update``, ``steps`` and ``seconds``."""
+        """Return tensors for a checkpoint, beside ``update``, ``steps`` and ``seconds``."""
         report = self.report or Report(0, 0, False, {})
         numbers = [self.reported, report.update, report.steps, int(report.due)]
         summary = {
@@ -77,12 +76,13 @@ class Progress:
         )
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Take over a ``state``.
+        """Restore a ``state``.
 
         Raises:
-            ValueError: it does not fit.
+            ValueError: the tensors do not fit.
         """
-        counts, metrics = state["report"], unprefixed("metrics", state)
+        counts = state["report"]
+        metrics = unprefixed("metrics", state)
         summary = unprefixed("summary", state)
         if counts.shape != (4,) or counts.dtype != torch.int64 or not bool((counts >= 0).all()):
             raise ValueError("its latest report is no row of four counts")
@@ -93,14 +93,15 @@ class Progress:
             raise ValueError("its metrics are no rows of numbers")
         if any(v.ndim or v.dtype != torch.float64 for v in summary.values()):
             raise ValueError("its means of episodes are no numbers")
-        self.reported, self.metrics = reported, metrics
+        self.reported = reported
+        self.metrics = metrics
         means = {k: float(v) for k, v in summary.items()}
         self.report = Report(update, steps, bool(due), means) if update else None
 
 
 @dataclass
 class Saved:
-    """What a checkpoint holds."""
+    """Content of a checkpoint."""
 
     at: Progress
     states: list[Any]  # of each stack
@@ -129,25 +130,26 @@ def train(
 
     Args:
         collectors: fresh or already started.
-        episodes: the latest ones, for the metrics; added to.
+        episodes: the latest episodes, for the metrics; new ones are added.
         schedule_steps: steps at which schedules end; None: the budget.
-        skip_diverged: a member that diverges does not stop the others.
+        skip_diverged: continue where a member diverges.
         checkpoint_every: environment steps between checkpoints. They are also written by time
             (``CHECKPOINT_SECONDS``), and on an interrupt.
         on_tick: called with each report; may raise to stop.
-        on_checkpoint: writes a checkpoint; None: none is written, and an interrupt is not for this
-            loop.
+        on_checkpoint: writes a checkpoint; None: the loop writes none, and ignores interrupts.
 
     Returns:
-        Where training stands.
+        Counts at the end of training.
 
     Raises:
         TrainingError: parameters or losses are no longer finite.
-        KeyboardInterrupt: an interrupt came, and a checkpoint is written.
+        KeyboardInterrupt: after an interrupt, when a checkpoint is written.
     """
     loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)
-    loop.schedule_steps, loop.skip_diverged = schedule_steps or budget, skip_diverged
-    loop.checkpoint_every, loop.on_checkpoint = checkpoint_every, on_checkpoint
+    loop.schedule_steps = schedule_steps or budget
+    loop.skip_diverged = skip_diverged
+    loop.checkpoint_every = checkpoint_every
+    loop.on_checkpoint = on_checkpoint
     with torch_threads(1 if learner.overlap else learner.threads):
         try:
             collectors.start(seeds / "start")
@@ -177,21 +179,26 @@ class _Loop:
         at: Progress,
         on_tick: OnTick | None,
     ) -> None:
-        self.learner, self.collectors = learner, collectors
-        self.episodes, self.seeds = episodes, seeds
-        self.at, self._on_tick = at, on_tick
+        self.learner = learner
+        self.collectors = collectors
+        self.episodes = episodes
+        self.seeds = seeds
+        self.at = at
+        self._on_tick = on_tick
         self._started = time.perf_counter() - at.seconds
         self._thread = WorkThread("learner", learner.threads)
         self._pending: Future[dict[str, Tensor]] | None = None
-        self._saved_at, self._saving_took = time.perf_counter(), 0.0
+        self._saved_at = time.perf_counter()
+        self._saving_took = 0.0
 
     def round(self, budget: int) -> None:
-        """Collect, and learn from it, or begin to."""
+        """Collect once, and learn from the result, or start to."""
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._request)
         self.report()
-        before, at.steps = at.steps, at.steps + collected.steps
-        update, at.update = at.update, at.update + 1
+        before, update = at.steps, at.update
+        at.steps += collected.steps
+        at.update += 1
         over = at.steps >= budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
@@ -200,7 +207,7 @@ class _Loop:
         if learner.overlap and not over:
             self.request()  # before the parameters change
         every = learner.report_every
-        self._begin(update, not every or over or crossed(every, before, at.steps))
+        self._start_update(update, not every or over or crossed(every, before, at.steps))
         if not learner.overlap:
             self.report()
             if not over:
@@ -209,43 +216,47 @@ class _Loop:
             self._save_if_due(before)
 
     def request(self) -> None:
-        """Decide what is collected next, with the parameters as they are now."""
+        """Prepare the next request with the present parameters."""
         at = self.at
         self._request = self.learner.request(at.update, at.steps, self._progress(at.steps))
 
-    def _begin(self, update: int, due: bool) -> None:
-        """Learn, on the thread if it may overlap; the update is reported if that is due."""
-        about = update, self.at.steps, self._progress(self.at.steps)
-        # Means of the episodes are of this moment, however long the update takes.
+    def _start_update(self, update: int, due: bool) -> None:
+        """Learn, on the thread if the learner overlaps; write a report later if it is due."""
+        arguments = update, self.at.steps, self._progress(self.at.steps)
+        # The means of episodes are of this moment, whatever the length of the update.
         summary = self.episodes.summary() if due and self._on_tick is not None else {}
         self.at.report = Report(update + 1, self.at.steps, due, summary)
         if self.learner.overlap:
-            self._pending = self._thread.submit(self.learner.learn, *about)
+            self._pending = self._thread.submit(self.learner.learn, *arguments)
         else:
-            self.at.metrics |= self.learner.learn(*about)
+            self.at.metrics |= self.learner.learn(*arguments)
 
     def _finish_update(self) -> None:
-        """Wait for a pending update."""
+        """Finish a pending update: wait for it, and keep its metrics."""
         if self._pending is not None:
-            metrics, self._pending = self._pending.result(), None
+            metrics = self._pending.result()
+            self._pending = None
             self.at.metrics |= metrics
 
     def report(self) -> None:
-        """Let a pending update end, and report it."""
+        """Finish a pending update, and write its report."""
         self._finish_update()
-        report, self.at.report = self.at.report, None
+        report = self.at.report
+        self.at.report = None
         if report is None or not report.due:
             return
         self._take_time()
         metrics = to_numbers(self.at.metrics, report.update, skip_diverged=self.skip_diverged)
-        self.at.metrics, since, self.at.reported = {}, self.at.reported, report.steps
+        since = self.at.reported
+        self.at.reported = report.steps
+        self.at.metrics = {}
         if self._on_tick is not None:
             state = [stack.state for stack in self.learner.stacks]
             metrics |= report.summary
             self._on_tick(Tick(report.update, report.steps, since, self.at.seconds, metrics, state))
 
     def close(self) -> None:
-        """Stop; a pending update is finished first, as it changes states in place."""
+        """Stop after a pending update, as it changes states in place."""
         self._thread.close()
 
     def _progress(self, steps: int) -> float:
@@ -255,7 +266,7 @@ class _Loop:
         self.at.seconds = time.perf_counter() - self._started
 
     def _save_if_due(self, before: int) -> None:
-        """Write a checkpoint if it is time to, or if an interrupt came; then stop for that."""
+        """Write a checkpoint if it is due or after an interrupt; then stop for the interrupt."""
         if self.on_checkpoint is None:
             return
         stopping = interrupts.requested()
@@ -265,19 +276,19 @@ class _Loop:
             interrupts.stop()
 
     def is_due(self, before: int) -> bool:
-        """Whether a checkpoint is to be written; ``before`` are the steps before this round."""
+        """Return True if a checkpoint is due; ``before`` are the steps before this round."""
         age = time.perf_counter() - self._saved_at
         by_time = age > max(CHECKPOINT_SECONDS, self._saving_took / CHECKPOINT_SHARE)
         return by_time or crossed(self.checkpoint_every, before, self.at.steps)
 
     def _save(self) -> None:
-        """Write a checkpoint; the next rows are requested already, and stay so."""
+        """Write a checkpoint; the request of the next rows stays open."""
         assert self.on_checkpoint is not None
         since = time.perf_counter()
         arrays = self.collectors.state()  # while the learner learns
         self._finish_update()
         if not all(bool(torch.isfinite(v).all()) for v in self.at.metrics.values()):
-            return  # it has diverged, as the next report says; the one before is better
+            return  # training has diverged, as the next report shows; keep the previous checkpoint
         differing = self.collectors.differing()
         if len(differing):
             self.learner.cut(differing)
@@ -298,21 +309,21 @@ def resume(
     saved: dict[str, Tensor],
     at: Progress,
 ) -> Array:
-    """Stand where a checkpoint left everything; (k,) environments that begin anew.
+    """Restore the state of a checkpoint; return environments (k,) that start new episodes.
 
-    They are those that did not repeat themselves.
+    These environments did not repeat their episodes exactly.
 
     Args:
-        saved: its ``extra``.
-        at: its steps; what else it says of them is added.
+        saved: the checkpoint's ``extra``.
+        at: its steps; the pending report is added.
     """
     arrays = {k: v.numpy() for k, v in unprefixed("collector", saved).items()}
     at.load(unprefixed("loop", saved))
     episodes.load(unprefixed("episodes", arrays))
-    begun = collectors.restore(arrays)
+    restarted = collectors.restore(arrays)
     learner.load(unprefixed("learner", saved))
-    learner.cut(begun)
-    return begun
+    learner.cut(restarted)
+    return restarted
 
 
 def begin_episodes(
@@ -322,15 +333,15 @@ def begin_episodes(
     at: Progress,
     seeds: Seeds,
 ) -> None:
-    """Continue a stage that had ended, in new episodes.
+    """Continue a finished stage in new episodes.
 
     Args:
         saved: the ``extra`` of its final state.
         at: its steps.
-        seeds: the stage's; the new episodes differ from those at its start.
+        seeds: of the stage; the new episodes differ from those at its start.
     """
     at.reported = at.steps
-    if kept := unprefixed("learner", saved):
-        learner.load(kept)
+    if learner_state := unprefixed("learner", saved):
+        learner.load(learner_state)
         learner.cut(np.arange(collectors.num_envs))
     collectors.start(seeds / "continued" / at.steps)

@@ -1,4 +1,4 @@
-"""Evaluating an agent while it trains: whole episodes in environments of their own."""
+"""Evaluation of an agent while it trains: whole episodes in separate environments."""
 
 from __future__ import annotations
 
@@ -16,31 +16,34 @@ from skillweave.types import Array
 
 
 class PeriodicEvaluation:
-    """Plays ``episodes`` episodes every so many steps of training; always the same starts.
+    """Evaluation by ``episodes`` episodes, always from the same starts, at intervals of training.
 
     Args:
-        every: steps; None: never.
-        num_envs: of training; there are no more here.
+        every: training steps between evaluations; None: no evaluations.
+        num_envs: of training; the most environments of an evaluation.
 
     Raises:
-        EnvError: no more environments can be made beside those of training.
+        EnvError: the environments cannot be made beside those of training.
     """
 
     def __init__(
         self, scene: Scene, seeds: Seeds, every: int | None, episodes: int, num_envs: int
     ) -> None:
         self._episodes = episodes
-        self._seeds, self._every = seeds / "probe", every
+        self._seeds = seeds / "probe"
+        self._every = every
         self._counted = 0
         self._ended = time.monotonic()
-        self.took, self.after = 0.0, 0.0
-        """Seconds of the latest evaluation, and of the training before it."""
+        self.took = 0.0
+        """Seconds of the latest evaluation."""
+        self.after = 0.0
+        """Seconds of the training before it."""
         self._arena: Collector | None = None
         if every is not None:
-            self._arena = self._made(scene, min(episodes, num_envs))
+            self._arena = self._make_arena(scene, min(episodes, num_envs))
 
     @staticmethod
-    def _made(scene: Scene, num_envs: int) -> Collector:
+    def _make_arena(scene: Scene, num_envs: int) -> Collector:
         try:
             return scene.collector(num_envs, None)
         except SkillweaveError as error:
@@ -71,27 +74,29 @@ class PeriodicEvaluation:
         if self._every is None or not (also or crossed(self._every, since, steps)):
             return {}
         assert self._arena is not None
-        began = time.monotonic()
-        told = self._played(self._arena, play)
-        self.after, self._ended = began - self._ended, time.monotonic()
-        self.took = self._ended - began
-        returns, success = told[:, RETURN], told[:, SUCCESS]
-        found = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
+        started = time.monotonic()
+        episodes = self._play_all(self._arena, play)
+        self.after = started - self._ended
+        self._ended = time.monotonic()
+        self.took = self._ended - started
+        returns, success = episodes[:, RETURN], episodes[:, SUCCESS]
+        metrics = {"eval_return": float(returns.mean()), "eval_return_min": float(returns.min())}
         if np.isnan(success).all():
-            return found
-        return found | {"eval_success": float((success == 1.0).mean())}
+            return metrics
+        return metrics | {"eval_success": float((success == 1.0).mean())}
 
-    def _played(self, arena: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
-        """All episodes, (n, 4 + I): one in each environment, and again until they are enough."""
-        told = [play(arena, self._seeds)]
+    def _play_all(self, arena: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
+        """Play all episodes, (n, 4 + I), in rounds of one episode in each environment."""
+        episodes = [play(arena, self._seeds)]
         rounds = -(-self._episodes // arena.num_envs)
-        told += [play(arena, self._seeds / "round" / i) for i in range(1, rounds)]
-        return np.concatenate(told)[: self._episodes]
+        episodes += [play(arena, self._seeds / "round" / i) for i in range(1, rounds)]
+        return np.concatenate(episodes)[: self._episodes]
 
     def spent(self) -> int:
-        """Environment steps made since this was last asked."""
+        """Return the environment steps since the previous call."""
         made = 0 if self._arena is None else self._arena.engine.steps_made
-        since, self._counted = made - self._counted, made
+        since = made - self._counted
+        self._counted = made
         return since
 
     def close(self) -> None:

@@ -19,13 +19,13 @@ from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage, target_of
 
 AGENT = "agent"
-"""What a plain agent's stage is named."""
+"""Name of a plain agent's stage."""
 
 
 @checked_names
 @dataclass
 class PlainAgent:
-    """An environment and who learns its own reward, with a budget in environment steps.
+    """An agent that learns an environment's own reward, with a budget in environment steps.
 
     Raises:
         DeclarationError: a setting is wrong; the message names it.
@@ -34,26 +34,26 @@ class PlainAgent:
     env: EnvValue
     """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     algorithm: AlgorithmSettings
-    """Its settings."""
+    """The algorithm's settings."""
     steps: AtLeastOne
     """Training budget in environment steps."""
     target_return: float | None = None
-    """Training ends early at this mean return of the periodic evaluation; None: it does not."""
+    """Training ends early at this mean return of the periodic evaluation; None: no target."""
     target_success: Share | None = None
     """Training ends early at this share of successful episodes (``info["success"]``)."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
     recorded = False
-    """It is of a run that was loaded without its code, and knows less than was declared."""
+    """True for a run that was loaded without its code; some of what was declared is missing."""
 
     def __post_init__(self) -> None:
         self.validate()
 
     def validate(self) -> None:
-        """Check every setting; training and loading do it again, as attributes may be set.
+        """Check every setting; training and loading call it again, as attributes may be set.
 
         Raises:
-            DeclarationError: something is wrong; the message names it.
+            DeclarationError: a setting is wrong; the message names it.
         """
         check_env(self.env)
         check_fields(self)
@@ -68,7 +68,7 @@ class PlainAgent:
         """Make the environment once, and return its spaces.
 
         Raises:
-            DeclarationError: the algorithm does not fit it.
+            DeclarationError: the algorithm does not fit the spaces.
         """
         spaces = self.spec.read_spaces()
         action_codec(spaces.action)
@@ -81,13 +81,21 @@ class PlainAgent:
         """Return its only stage."""
         target = target_of(self.target_return, self.target_success, AGENT)
         spec = self.spec
-        how = self.algorithm, self.steps, lambda _: skill_scene(spec), target
-        return [Stage(AGENT, "agent", *how)]
+        return [
+            Stage(
+                AGENT,
+                "agent",
+                self.algorithm,
+                self.steps,
+                lambda _: skill_scene(spec),
+                target,
+            )
+        ]
 
     def manifest(self, seed: int, how: TrainDefaults | None = None) -> dict[str, Any]:
         """Return the content of a new run's ``run.json``, for this ``seed``.
 
-        ``how``: evaluation and checkpoints; None: as ``train_defaults`` says.
+        ``how``: evaluation and checkpoints; None: ``train_defaults``.
         """
         how = how or self.train_defaults
         (stage,) = self.stages()
@@ -109,5 +117,5 @@ class PlainAgent:
 
 
 def load_agent_of(run: RunDirectory) -> AgentPolicy:
-    """The policy of a finished run of a plain agent."""
+    """Return the policy of a finished run of a plain agent."""
     return run.load_policy(run.manifest["stages"][0]["name"])

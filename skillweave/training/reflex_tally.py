@@ -1,4 +1,4 @@
-"""Counts in how many steps of an evaluation each reflex acted."""
+"""Counts of the steps of an evaluation in which each reflex acted."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from skillweave.types import Array, Policy
 
 
 class ReflexTally:
-    """Counts the steps in which each reflex of a policy acted, at every level.
+    """Counts of the steps in which each reflex of a policy acted, at every level.
 
     Where several reflexes hold, only the one whose action was taken counts: the last of a level,
-    and that of a hierarchy before those of the hierarchies in it.
+    and a reflex of a hierarchy before reflexes of the hierarchies in it.
 
     Args:
         policy: the acting policy.
@@ -29,7 +29,8 @@ class ReflexTally:
             *(() if skills is None else skills.reflexes),
             *(outer if isinstance(outer, tuple) else ()),
         )
-        self._path, self._count = path, [0] * len(self._reflexes)
+        self._path = path
+        self._count = [0] * len(self._reflexes)
         below = {
             i: ReflexTally(inner, f"{path}{policy.labels[i]}/")
             for i, inner in enumerate(() if skills is None else skills.policies)
@@ -38,33 +39,33 @@ class ReflexTally:
 
     @property
     def counts(self) -> bool:
-        """Whether there is a reflex at this level or below."""
+        """True if this level or one below has a reflex."""
         return bool(self._reflexes or self._below)
 
     def add(self, played: Played, overridden: Array | None = None) -> None:
         """Count one step of each environment.
 
         Args:
-            overridden: (k,) bool, where a reflex of a level above acted.
+            overridden: (k,) bool, a reflex of a level above acted.
         """
         if not self.counts:
             return
-        taken = np.zeros(len(played.rows), bool) if overridden is None else overridden.copy()
+        acted = np.zeros(len(played.rows), bool) if overridden is None else overridden.copy()
         for i, reflex in reversed(list(enumerate(self._reflexes))):
-            acts = reflex.holds(played.step.obs) & ~taken
+            acts = reflex.holds(played.step.obs) & ~acted
             self._count[i] += int(acts.sum())
-            taken |= acts
+            acted |= acts
         for i, tally in self._below.items():
             rows = np.flatnonzero(played.acting == i)
             if len(rows):
-                tally.add(played_below(played, i, rows), taken[rows])
+                tally.add(played_below(played, i, rows), acted[rows])
 
     def steps(self) -> dict[str, int]:
         """Return the steps in which each reflex acted, by its path."""
-        found: dict[str, int] = {}
+        steps_of: dict[str, int] = {}
         for reflex, count in zip(self._reflexes, self._count, strict=True):
             name = f"{self._path}{reflex.name}"
-            found[name] = found.get(name, 0) + count
+            steps_of[name] = steps_of.get(name, 0) + count
         for tally in self._below.values():
-            found |= tally.steps()
-        return found
+            steps_of |= tally.steps()
+        return steps_of

@@ -1,4 +1,4 @@
-"""The learner from replay: what it keeps, and how many gradient steps are due."""
+"""The learner from replay: its store, and the gradient steps that are due."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ DRAWN_AT_ONCE = 8
 
 
 class ReplayLearner:
-    """Stacks side by side that learn from one store of what all did, or each from its own rows.
+    """Stacks side by side that learn from one shared store, or each from its own rows.
 
-    What shapes the experience (``num_envs``, ``train_freq``, ``n_step``, the store's settings) is
-    that of the first stack. Budgets and ``learning_starts`` count environment steps; the update
-    ratio counts transitions, which a selector has one of for each decision.
+    The settings of experience (``num_envs``, ``train_freq``, ``n_step``, the store) are taken from
+    the first stack. Budgets and ``learning_starts`` count environment steps; the update ratio
+    counts transitions, of which a selector has one for each decision.
 
     Args:
         store: made by ``replay_store``.
-        row_steps: environment steps of a row, about; a selector's calls have several.
+        row_steps: approximate environment steps of a row; a selector's calls have several.
         goes_on_at: environment steps of the stage so far.
     """
 
@@ -54,31 +54,36 @@ class ReplayLearner:
         row_steps: int = 1,
         goes_on_at: int = 0,
     ) -> None:
-        self.stacks, self._seeds, self._row_steps = stacks, seeds, row_steps
-        self.store, self.config = store, stacks[0].algorithm.config
-        self.overlap, self.threads = bool(self.config.overlap), int(self.config.threads)
+        self.stacks = stacks
+        self.store = store
+        self.config = stacks[0].algorithm.config
+        self.overlap = bool(self.config.overlap)
+        self.threads = int(self.config.threads)
+        self._seeds = seeds
+        self._row_steps = row_steps
         self.members = sum(s.members for s in stacks)
         self._first = [0, *itertools.accumulate(s.members for s in stacks)]
         self._random_until = int(self.config.learning_starts) * self.members
         self._acts_at_random = True
-        # A resumed stage whose store was not saved fills it by what it has learnt already.
+        # A resumed stage whose store was not saved fills it by acting with its trained policy.
         self._learns_from = self._random_until + (0 if len(store) else goes_on_at)
-        self._transitions = np.zeros(2)  # of a member, all so far: when last learnt, and now
+        self._transitions = np.zeros(2)  # of a member: at the latest update, and now
         self._returns: Array | None = None  # (N,), the open episodes' discounted returns
         self._acting: tuple[ActingParams, ...] = ()  # of the latest request
         self._resumed: tuple[ActingParams, ...] = ()  # of the first request after a checkpoint
 
     def act_from_the_start(self) -> None:
-        """Never act at random: it has learnt before."""
+        """Skip the phase of random actions: the policy is trained already."""
         self._acts_at_random = False
 
     def request(self, update: int, steps: int, progress: float) -> Request:
-        """``train_freq`` rows of every environment."""
-        explored = progress if self._acts_at_random else 1.0  # ε of DQN does not begin anew
+        """Return a request for ``train_freq`` rows of every environment."""
+        explored = progress if self._acts_at_random else 1.0  # ε of DQN does not start again
         params = self._resumed or tuple(
             s.algorithm.acting_params(s.state, explored) for s in self.stacks
         )
-        self._acting, self._resumed = params, ()
+        self._acting = params
+        self._resumed = ()
         rows = int(self.config.train_freq) * self._row_steps
         at_random = self._acts_at_random and steps < self._random_until
         seeds = self._seeds / "collect" / update
@@ -93,7 +98,7 @@ class ReplayLearner:
         )
 
     def _action_repeat(self, at: int, progress: float) -> ActionRepeat | None:
-        """When to take one action again and again, from row ``at`` on."""
+        """Return the schedule of repeated actions (εz-greedy) from row ``at`` on; None: off."""
         cfg = self.config
         if not cfg.action_repeat:
             return None
@@ -102,7 +107,7 @@ class ReplayLearner:
         )
 
     def take(self, batches: Mapping[str, Batch]) -> None:
-        """Put rows into the store, and update the running scales of observations and returns."""
+        """Store rows, and update the running scales of observations and returns."""
         batch = batches[""]
         self.store.add(batch)
         valid = batch.get("valid")
@@ -119,18 +124,18 @@ class ReplayLearner:
             self._scale_returns(batch)
 
     def _scale_returns(self, batch: Batch) -> None:
-        """Keep the running scale of discounted returns, row by row."""
+        """Update the running scale of discounted returns, row by row."""
         _, n = batch.lead
         each = n // self.members
         if self._returns is None:
             self._returns = np.zeros(n, np.float32)
         gamma = self._gamma().repeat(each)
-        every = batch.get("valid")
+        all_valid = batch.get("valid")
         for at, ended in enumerate(batch.ended):
-            valid = None if every is None else every[at]
+            valid = None if all_valid is None else all_valid[at]
             power = gamma ** batch["steps"][at].astype(np.float32)
-            now = self._returns * power + batch["reward"][at]
-            self._returns = now if valid is None else np.where(valid, now, self._returns)
+            returns = self._returns * power + batch["reward"][at]
+            self._returns = returns if valid is None else np.where(valid, returns, self._returns)
             for i, stack in enumerate(self.stacks):
                 columns = self._columns(i)
                 stack.algorithm.update_return_stats(
@@ -141,27 +146,31 @@ class ReplayLearner:
             self._returns[ended if valid is None else ended & valid] = 0.0
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
-        """Make the gradient steps that are due; the metrics of the last one, if there were any."""
+        """Make the gradient steps that are due; return the metrics of the last one, {} for none."""
         if steps <= self._learns_from or not self.store.ready:
             self._transitions[0] = self._transitions[1]
             return {}
-        found = [self._learn(i, update, progress) for i in range(len(self.stacks))]
+        metrics = [self._learn(i, update, progress) for i in range(len(self.stacks))]
         self._transitions[0] = self._transitions[1]
-        if not all(found):
+        if not all(metrics):
             return {}
-        return {k: torch.cat([m[k] for m in found]) for k in found[0]}
+        return {k: torch.cat([m[k] for m in metrics]) for k in metrics[0]}
 
     def _learn(self, at: int, update: int, progress: float) -> dict[str, Tensor]:
-        """A stack's gradient steps."""
-        stack, first = self.stacks[at], self._first[at]
+        """Make the gradient steps of the stack number ``at``; return the metrics of the last."""
+        stack = self.stacks[at]
+        first = self._first[at]
         cfg = stack.algorithm.config
         before, after = (int(t * cfg.update_ratio) for t in self._transitions)
-        due, metrics = after - before, {}
+        due = after - before
+        metrics: dict[str, Tensor] = {}
         beta = cfg.priority_beta + progress * (1.0 - cfg.priority_beta)
         seeds = member_seeds(self._seeds, "learn", stack.members, update, first)
-        rngs, generators = [s.numpy() for s in seeds], [s.torch() for s in seeds]
+        rngs = [s.numpy() for s in seeds]
+        generators = [s.torch() for s in seeds]
+        gamma = stack.state.gamma.cpu()
         # Several draws at once cost little more than one, but priorities change in between.
-        draws, gamma = 1 if cfg.prioritized else DRAWN_AT_ONCE, stack.state.gamma.cpu()
+        draws = 1 if cfg.prioritized else DRAWN_AT_ONCE
         for done in range(0, due, draws):
             size = cfg.batch_size * min(draws, due - done)
             drawn = self.store.sample(size, gamma, rngs, beta, first, progress)
@@ -174,34 +183,34 @@ class ReplayLearner:
         return metrics
 
     def cut(self, columns: Array) -> None:
-        """The open trajectories of ``columns`` (k,) end here."""
+        """End the open trajectories of ``columns`` (k,)."""
         self.store.cut(columns)
         if self._returns is not None:
             self._returns[columns] = 0.0
 
     def kept(self, *, requested: bool = True, replay: bool = True) -> dict[str, Tensor]:
-        """What is counted, who acts next, and the store, if it is to be saved."""
+        """Return counts, the next acting parameters, and the store if it is saved."""
         saved = replay and self.config.save_buffer
-        store = prefixed("store", self.store.state()) if saved else {}
+        tensors = prefixed("store", self.store.state()) if saved else {}
         acting = {str(i): p.state() for i, p in enumerate(self._acting) if requested}
         for i, state in acting.items():
-            store |= prefixed(f"acting.{i}", state)
-        return self.counts() | store
+            tensors |= prefixed(f"acting.{i}", state)
+        return self.counts() | tensors
 
     def counts(self) -> dict[str, Tensor]:
-        """What is kept beside the store."""
-        found = {"transitions": torch.from_numpy(self._transitions.copy())}
+        """Return the counts of transitions and the open episodes' returns."""
+        counts = {"transitions": torch.from_numpy(self._transitions.copy())}
         if self._returns is not None:
-            found["returns"] = torch.from_numpy(self._returns.copy())
-        return found
+            counts["returns"] = torch.from_numpy(self._returns.copy())
+        return counts
 
     def load(self, kept: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint kept."""
+        """Restore the tensors of a checkpoint."""
         check_counts(kept, self.store.num_envs)
         self._transitions = kept["transitions"].numpy().copy()
         if "returns" in kept:
             self._returns = kept["returns"].numpy().copy()
-        if acting := unprefixed("acting", kept):  # a generation begins with a request of its own
+        if acting := unprefixed("acting", kept):  # a generation starts with its own request
             self._resumed = tuple(
                 acting_of(stack, unprefixed(str(i), acting)) for i, stack in enumerate(self.stacks)
             )
@@ -210,7 +219,7 @@ class ReplayLearner:
             self._learns_from = self._random_until
 
     def _gamma(self) -> Array:
-        """(P,) float32, of all members."""
+        """Return the discounts of all members, (P,) float32."""
         return np.concatenate([s.state.gamma.cpu().numpy() for s in self.stacks])
 
     def _columns(self, stack: int) -> slice:
@@ -220,12 +229,12 @@ class ReplayLearner:
 
 
 def check_counts(kept: dict[str, Tensor], num_envs: int) -> None:
-    """Raise a ValueError where ``ReplayLearner.counts`` cannot be gone on from."""
-    made = kept["transitions"]
-    if made.shape != (2,) or made.dtype != torch.float64:
-        raise ValueError(f"the number of its transitions is {made.dtype} {tuple(made.shape)}")
-    # A checkpoint is made after learning, so nothing was collected since.
-    learnt, now = made.tolist()
+    """Raise a ValueError where a checkpoint's ``ReplayLearner.counts`` are invalid."""
+    counts = kept["transitions"]
+    if counts.shape != (2,) or counts.dtype != torch.float64:
+        raise ValueError(f"the number of its transitions is {counts.dtype} {tuple(counts.shape)}")
+    # A checkpoint is made right after learning, so both counts are equal.
+    learnt, now = counts.tolist()
     if learnt != now or not 0.0 <= now < 2.0**53:
         raise ValueError(f"it has learnt from {learnt} of {now} transitions: they must be equal")
     returns = kept.get("returns")
@@ -245,16 +254,16 @@ def store_of(
     shared: bool = False,
     relabel: Relabel | None = None,
 ) -> ReplayStore:
-    """An empty replay store for an algorithm's samples.
+    """Return an empty replay store for an algorithm's samples.
 
     Args:
         num_envs: of all members together.
-        shared: members learn from what all did.
+        shared: each member learns from the experience of all.
         relabel: judges transitions again when they are drawn.
 
     Raises:
-        TrainingError: it is larger than the machine's memory.
-        DeclarationError: it holds not even one row.
+        TrainingError: the store is larger than the machine's memory.
+        DeclarationError: the store is smaller than one row.
     """
     return replay_store(
         algorithm.config,
@@ -273,13 +282,13 @@ def store_of(
 def learner_of(
     stack: Stack, num_envs: int, seeds: Seeds, *, row_steps: int = 1, goes_on_at: int = 0
 ) -> Learner:
-    """The learner of one stack, by what its algorithm learns from.
+    """Return the learner of one stack: from rollouts or from replay, by its algorithm.
 
     Args:
-        row_steps, goes_on_at: as of ``ReplayLearner``.
+        row_steps, goes_on_at: see ``ReplayLearner``.
     """
     if stack.algorithm.store == "rollout":
-        # A skill that is seldom where it may start learns from batches that are worth it.
+        # A skill that can seldom start waits until a batch is large enough.
         full = int(stack.algorithm.config.n_steps) * num_envs // stack.members
         return RolloutLearner(stack, seeds, full // 2 if row_steps == 1 else 0)
     store = store_of(stack.algorithm, num_envs, stack.members)
@@ -287,7 +296,7 @@ def learner_of(
 
 
 def _rows(x: Array, columns: slice, stack: Stack) -> Tensor:
-    """The columns of a stack, of (T, N, …), as (P, T·B, …) on the stack's device."""
+    """Return a stack's columns of (T, N, …) as (P, T·B, …) on the stack's device."""
     rows = to_tensor(np.ascontiguousarray(x[:, columns])).unflatten(1, (stack.members, -1))
-    found: Tensor = rows.transpose(0, 1).flatten(1, 2)
-    return found.to(stack.state.params.device)
+    flat: Tensor = rows.transpose(0, 1).flatten(1, 2)
+    return flat.to(stack.state.params.device)

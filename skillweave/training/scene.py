@@ -1,4 +1,4 @@
-"""Where a stage learns: which environments, and what learners do in them."""
+"""Environments of a stage, with the spaces and collectors of its learners."""
 
 from __future__ import annotations
 
@@ -21,47 +21,47 @@ from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
 
 CALL = 16
-"""Environment steps of a call, about, where nothing says how long it lasts."""
+"""Approximate environment steps of a call without a declared length."""
 
 
 class MakeCollector(Protocol):
-    """Makes a collector of a scene."""
+    """A function that makes a collector of a scene."""
 
     def __call__(
         self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
-        """A collector of ``num_envs`` environments.
+        """Return a collector of ``num_envs`` environments.
 
         Args:
-            acting: the learners; None where they come later.
+            acting: the acting policies; None if this object is only a template for ``like()``.
             first: the number of the first environment, for messages.
-            shared: several learn from what each does, with a γ of their own.
+            shared: members learn from the experience of all, each with its own γ.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Environments, and what learners see and choose in them."""
+    """Environments, with the learner's spaces and collectors."""
 
     name: str
-    """What messages call the environment."""
+    """Name of the environment in messages."""
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
-    """The learner's: a selector chooses among skills."""
+    """The learner's action space: a selector chooses among skills."""
     collector: MakeCollector
     row_steps: int = 1
-    """Environment steps of a row of experience, about."""
+    """Approximate environment steps of a row of experience."""
     log_info: tuple[str, ...] = ()
     """Keys of ``info`` that collectors of learners log."""
 
     def learners_collector(
         self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
-        """Return a collector whose episodes are reported; arguments are as of ``collector``."""
-        found = self.collector(num_envs, acting, first, shared)
-        found.log_info = self.log_info
-        return found
+        """Return a collector whose episodes are reported; see ``MakeCollector``."""
+        collector = self.collector(num_envs, acting, first, shared)
+        collector.log_info = self.log_info
+        return collector
 
 
 def skill_scene(
@@ -73,12 +73,13 @@ def skill_scene(
     search_steps: int | None = None,
     episode_calls: int = 1,
 ) -> Scene:
-    """The environments seen through a skill; None: as they are.
+    """Return the scene of a skill's stage; ``skill`` None: of the task itself.
 
     Args:
-        starters: skills that can act already: they lead to where the skill may start.
-        start_calls: an episode begins after up to so many calls of theirs.
-        search_steps: an episode begins anew where it may not start after so many steps.
+        starters: skills that can act already; they bring the environment to where the skill may
+            start.
+        start_calls: an episode starts after up to this many calls of ``starters``.
+        search_steps: reset an episode in which the skill cannot start within this many steps.
         episode_calls: the most calls of the skill in an episode.
     """
     search = start_calls, search_steps, episode_calls
@@ -95,11 +96,11 @@ def skill_scene(
 def selector_scene(
     spec: EnvSpec, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
 ) -> Scene:
-    """The environments in which a selector calls skills.
+    """Return the scene of a selector that calls ready skills.
 
     Args:
-        guide: a ready selector that is asked wherever it decides.
-        as_skill: the skill that all of it is, in another hierarchy; None: the task itself.
+        guide: a ready selector that guides its decisions.
+        as_skill: the hierarchy as a skill of another one; None: the outermost hierarchy.
     """
 
     def collector(
@@ -115,24 +116,24 @@ def selector_scene(
 
 @dataclass(frozen=True)
 class WovenScene(Scene):
-    """Environments in which a selector calls skills, and some of these learn too."""
+    """Environments in which a selector calls skills, of which some learn, too."""
 
     skills: SkillSet = field(kw_only=True)
-    """Those that learn have any policy, or are ``UntrainedHierarchy``."""
+    """The skills; learning ones have any policy, or are ``UntrainedHierarchy``."""
     skill_space: gym.Space[Any] = field(kw_only=True)
-    """What skills choose from."""
+    """Action space of the skills."""
     spec: EnvSpec = field(kw_only=True)
     guide: ActiveGuide | None = field(kw_only=True)
-    """A ready selector, which is asked wherever the selector decides, or decides itself."""
+    """A ready selector that guides the selector's decisions, or decides in its place."""
     as_skill: Skill | None = field(kw_only=True)
-    """The skill that all of it is, in another hierarchy."""
+    """The hierarchy as a skill of another one."""
     margins: Mapping[str, float] = field(kw_only=True)
-    """By the paths of critics in hierarchies below: where calls are cut there."""
+    """Margins of interruption in hierarchies below, by the paths of their critics."""
     guide_kl: Mapping[str, float] = field(kw_only=True)
-    """By the paths of selectors in hierarchies below: their largest KL from their guides."""
+    """Target KL of guides in hierarchies below, by the paths of their selectors."""
 
     def chooses_from(self, path: str) -> gym.Space[Any]:
-        """The actions of a skill, a selector or a critic of skills, by its path."""
+        """Return the action space of a skill, selector or critic at ``path``."""
         *nodes, name = path.split("/")
         level = self.level(nodes)
         if name == SELECTOR:
@@ -140,24 +141,24 @@ class WovenScene(Scene):
         return gym.spaces.Discrete(len(level.skills)) if name == CRITIC else self.skill_space
 
     def steps_of_row(self, path: str) -> int:
-        """Environment steps of a row of a learner's experience, about, by its path."""
+        """Return the approximate environment steps of a row of the learner at ``path``."""
         *nodes, name = path.split("/")
         return self.level(nodes).usual_steps or CALL if name == SELECTOR else 1
 
     def is_greedy(self, path: str) -> bool:
-        """Whether a learner does not explore where its hierarchy is evaluated, by its path."""
+        """Return True if the learner at ``path`` acts greedily in evaluations."""
         *nodes, name = path.split("/")
         level = self.level(nodes)
         return level.greedy_selector if name == SELECTOR else level.greedy
 
     def level(self, nodes: Sequence[str]) -> SkillSet:
-        """The skills of a hierarchy below, by the names on the way to it."""
-        found = self.skills
+        """Return the skills of a hierarchy below, by the names on the way to it."""
+        skills = self.skills
         for node in nodes:
-            number = [s.name for s in found.skills].index(node)
-            inner: Any = found.policies[number]
-            found = inner.skills
-        return found
+            number = [s.name for s in skills.skills].index(node)
+            inner: Any = skills.policies[number]
+            skills = inner.skills
+        return skills
 
     def woven(
         self,
@@ -166,11 +167,11 @@ class WovenScene(Scene):
         learners: Mapping[str, Acting],
         margins: Mapping[str, float],
     ) -> WovenCollector:
-        """A collector of these environments.
+        """Return a collector of environments in ``engine``.
 
         Args:
             acting: the selector; None: the guide decides.
-            learners, margins: as of ``WovenCollector``.
+            learners, margins: see ``WovenCollector``.
         """
         return WovenCollector(
             engine, acting, self.skills, learners, margins, self.guide, self.as_skill
@@ -185,10 +186,19 @@ def woven_scene(
     margins: Mapping[str, float] | None = None,
     guide_kl: Mapping[str, float] | None = None,
 ) -> WovenScene:
-    """The environments in which a selector calls skills, and some of these learn too."""
+    """Return the scene of a selector that calls skills, of which some learn, too."""
     plain = skill_scene(spec)
     return WovenScene(
-        spec.name, plain.observation_space, gym.spaces.Discrete(skills.choices), plain.collector,
-        skills.usual_steps or CALL, skills=skills, skill_space=plain.action_space, spec=spec,
-        guide=guide, as_skill=as_skill, margins=margins or {}, guide_kl=guide_kl or {},
-    )  # fmt: skip
+        spec.name,
+        plain.observation_space,
+        gym.spaces.Discrete(skills.choices),
+        plain.collector,
+        skills.usual_steps or CALL,
+        skills=skills,
+        skill_space=plain.action_space,
+        spec=spec,
+        guide=guide,
+        as_skill=as_skill,
+        margins=margins or {},
+        guide_kl=guide_kl or {},
+    )

@@ -1,4 +1,4 @@
-"""What the skills of a policy did in an evaluation: their steps, calls, ends and rewards."""
+"""Reports of a policy's skills in an evaluation: their steps, calls, ends and rewards."""
 
 from __future__ import annotations
 
@@ -18,56 +18,55 @@ from skillweave.training.play import Played
 from skillweave.types import Array, Policy, unprefixed
 
 _MEMORIES = ("chosen", "after")
-"""Fields of a step that hold what a policy remembers."""
+"""Fields of a step that hold a policy's memory."""
 ENDS = {
     CallEnd.OWN: "own",
     CallEnd.LIMIT: "limit",
     CallEnd.INTERRUPTED: "interrupted",
     CallEnd.EPISODE: "episode",
 }
-"""Why a call ended, as reports name it."""
+"""Names of the ends of calls in reports."""
 
 
 @dataclass(frozen=True)
 class SkillReport:
-    """What one skill did in all episodes of an evaluation.
+    """Counts and sums of one skill over all episodes of an evaluation.
 
     A skill that is a hierarchy has a report, and each of its own skills has one, under its path. A
     call in it goes on where the hierarchy is called again at once; where another skill follows, it
-    has ended by the limit. What needs the skills' declarations is not known of a policy that is no
-    hierarchy, and its reward and success not of a run that was loaded without its code.
+    has ended by the limit. Fields that need the skills' declarations are unknown for a policy that
+    is no hierarchy; rewards and successes are unknown for a run that was loaded without its code.
     """
 
     steps: Count
-    """Environment steps in which it acted."""
+    """Environment steps of the skill."""
     calls: Count
-    """How often it was called."""
+    """Number of calls."""
     ended: dict[str, Count]
-    """How many calls ended for each reason: ``own``, ``limit``, ``interrupted``, ``episode`` (the
-    episode ended, or the evaluation's step limit cut it). They add up to ``calls``; empty: not
-    known."""
+    """Calls by their end: ``own``, ``limit``, ``interrupted``, ``episode`` (the episode ended, or
+    the evaluation's step limit cut it). They add up to ``calls``; empty: unknown."""
     succeeded: Count | None
-    """Calls whose last step ``success`` says yes to; None: the skill does not define it."""
+    """Calls with ``success`` true in the last step; None: the skill does not define it."""
     return_sum: float | None
     """Sum of its own reward over its steps, not discounted; of the environment's reward where the
-    skill defines none. None: not known."""
+    skill defines none. None: unknown."""
     first: Count = field(default=0, compare=False)
-    """Calls with which an episode began."""
+    """Calls at the start of an episode."""
     followed: dict[str, Count] = field(default_factory=dict, compare=False)
-    """How many of its calls a call of each skill followed; the others were the last of an episode.
-    Empty: not known."""
+    """Its calls by the skill called next; the others were the last of an episode. Empty:
+    unknown."""
     idle: Count = field(default=0, compare=False)
-    """Calls that ended by themselves after one step, right after a call of it that had ended so."""
+    """Calls that ended by themselves after one step, right after a call of it with such an end."""
     late: Count = field(default=0, compare=False)
-    """Calls that went on to their limit after they had succeeded, of a skill that says neither
-    where it stops nor how long it lasts."""
+    """Calls that went on to their limit after they had succeeded, of a skill with neither
+    an end nor a length of its own."""
     hasty: Count = field(default=0, compare=False)
     """Calls that ended by themselves within two steps, without success, of a skill whose own reward
     was below 0 in the last of them."""
 
     @property
     def length_mean(self) -> float | None:
-        """Mean steps of a call; None: there was none."""
+        """Mean steps of a call; None: no calls."""
         return self.steps / self.calls if self.calls else None
 
     @property
@@ -77,11 +76,11 @@ class SkillReport:
 
     @property
     def return_mean(self) -> float | None:
-        """Mean sum of its own reward over a call; None: no calls, or not known."""
+        """Mean sum of its own reward over a call; None: no calls, or unknown."""
         return None if self.return_sum is None or not self.calls else self.return_sum / self.calls
 
     def to_json(self, total: int) -> dict[str, Any]:
-        """The report as plain JSON; ``total`` are the steps of all skills."""
+        """Return the report as plain JSON; ``total`` are the steps of all skills."""
         return {
             "share": self.steps / total if total else 0.0,
             "steps": self.steps,
@@ -94,35 +93,37 @@ class SkillReport:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What the skills say of one step in each environment that acts."""
+class StepOutcome:
+    """Outcome of one step in each acting environment, judged by the running skills."""
 
-    why: Array  # (k,) int8, ``CallEnd`` its call has ended; RUNNING: it goes on
-    reward: Array  # (k,) the running skill's own; the environment's where it defines none
-    succeeded: Array  # (k,) bool, the call is over, and its skill's ``success`` says yes
-    has_succeeded: Array  # (k,) bool, ``success`` says yes; endless skills are asked at every step
+    why: Array  # (k,) int8, ``CallEnd`` of the running call
+    reward: Array  # (k,) by the running skill; by the environment where it defines none
+    succeeded: Array  # (k,) bool, the call is over with ``success`` true
+    has_succeeded: Array  # (k,) bool, ``success`` is true; for endless skills at every step
 
 
-def judged_step(skills: SkillSet, played: Played) -> Judged:
+def judge_step(skills: SkillSet, played: Played) -> StepOutcome:
     """Judge a step of a hierarchy by the running skills."""
     assert played.acting is not None
     assert played.elapsed is not None
     assert played.why is not None
-    acting, why = played.acting, played.why.copy()
+    acting = played.acting
+    why = played.why.copy()
     why[(why == CallEnd.RUNNING) & played.over] = CallEnd.EPISODE
     over = why != CallEnd.RUNNING
-    reward, success = played.reward.copy(), np.zeros(len(acting), bool)
+    reward = played.reward.copy()
+    success = np.zeros(len(acting), bool)
     for i, skill in enumerate(skills.skills):
         if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
             reward[rows] = _outcome(skill, played, played.elapsed, rows).reward
         due = (acting == i) & (over | is_endless(skills, i))
         if skill.defines("success") and len(rows := np.flatnonzero(due)):
             success[rows] = _outcome(skill, played, played.elapsed, rows).success
-    return Judged(why, reward, success & over, success)
+    return StepOutcome(why, reward, success & over, success)
 
 
 def is_endless(skills: SkillSet, i: int) -> bool:
-    """Whether skill ``i`` is no hierarchy, and says neither where it stops nor how long."""
+    """Return True if skill ``i`` is no hierarchy and has neither an end nor a length of its own."""
     skill = skills.skills[i]
     if skill.max_steps is not None or skill.call_steps is not None or skill.defines("termination"):
         return False
@@ -130,23 +131,26 @@ def is_endless(skills: SkillSet, i: int) -> bool:
 
 
 class SkillTally:
-    """Counts what each skill of a policy does, as episodes are played.
+    """Counter of steps, calls and rewards of a policy's skills, as episodes are played.
 
     Args:
-        policy: whose skills; a hierarchy's are counted at every level.
-        episodes: that are played.
+        policy: with the skills; a hierarchy's are counted at every level.
+        episodes: the number of episodes.
         path: of its skills: empty, or ``inner/`` for example.
     """
 
     def __init__(self, policy: Policy, episodes: int, path: str = "") -> None:
-        self.labels, self._path = policy.labels, path
-        found = getattr(policy, "skills", None)
-        self.skills = found if isinstance(found, SkillSet) else None
+        self.labels = policy.labels
+        self._path = path
+        skill_set = getattr(policy, "skills", None)
+        self.skills = skill_set if isinstance(skill_set, SkillSet) else None
         count = len(self.labels)
-        self._steps, self._calls = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self._steps = np.zeros(count, np.int64)
+        self._calls = np.zeros(count, np.int64)
         self._ended = np.zeros((count, len(CallEnd)), np.int64)
         self._succeeded = np.zeros(count, np.int64)
-        self._late, self._hasty = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self._late = np.zeros(count, np.int64)
+        self._hasty = np.zeros(count, np.int64)
         self._endless = np.array(
             [self.skills is not None and is_endless(self.skills, i) for i in range(count)], bool
         )
@@ -160,11 +164,11 @@ class SkillTally:
         self._returns = np.zeros((episodes, count))
         policies = () if self.skills is None else self.skills.policies
         self._below = {
-            i: SkillTally(own, episodes, f"{path}{self.labels[i]}/")
-            for i, own in enumerate(policies)
-            if skills_below(own) is not None
+            i: SkillTally(inner, episodes, f"{path}{self.labels[i]}/")
+            for i, inner in enumerate(policies)
+            if skills_below(inner) is not None
         }
-        self._open = np.full(episodes, -1)  # by episode, the skill whose call may go on
+        self._running = np.full(episodes, -1)  # by episode, the skill whose call may go on
         self._idle = np.zeros(count, np.int64)
         self._done = np.full(episodes, -1)  # by episode, the skill that has just ended by itself
 
@@ -174,30 +178,34 @@ class SkillTally:
         if acting is None:
             return
         self._steps += np.bincount(acting, minlength=count)
-        called, whose = acting[played.begun], played.episode[played.begun]
+        called = acting[played.call_start]
+        episode = played.episode[played.call_start]
         self._calls += np.bincount(called, minlength=count)
-        np.add.at(self._next, (self._before[whose], called), 1)
-        self._before[whose] = 1 + called
-        own = played.reward
+        np.add.at(self._next, (self._before[episode], called), 1)
+        self._before[episode] = 1 + called
+        reward = played.reward
         if self.skills is not None:
-            judged = judged_step(self.skills, played)
+            outcome = judge_step(self.skills, played)
             assert played.elapsed is not None
-            self._open[played.episode] = np.where(judged.why == CallEnd.RUNNING, acting, -1)
-            own = judged.reward
-            ended = np.flatnonzero(judged.why != CallEnd.RUNNING)
-            np.add.at(self._ended, (acting[ended], judged.why[ended]), 1)
-            done, again = judged.why == CallEnd.OWN, self._done[played.episode] == acting
+            self._running[played.episode] = np.where(outcome.why == CallEnd.RUNNING, acting, -1)
+            reward = outcome.reward
+            ended = np.flatnonzero(outcome.why != CallEnd.RUNNING)
+            np.add.at(self._ended, (acting[ended], outcome.why[ended]), 1)
+            done = outcome.why == CallEnd.OWN
+            again = self._done[played.episode] == acting
             self._idle += np.bincount(acting[done & again], minlength=count)
             self._done[played.episode] = np.where(done, acting, -1)
-            np.add.at(self._succeeded, acting[ended], judged.succeeded[ended])
-            assert played.begun is not None
-            before = self._has_succeeded[played.episode] & ~played.begun & self._endless[acting]
-            late = before & judged.succeeded & (judged.why == CallEnd.LIMIT)
+            np.add.at(self._succeeded, acting[ended], outcome.succeeded[ended])
+            assert played.call_start is not None
+            before = (
+                self._has_succeeded[played.episode] & ~played.call_start & self._endless[acting]
+            )
+            late = before & outcome.succeeded & (outcome.why == CallEnd.LIMIT)
             self._late += np.bincount(acting[late], minlength=count)
-            hasty = done & (played.elapsed <= 2) & self._pays[acting] & (own < 0)
-            self._hasty += np.bincount(acting[hasty & ~judged.succeeded], minlength=count)
-            self._has_succeeded[played.episode] = judged.has_succeeded
-        self._returns[played.episode, acting] += own
+            hasty = done & (played.elapsed <= 2) & self._pays[acting] & (reward < 0)
+            self._hasty += np.bincount(acting[hasty & ~outcome.succeeded], minlength=count)
+            self._has_succeeded[played.episode] = outcome.has_succeeded
+        self._returns[played.episode, acting] += reward
         for i, tally in self._below.items():
             tally.cut(played.episode[acting != i])
             rows = np.flatnonzero(acting == i)
@@ -205,32 +213,39 @@ class SkillTally:
                 tally.add(played_below(played, i, rows))
 
     def cut(self, episodes: Array) -> None:
-        """Another skill acts in ``episodes`` (k,): calls that might have gone on are over."""
-        over = episodes[self._open[episodes] >= 0]
+        """End calls that might have gone on in ``episodes`` (k,), as another skill acts there."""
+        over = episodes[self._running[episodes] >= 0]
         if len(over):
-            np.add.at(self._ended[:, CallEnd.LIMIT], self._open[over], 1)
-            self._open[over] = -1
+            np.add.at(self._ended[:, CallEnd.LIMIT], self._running[over], 1)
+            self._running[over] = -1
         self._done[episodes] = -1
         for tally in self._below.values():
             tally.cut(episodes)
 
     def reports(self) -> dict[str, SkillReport]:
-        """The report of each skill, by its path."""
-        returns, found = self._returns.sum(axis=0), dict[str, SkillReport]()
+        """Return the report of each skill, by its path."""
+        returns = self._returns.sum(axis=0)
+        reports: dict[str, SkillReport] = {}
         paths = [self._path + name for name in self.labels]
         for i, name in enumerate(paths):
-            found[name] = SkillReport(
-                int(self._steps[i]), int(self._calls[i]), self._ends(i), self._successes(i),
-                float(returns[i]) if self._known(i) else None, int(self._next[0, i]),
-                dict(zip(paths, self._next[1 + i].tolist(), strict=True)), int(self._idle[i]),
-                int(self._late[i]), int(self._hasty[i]),
-            )  # fmt: skip
+            reports[name] = SkillReport(
+                steps=int(self._steps[i]),
+                calls=int(self._calls[i]),
+                ended=self._ends(i),
+                succeeded=self._successes(i),
+                return_sum=float(returns[i]) if self._has_reward(i) else None,
+                first=int(self._next[0, i]),
+                followed=dict(zip(paths, self._next[1 + i].tolist(), strict=True)),
+                idle=int(self._idle[i]),
+                late=int(self._late[i]),
+                hasty=int(self._hasty[i]),
+            )
             if i in self._below:
-                found |= self._below[i].reports()
-        return found
+                reports |= self._below[i].reports()
+        return reports
 
-    def _known(self, i: int) -> bool:
-        """Whether the reward of skill ``i`` is."""
+    def _has_reward(self, i: int) -> bool:
+        """Return True if the reward of skill ``i`` is known."""
         return self.skills is not None and not isinstance(self.skills.skills[i], RecordedSkill)
 
     def _ends(self, i: int) -> dict[str, int]:
@@ -245,9 +260,9 @@ class SkillTally:
 
 
 class CallTally:
-    """Counts what one skill does that acts alone: one call in each episode.
+    """Counter for one skill that acts alone: one call in each episode.
 
-    The call begins where the skill may start, at the episode's start as a rule, and ends by its
+    The call starts where the skill may start, usually at the episode's start, and ends by its
     ``termination``, at its ``max_steps``, or with the episode. The skill acts on after it, but only
     the call counts: a skill that is called again where its work is done would succeed each time.
 
@@ -255,26 +270,30 @@ class CallTally:
         skill: the skill.
         path: its name in reports.
         policy: its policy; a hierarchy's own skills are counted, too.
-        episodes: that are played.
+        episodes: the number of episodes.
     """
 
     def __init__(self, skill: Skill, path: str, policy: Policy, episodes: int) -> None:
-        self._skill, self._path = skill, path
+        self._skill = skill
+        self._path = path
         inner = skills_below(policy) is not None
         self._below = SkillTally(policy, episodes, f"{path}/") if inner else None
-        self._open, self._done = np.zeros(episodes, bool), np.zeros(episodes, bool)
-        self._elapsed, self._returns = np.zeros(episodes, np.int64), np.zeros(episodes)
+        self._running = np.zeros(episodes, bool)
+        self._done = np.zeros(episodes, bool)
+        self._elapsed = np.zeros(episodes, np.int64)
+        self._returns = np.zeros(episodes)
         self._succeeded = 0
         self._ended = dict.fromkeys(ENDS.values(), 0)
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
-        waiting = np.flatnonzero(~self._open[played.episode] & ~self._done[played.episode])
+        waiting = np.flatnonzero(~self._running[played.episode] & ~self._done[played.episode])
         if len(waiting):
-            obs, where = played.step.obs[waiting], played.rows[waiting]
-            may = asked(self._skill, "initiation", obs, len(waiting), ids=where)
-            self._open[played.episode[waiting[may]]] = True
-        rows = np.flatnonzero(self._open[played.episode])
+            obs = played.step.obs[waiting]
+            ids = played.rows[waiting]
+            may = asked(self._skill, "initiation", obs, len(waiting), ids=ids)
+            self._running[played.episode[waiting[may]]] = True
+        rows = np.flatnonzero(self._running[played.episode])
         if not len(rows):
             return
         episode = played.episode[rows]
@@ -302,23 +321,27 @@ class CallTally:
             last = _outcome(self._skill, played, self._elapsed[played.episode], ended_rows)
             assert last.success is not None
             self._succeeded += int(last.success.sum())
-        self._open[episode[over]], self._done[episode[over]] = False, True
+        self._running[episode[over]] = False
+        self._done[episode[over]] = True
 
     def reports(self) -> dict[str, SkillReport]:
-        """The report of the skill by its path; then those of a hierarchy's own skills."""
+        """Return the skill's report and, for a hierarchy, the reports of its skills, by path."""
         calls = int(self._done.sum())
-        known = not isinstance(self._skill, RecordedSkill)
+        has_reward = not isinstance(self._skill, RecordedSkill)
         report = SkillReport(
-            int(self._elapsed.sum()), calls, dict(self._ended),
-            self._succeeded if self._skill.defines("success") else None,
-            float(self._returns.sum()) if known else None, calls,
-        )  # fmt: skip
+            steps=int(self._elapsed.sum()),
+            calls=calls,
+            ended=dict(self._ended),
+            succeeded=self._succeeded if self._skill.defines("success") else None,
+            return_sum=float(self._returns.sum()) if has_reward else None,
+            first=calls,
+        )
         below = {} if self._below is None else self._below.reports()
         return {self._path: report} | below
 
 
 def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | CallTally]:
-    """Return the path of the skill that a policy is alone, or None, and what counts its calls."""
+    """Return the path of the skill that acts alone, or None, and a tally of its calls."""
     skill = getattr(policy, "skill", None)
     if not isinstance(skill, Skill):
         return None, SkillTally(policy, episodes)
@@ -327,18 +350,18 @@ def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | Ca
 
 
 def rows_of(played: Played, rows: Array) -> Played:
-    """A step of some ``rows`` (m,) of those that act."""
+    """Return a step of ``rows`` (m,) of the acting environments."""
     if len(rows) == len(played.rows):
         return played
     values = {f.name: getattr(played, f.name) for f in fields(played)}
     step = seen_by(None, played.step, played.step.elapsed[rows], rows)
-    some = {k: v[rows] for k, v in values.items() if isinstance(v, np.ndarray)}
+    arrays = {k: v[rows] for k, v in values.items() if isinstance(v, np.ndarray)}
     memories = {k: values[k] and {n: v[rows] for n, v in values[k].items()} for k in _MEMORIES}
-    return Played(**values | some | memories | {"step": step})
+    return Played(**values | arrays | memories | {"step": step})
 
 
 def played_below(played: Played, i: int, rows: Array) -> Played:
-    """A step of ``rows`` (m,) as it was in the hierarchy that is skill ``i``."""
+    """Return a step of ``rows`` (m,) inside the hierarchy that is skill ``i``."""
     assert played.elapsed is not None
     assert played.chosen is not None
     assert played.after is not None
@@ -346,26 +369,35 @@ def played_below(played: Played, i: int, rows: Array) -> Played:
     after = {k: v[rows] for k, v in unprefixed(str(i), played.after).items()}
     step = seen_by(None, played.step, played.elapsed[rows], rows)
     return Played(
-        played.rows[rows], played.episode[rows], step, played.reward[rows], played.lasted[rows],
-        played.cut[rows], chosen["skill"], chosen["elapsed"] == 0, after["elapsed"], after["end"],
-        chosen, after,
-    )  # fmt: skip
+        played.rows[rows],
+        played.episode[rows],
+        step,
+        played.reward[rows],
+        played.lasted[rows],
+        played.cut[rows],
+        acting=chosen["skill"],
+        call_start=chosen["elapsed"] == 0,
+        elapsed=after["elapsed"],
+        why=after["end"],
+        chosen=chosen,
+        after=after,
+    )
 
 
 def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillReport]]:
-    """The reports by the path of the hierarchy that skills are of; the first path is empty."""
-    found: dict[str, dict[str, SkillReport]] = {}
+    """Return the reports grouped by the path of their hierarchy; "": the outermost."""
+    levels: dict[str, dict[str, SkillReport]] = {}
     for name, report in skills.items():
-        found.setdefault(name.rpartition("/")[0], {})[name] = report
-    return found
+        levels.setdefault(name.rpartition("/")[0], {})[name] = report
+    return levels
 
 
 def all_steps(skills: Mapping[str, SkillReport]) -> int:
-    """Environment steps of all skills, each counted once."""
+    """Return the environment steps of all skills, each step counted once."""
     top = [name for name in skills if name.rpartition("/")[0] not in skills]
     return sum(skills[name].steps for name in top)
 
 
 def _outcome(skill: Skill, played: Played, elapsed: Array, rows: Array) -> Outcome:
-    """Judge a step of ``rows`` (m,) of those that act; ``elapsed`` is of all of them."""
+    """Judge a step of ``rows`` (m,) of the acting environments; ``elapsed`` is of all."""
     return judge(skill, seen_by(skill, played.step, elapsed[rows], rows), played.rows[rows])

@@ -1,4 +1,4 @@
-"""What the skills of a policy did, for people: a table, and hints where something looks wrong."""
+"""Text on the skills of a policy: a table, and hints of mistakes."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ def call_line(name: str, report: SkillReport) -> str:
     """Return a part of a sentence on the calls of a skill that acts alone."""
     if not report.calls:
         return f"{name} could start nowhere by its initiation()"
-    told = []
+    results = []
     if report.return_mean is not None:
-        told.append(f"{report.return_mean:,.1f} by its own reward")
+        results.append(f"{report.return_mean:,.1f} by its own reward")
     if report.success_rate is not None:
-        told.append(f"{report.success_rate:.0%} succeed")
+        results.append(f"{report.success_rate:.0%} succeed")
     called = f"{name} alone: {report.calls:,} calls of {report.length_mean:,.0f} steps"
-    return ", ".join([called, *told])
+    return ", ".join([called, *results])
 
 
 def hints(skills: Mapping[str, SkillReport]) -> list[str]:
-    """Return a sentence on each thing that looks like a mistake."""
+    """Return a sentence on each probable mistake."""
     return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
 
 
 def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
-    """A line for each reflex: in how many of ``total`` steps it acted."""
+    """Return a line for each reflex, with the share of ``total`` steps in which it acted."""
     return [
         f"reflex {name} acted in {steps:,} of {total:,} steps ({steps / total:.1%})"
         for name, steps in reflexes.items()
@@ -73,24 +73,24 @@ def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
 
 
 def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill most of whose calls are idle, while the others take time.
+    """Return a sentence on each skill with mostly idle calls, while its others take time.
 
-    A skill whose calls all take a step or two, as a move does, is not meant.
+    A skill whose calls all take a step or two, as a move does, is left out.
     """
-    found = []
+    sentences = []
     for name, report in skills.items():
         others = report.calls - report.idle
         if report.idle > others and report.steps - report.idle > 2 * others:
-            found.append(
+            sentences.append(
                 f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
                 "right after a call of it had ended. If its work is done there, let its "
                 "initiation() be False there; some other skill must be able to start."
             )
-    return found
+    return sentences
 
 
 def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill, a quarter of whose calls are late, or more."""
+    """Return a sentence on each skill with a quarter of its calls late, or more."""
     return [
         f"{report.late:,} of {report.calls:,} calls of {name!r} went on to their limit after they "
         "had succeeded. If its work is done then, let its termination() be True where success() "
@@ -101,22 +101,22 @@ def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
 
 
 def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
-    """A sentence about each skill, half of whose calls are hasty, or more.
+    """Return a sentence on each skill with half of its calls hasty, or more.
 
-    A move of one step that has a cost of its own is meant, too.
+    A move of one step with its own cost is included.
     """
-    found = []
+    sentences = []
     for name, report in skills.items():
         if 2 * report.hasty >= report.calls > 0:
             failed = "" if report.succeeded is None else ", without success"
-            found.append(
+            sentences.append(
                 f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its "
                 f"termination() within two steps{failed}, and their last reward was below 0. Where "
                 "a step costs and an end pays nothing, it is best to end at once: pay for success, "
                 "or let success alone end it. If it was called where its work was done, let its "
                 "initiation() be False there."
             )
-    return found
+    return sentences
 
 
 def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str]:
@@ -125,20 +125,20 @@ def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str
     Args:
         episodes: the number of episodes that were played.
     """
-    found = []
+    sentences = []
     for name, report in skills.items():
         if not report.calls:
-            found.append(
+            sentences.append(
                 f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, "
                 "see that its initiation() is True where the other skills end, give it more "
                 "steps, or raise together.epsilon_final; else leave it out."
             )
         elif report.succeeded == 0:
-            found.append(
+            sentences.append(
                 f"None of {report.calls:,} calls of skill {name!r} ended with success() true. Give "
                 "it more steps or longer calls (call_steps), or a reward that leads there."
             )
-    return found
+    return sentences
 
 
 def _percent(value: float | None) -> str:

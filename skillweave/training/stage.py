@@ -1,4 +1,4 @@
-"""A stage as data: who learns, who decides, with which algorithm, for how many steps."""
+"""A stage as data: its learners, its decider, algorithms and budget."""
 
 from __future__ import annotations
 
@@ -25,45 +25,46 @@ from skillweave.training.replay_learner import store_of
 from skillweave.training.scene import Scene
 from skillweave.types import Policy
 
-SELECTOR, CRITIC = levels.SELECTOR, levels.CRITIC
+SELECTOR = levels.SELECTOR
+CRITIC = levels.CRITIC
 TOGETHER = "together"
 """Name of the stage in which all learn together."""
 
 
 def decides(path: str) -> bool:
-    """Whether it is the path of a selector or a critic of skills: they are no skills."""
+    """Return True for the path of a selector or a critic of skills, which are no skills."""
     return path.rpartition("/")[2] in (SELECTOR, CRITIC)
 
 
 Policies = Mapping[str, Policy]
-"""By name, everyone who can act already: ready skills, and who learnt in earlier stages."""
+"""Policies by path: ready skills, and those that earlier stages trained."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """Where a stage may end before its budget is spent, by its periodic evaluation."""
+    """A value of the periodic evaluation at which a stage ends before its budget is spent."""
 
     of: Literal["return", "success"]
-    """The mean return, or the share of episodes that succeed."""
+    """The criterion: the mean return, or the share of episodes that succeed."""
     at_least: float
-    """The value that is good enough."""
+    """The smallest value that reaches the target."""
 
     def reached(self, evaluation: Mapping[str, float], stage: str) -> float | None:
-        """The value that an evaluation found, where it is good enough.
+        """Return the value of an evaluation that reaches the target, else None.
 
         Args:
-            evaluation: its metrics; empty where there was none.
-            stage: its name, for messages.
+            evaluation: its metrics; empty: no evaluation.
+            stage: the stage's name, for messages.
 
         Raises:
-            EnvError: it cannot tell, as nobody says which episodes succeed.
+            EnvError: the environment does not report which episodes succeed.
         """
         if not evaluation:
             return None
         if (value := evaluation.get(f"eval_{self.of}")) is None:
             raise EnvError(
-                f"stage {stage!r} has target_success, but its environment does not say which "
-                "episodes succeed: info['success'] must be there in an episode's last step"
+                f"stage {stage!r} has target_success, but its environment does not report which "
+                "episodes succeed: set info['success'] in an episode's last step"
             )
         return value if value >= self.at_least else None
 
@@ -74,7 +75,7 @@ def target_of(
     """Return the target of two settings, of which one may be given.
 
     Args:
-        where: whose they are, for messages.
+        where: the stage or skill, for messages.
 
     Raises:
         DeclarationError: both are given.
@@ -124,7 +125,7 @@ class Together:
 
 @dataclass(frozen=True)
 class Stage:
-    """What to train, and in which environment."""
+    """A task of training: its environment, algorithm and budget."""
 
     name: str
     kind: Literal["agent", "skill", "selector", "together"]
@@ -133,43 +134,43 @@ class Stage:
     budget: int
     """Environment steps."""
     scene: Callable[[Policies], Scene]
-    """Where it learns, given everyone who can act already."""
+    """Makes the scene in which it learns, from the policies so far."""
     target: Target | None = None
-    """Where it may end early."""
+    """A target at which it ends early; None: without target."""
     beside: Mapping[str, AlgorithmConfig] = field(default_factory=dict)
-    """Who learns beside the selector from the same steps, and by which algorithm."""
+    """Algorithms of the learners beside the selector, by path."""
     together: Together | None = None
-    """How they learn together; None: one learns alone."""
+    """Settings of learning together; None: a single learner."""
     task_weights: Mapping[str, float] = field(default_factory=dict)
-    """By path, the weights of skills that differ from ``together.task_weight``."""
+    """Weights of skills that differ from ``together.task_weight``, by path."""
     ready: bool = False
-    """The selector does not learn: ``config`` says how many environments there are."""
+    """True if the selector is ready: ``config`` then only sets the number of environments."""
     guide_kl: float | None = None
     """Keep the selector within this KL of its guide; None disables this."""
     node: str = ""
-    """The path of the hierarchy that it is of: empty, or ``inner/`` for example."""
+    """The path of the stage's hierarchy: empty, or ``inner/`` for example."""
     compared: bool = False
-    """What is learnt is kept only if it is better than what was there before."""
+    """Keep the result only if it is better than the policies before."""
     greedy_judged: bool = False
     """At its end, evaluate whether skills and selector should act greedily or sample."""
 
     @property
     def acts_by_code(self) -> bool:
-        """Whether a policy of the stage can be loaded only with code of the user's."""
+        """True if a policy of the stage can be loaded only with the user's code."""
         return any(own_encoders(config) for config in (self.config, *self.beside.values()))
 
     @property
     def learns_by_code(self) -> bool:
-        """Whether the stage can be trained only with functions of the user in its settings."""
+        """True if the stage can be trained only with functions of the user in its settings."""
         configs = (self.config, *self.beside.values())
         return self.acts_by_code or any(own_schedules(config) for config in configs)
 
     def inside(self, name: str) -> Stage:
-        """This stage in a hierarchy that is the skill ``name`` of another one."""
+        """Return this stage in a hierarchy that is the skill ``name`` of another one."""
 
         def scene(policies: Policies) -> Scene:
-            own = {k.removeprefix(path): v for k, v in policies.items() if k.startswith(path)}
-            return self.scene(own)
+            inside = {k.removeprefix(path): v for k, v in policies.items() if k.startswith(path)}
+            return self.scene(inside)
 
         path = f"{name}/"
         return replace(
@@ -182,7 +183,7 @@ class Stage:
         )
 
     def entry(self) -> dict[str, Any]:
-        """The manifest's entry before training."""
+        """Return the manifest's entry before training."""
         first = self.node + SELECTOR if self.together else self.name
         entry: dict[str, Any] = {
             "name": self.name,
@@ -209,7 +210,7 @@ class Stage:
 def check_stages(
     entries: Sequence[dict[str, Any]], eval_every: int | None, keep: str = "last"
 ) -> None:
-    """Raise a DeclarationError where a stage of a manifest could not do what it is to do."""
+    """Raise a DeclarationError where the settings of a manifest's stages do not fit together."""
     alone = any(entry.get("evolution") is None for entry in entries)
     if keep == "best" and eval_every is None and alone:
         raise DeclarationError(
@@ -217,21 +218,23 @@ def check_stages(
             "environment steps between evaluations"
         )
     for entry in entries:
-        where, population = f"stage {entry['name']!r}", entry.get("evolution")
+        where = f"stage {entry['name']!r}"
+        population = entry.get("evolution")
         try:
             resolve_device(entry["algorithm"].get("device", "cpu"))
         except SkillweaveError as error:
             raise reworded(error, f"{where}: {error}") from error
         members = 1 if population is None else population["population"]
-        starts, budget = entry["algorithm"].get("learning_starts", 0), entry["budget"] // members
+        starts = entry["algorithm"].get("learning_starts", 0)
+        budget = entry["budget"] // members
         if budget <= starts:
             each = " for each member" if members > 1 else ""
             raise DeclarationError(
                 f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
-        for name, own in entry.get("algorithms", {}).items():
-            if budget <= (starts := own.get("learning_starts", 0)):
+        for name, algorithm in entry.get("algorithms", {}).items():
+            if budget <= (starts := algorithm.get("learning_starts", 0)):
                 raise DeclarationError(
                     f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
                     f"after {starts:,} (learning_starts). Give the stage more steps, or start "
@@ -251,33 +254,33 @@ def check_stages(
 
 
 ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
-"""What a message advises where a stage cannot have several."""
+"""Advice of messages where a stage cannot have several collectors."""
 
 
 def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any = None) -> None:
-    """Write into each stage's entry how many processes are to step its environments.
+    """Write the number of processes for its environments into each stage's entry.
 
-    Of a population it is the number of parts into which its members are split; where nobody said
-    one, they stay in this process. A number that was measured is lowered to one that divides
-    ``num_envs``, or to 1 where processes cannot be started.
+    For a population it is the number of parts into which its members are split; without a declared
+    number they stay in this process. A measured number is lowered to one that divides ``num_envs``,
+    or to 1 where processes cannot be started.
 
     Args:
-        sent: what processes get, beside the environment.
+        sent: the object that processes receive beside the environment.
 
     Raises:
-        DeclarationError: a number that the user gave does not divide ``num_envs``, or a population
-            is to be split whose members learn on a GPU.
+        DeclarationError: a declared number does not divide ``num_envs``, or a population whose
+            members learn on a GPU is to be split.
     """
     alone = any(entry.get("evolution") is None for entry in entries)
     workers = workers_for(spec) if alone else 1
     if workers > 1 and spec.workers is None:
-        why = why_no_processes() or runs_again() or cannot_be_sent((spec, sent))
-        if why:
+        reason = why_no_processes() or runs_again() or cannot_be_sent((spec, sent))
+        if reason:
             workers = 1
             notice(
                 f"{spec.name} is slow enough that several processes would step it faster, but "
-                f"{why}. All environments stay in one process; EnvSpec(workers=1) ends this "
-                f"message, EnvSpec(workers={cores()}) asks for processes"
+                f"{reason}. All environments stay in one process; EnvSpec(workers=1) ends this "
+                f"message, EnvSpec(workers={cores()}) uses processes"
             )
     for entry in entries:
         num_envs = entry["algorithm"]["num_envs"]
@@ -300,10 +303,12 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
             entry["workers"] = workers
 
 
-def workers_of(entry: Mapping[str, Any], asked: int) -> int:
-    """How many workers a stage has where so many were asked for: a member is in one part."""
+def workers_of(entry: Mapping[str, Any], requested: int) -> int:
+    """Return a stage's number of workers for a requested one: at most one for each member."""
     population = entry.get("evolution")
-    return asked if population is None or asked <= 1 else min(asked, int(population["population"]))
+    if population is None or requested <= 1:
+        return requested
+    return min(requested, int(population["population"]))
 
 
 def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
@@ -312,7 +317,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
     A buffer that is larger than the free memory is a TrainingError.
 
     Args:
-        entry: the manifest's; "evolution" says of how many members.
+        entry: the manifest's; "evolution" holds the number of members.
     """
     config = config_from_json(entry["algorithm"])
     algorithm = make_algorithm(config, observation_space, action_space)
@@ -325,7 +330,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
             f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
             f"Have {ONE}, take PPO, or name other stages: evolve={{...}}"
         )
-    try:  # what is not written takes no memory
+    try:  # unwritten slots take no memory
         store_of(algorithm, config.num_envs * members, members, shared=members > 1)
     except SkillweaveError as error:
         raise reworded(error, f"stage {entry['name']!r}: {error}") from error

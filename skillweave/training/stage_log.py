@@ -1,4 +1,4 @@
-"""What a stage writes and tells while it trains, whoever learns in it."""
+"""Log of a stage in training: its entry, lines, checkpoints and messages, for any learner."""
 
 from __future__ import annotations
 
@@ -25,46 +25,46 @@ from skillweave.training.keep_best import KeepBest
 ENOUGH = 20
 """Episodes after which a logged key of ``info`` that never occurred is reported."""
 SLOW_SECONDS = 10.0
-"""Seconds of an evaluation that are worth a word, if training takes less."""
+"""Seconds of an evaluation that cause a message, if training takes less."""
 T = TypeVar("T")
 START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
-"""Where a stage stands before its first update."""
+"""Header of a stage before its first update."""
 LARGEST_SPARE = 100 * 2**20
-"""Bytes of replay buffers that a finished stage keeps; one that keeps none fills a new one."""
+"""Most bytes of replay buffers that a finished stage keeps; without them it fills new ones."""
 
 
 class Listener(Protocol):
-    """Is told how training goes: a progress bar, TensorBoard, Weights & Biases."""
+    """Receiver of training's events: a progress bar, TensorBoard, Weights & Biases."""
 
     def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on."""
+        """Handle the start of a stage, or its continuation."""
         ...
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made."""
+        """Handle the report of an update."""
         ...
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over."""
+        """Handle the end of a stage."""
         ...
 
     def message(self, text: str) -> None:
-        """Something that people should know."""
+        """Show a message to people."""
         ...
 
 
 def never_succeeded(entry: Mapping[str, Any]) -> bool:
-    """Whether a skill's stage has ended, and none of its calls was a success.
+    """Return True if a skill's stage has ended without a successful call.
 
-    Skills without ``success`` and populations are not judged.
+    False for skills without ``success``, and for populations.
     """
     return entry.get("succeeded") is False
 
 
 def success_rate(entry: Mapping[str, Any]) -> float:
-    """The share of a skill's calls that were a success when its stage ended.
+    """Return the share of a skill's calls that succeeded at the end of its stage.
 
-    1 where that is not judged; see ``never_succeeded``.
+    1 for skills without ``success``, and for populations.
     """
     if "succeeded" not in entry:
         return 1.0
@@ -72,106 +72,109 @@ def success_rate(entry: Mapping[str, Any]) -> float:
 
 
 class StageLog:
-    """A stage's entry in the manifest, its lines, its checkpoints, and who is told.
+    """Writer of a stage's entry in the manifest, its lines and checkpoints, and its listeners.
 
     Args:
-        at: where the stage stands: a checkpoint's header, or ``START``.
+        at: the header of the checkpoint to continue from, or ``START``.
     """
 
     def __init__(
         self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Mapping[str, Any]
     ) -> None:
-        self.run, self.listeners, self.entry, self.at = run, listeners, run.stage(name), dict(at)
+        self.run = run
+        self.listeners = listeners
+        self.entry = run.stage(name)
+        self.at = dict(at)
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         self._has_final = False
         # Before a stage trains, its entry has the size that the files had when it was last done.
-        begins = self.entry["status"] != "training"
-        lack = run.rewind(self.at if begins else self.entry | self.at)
-        known = {} if begins or lack else self.entry
-        self.entry.update(run.line_bytes() | known, status="training")
+        is_new = self.entry["status"] != "training"
+        incomplete = run.rewind(self.at if is_new else self.entry | self.at)
+        sizes = {} if is_new or incomplete else self.entry
+        self.entry.update(run.line_bytes() | sizes, status="training")
         run.save()
         for listener in listeners:
             listener.stage(name, int(self.entry["budget"]))
-        for file in lack:
-            self.tell(f"{run.path / file} was removed or shortened: curves lack what stood there")
+        for file in incomplete:
+            self.tell(f"{run.path / file} was removed or shortened: curves lack its lines")
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made."""
+        """Write the report of an update, and pass it to listeners."""
         name = self.entry["name"]
         self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
-        now = {"stage": name, "update": update, "steps": steps}
-        self.run.log(now | {"seconds": round(seconds, 4)} | metrics)
+        header = {"stage": name, "update": update, "steps": steps}
+        self.run.log(header | {"seconds": round(seconds, 4)} | metrics)
         for listener in self.listeners:
             listener.tick(name, steps, seconds, metrics)
 
     @property
     def stop_requested(self) -> bool:
-        """Whether a callback has asked to end the stage."""
+        """True if a callback has ended the stage."""
         return any(callback.stopped for callback in self._callbacks)
 
     def stands(self, update: int, steps: int, seconds: float) -> None:
-        """Training stands here, and a checkpoint of it is written."""
+        """Set the counts of the next checkpoint."""
         self.at.update(update=update, steps=steps, seconds=seconds)
 
     def tell(self, text: str) -> None:
-        """Something that people should know."""
+        """Send a message about the stage to listeners."""
         for listener in self.listeners:
             listener.message(f"{self.entry['name']}: {text}")
 
     def tell_begun_anew(self, count: int, of: int) -> None:
-        """Of ``of`` environments, ``count`` could not be brought back to where they were."""
+        """Report that ``count`` of ``of`` environments could not repeat their open episodes."""
         if count:
             self.tell(
-                f"{count} of {of} open episodes begin anew, so the end may differ from that of an "
-                "undisturbed run: given the same seed and the same actions, the environment does "
-                "not repeat itself"
+                f"{count} of {of} open episodes start again, so the result may differ from that of "
+                "an undisturbed run: given the same seed and the same actions, the environment "
+                "does not repeat itself"
             )
 
     def tell_learnt_nothing(self) -> None:
-        """Its weights are still those that it began with."""
+        """Report that the weights are still the initial ones."""
         self.tell(
             f"it learnt nothing in {self.at['steps']:,} steps, as too few of them were its own: "
-            "perhaps its initiation() seldom holds where the others lead. Widen it, or give more "
+            "perhaps its initiation() is seldom True where the others lead. Widen it, or give more "
             "steps"
         )
 
     def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
-        """Write a checkpoint: a state, what else resuming needs, and ``more`` in its header.
+        """Write a checkpoint: a state, other tensors for resuming, and ``more`` in its header.
 
-        What ``at`` says of updates and steps must be of this moment; its metrics are the latest
-        that were reported.
+        The updates and steps of ``at`` must be of this moment; its metrics are the latest reported
+        ones.
         """
         self.run.save_checkpoint(state, self._header(more), extra)
-        self._tell_checkpoint()
+        self._notify_callbacks()
 
     def _header(self, more: Mapping[str, Any]) -> dict[str, Any]:
-        kept = ("update", "steps", "evaluation_steps", "seconds", "metrics")
-        return {"stage": self.entry["name"]} | {k: self.at[k] for k in kept} | dict(more)
+        fields = ("update", "steps", "evaluation_steps", "seconds", "metrics")
+        return {"stage": self.entry["name"]} | {k: self.at[k] for k in fields} | dict(more)
 
-    def _tell_checkpoint(self) -> None:
+    def _notify_callbacks(self) -> None:
         for callback in self._callbacks:
             callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
 
     def tell_absent(self, tally: EpisodeTally, *, over: bool) -> None:
-        """Say once in a run which logged keys of ``info`` never occurred.
+        """Report once in a run the logged keys of ``info`` that never occurred.
 
         Args:
-            over: the stage is, so there are no more episodes to wait for.
+            over: the stage has ended, so no more episodes will come.
         """
         if not tally.absent or not tally.ended or (tally.ended < ENOUGH and not over):
             return
         absent = [key for key in tally.absent if key not in self.run.reported_absent]
         self.run.reported_absent |= set(absent)
         others = sorted(tally.others - set(absent))
-        there = f"its keys there were {', '.join(others)}" if others else "it was empty there"
+        content = f"its keys there were {', '.join(others)}" if others else "it was empty there"
         for key in absent:
             self.tell(
                 f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info); "
-                f"{there}.{close_matches(key, others)}"
+                f"{content}.{close_matches(key, others)}"
             )
 
     def tell_endless(self, tally: EpisodeTally) -> None:
-        """Say once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
+        """Report once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
         if tally.longest < LONG_EPISODE:
             return
         notice(
@@ -183,7 +186,7 @@ class StageLog:
         )
 
     def tell_slow(self, took: float, after: float) -> None:
-        """Say once in a run that evaluations take longer than training.
+        """Report once in a run that evaluations take longer than training.
 
         Args:
             took: seconds of an evaluation.
@@ -198,12 +201,14 @@ class StageLog:
         )
 
     def stopped(self) -> None:
-        """The stage ends here, as a callback has asked for."""
+        """Record that a callback has ended the stage."""
         self.entry["stopped"] = {"steps": self.at["steps"]}
-        self.tell(f"the callback returned False after {self.at['steps']:,} steps: it ends here")
+        self.tell(
+            f"the callback returned False after {self.at['steps']:,} steps: the stage ends here"
+        )
 
     def kept_best(self, best: KeepBest) -> None:
-        """The stage ends with the weights of its best evaluation."""
+        """Record that the stage ends with the weights of its best evaluation."""
         self.entry["best"] = {"steps": best.steps, "of": best.of, "value": best.value}
         self.at["metrics"] = self.at["metrics"] | best.metrics
         self.tell(best_words(self.entry["best"]))
@@ -222,12 +227,12 @@ class StageLog:
         A full disk does not stop the stage: its policies are smaller.
 
         Args:
-            extra: what continuing needs beside the state.
-            spare: what may be left out: replay buffers. They are, if they are large.
-            more: of the header.
-            spent: the budget is spent, so it is a checkpoint first: all is learnt, should writing
-                the policies fail. Else a run that is killed now comes here again from the
-                checkpoint before.
+            extra: tensors that continuing needs beside the state.
+            spare: replay buffers, which are left out if they are large.
+            more: entries of the header.
+            spent: the budget is spent, so the state is a checkpoint, too, in case writing the
+                policies fails. Else a run that is killed now repeats the end of the stage from
+                the previous checkpoint.
         """
         header = self._header(more)
         write = self.run.save_checkpoint if spent else self.run.save_final
@@ -247,24 +252,25 @@ class StageLog:
             )
             return
         if spent:
-            self._tell_checkpoint()
+            self._notify_callbacks()
 
     def reached(self, value: float) -> None:
-        """The stage has reached its target and ends here."""
+        """Record that the stage has reached its target."""
         self.entry["reached"] = {"steps": self.at["steps"], "value": value}
         target = self.entry["target"]
         self.tell(
             f"target reached after {self.at['steps']:,} steps: {target['of']} {value:g}, "
-            f"at least {target['at_least']:g} was asked"
+            f"the target is {target['at_least']:g}"
         )
 
     def done(self, policies: Mapping[str, AgentPolicy], states: Mapping[str, Any]) -> None:
-        """The stage is over: keep who learnt in it, and say how it went.
+        """Finish the stage: save its policies, and record the result.
 
         Args:
-            states: by name, what those who learn on in a later stage begin with there.
+            states: by name, the states with which learners continue in a later stage.
         """
-        entry, at = self.entry, self.at
+        entry = self.entry
+        at = self.at
         for name, state in states.items():
             if learns_again(self.run, entry["name"], name):
                 save_state(self.run, entry["name"], name, state)
@@ -272,7 +278,7 @@ class StageLog:
         if self._has_final:
             self.run.keep_final(entry["name"])
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
-        entry.update(self.run.line_bytes())  # so that a later stage sees if lines were removed
+        entry.update(self.run.line_bytes())  # so that a later stage notices removed lines
         entry["evaluation_steps"] = at["evaluation_steps"]
         entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
         entry["final"] = at["metrics"]
@@ -281,8 +287,8 @@ class StageLog:
         self.run.save()
         if never_succeeded(entry):
             self.tell(
-                "success() held at the end of none of its calls, so stages after this one build on "
-                "a skill that does not work. It may need more steps, a reward that leads there "
+                "no call ended with success() true, so stages after this one build on a skill that "
+                "does not work. It may need more steps, a reward that leads there "
                 "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
             )
         self.run.drop_checkpoints()
@@ -292,7 +298,7 @@ class StageLog:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
     def _save_policies(self, policies: Mapping[str, AgentPolicy]) -> None:
-        """Write who learnt; on a full disk in place of what is needed less."""
+        """Write the policies; on a full disk delete final states of earlier stages first."""
         name = self.entry["name"]
         try:
             self.run.save_policies(name, policies)
@@ -301,30 +307,30 @@ class StageLog:
                 raise
             self.run.save_policies(name, policies)
             self.tell(
-                "the disk is full, so final states of stages before it were deleted to make room: "
+                "the disk is full, so final states of earlier stages were deleted to make room: "
                 "those stages cannot be given more steps later"
             )
 
     def _succeeded(self) -> bool | None:
-        """Whether any call of the skill was a success; None: nobody says so."""
+        """Return True if a call of the skill succeeded; None: unknown."""
         if self.entry["kind"] != "skill" or self.entry.get("evolution"):
             return None
         lines = [line for line in self.run.metrics() if line.get("stage") == self.entry["name"]]
-        told = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
-        if wrong := [value for value in told if type(value) not in (int, float)]:
+        shares = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
+        if wrong := [value for value in shares if type(value) not in (int, float)]:
             raise RunError(
                 f"{self.run.path / 'metrics.jsonl'}: {self.entry['name']!r} has a share of calls "
                 f"that succeeded of {shown(wrong[0])}, which is no number; remove that line, then "
                 f"{resume_words(self.run)}"
             )
-        return max(told) > 0.0 if told else None
+        return max(shares) > 0.0 if shares else None
 
 
 def resumed(log: StageLog, restore: Callable[[], T]) -> T:
-    """What ``restore`` returns, which brings environments back to where a checkpoint left them.
+    """Return the result of ``restore``, which restores environments from a checkpoint.
 
     Raises:
-        RunError: the checkpoint does not hold what belongs there.
+        RunError: the content of the checkpoint is wrong.
     """
     try:
         return restore()
@@ -333,6 +339,6 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
         raise error if run in str(error) else reworded(error, f"{run}: {error}") from error
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise RunError(
-            f"{log.run.path}: training cannot go on from the checkpoint of stage "
+            f"{log.run.path}: training cannot continue from the checkpoint of stage "
             f"{log.entry['name']!r}: {error!r}"
         ) from error

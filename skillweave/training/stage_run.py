@@ -1,4 +1,4 @@
-"""A stage in a run, and what whoever learns in it must be able to do."""
+"""A stage in a run, and the interface of its learners."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from skillweave.training.stage_log import StageLog
 
 @dataclass(frozen=True)
 class StageRun:
-    """A stage in a run. The run's settings count: a resumed run goes on as it began."""
+    """A stage in a run. The run's settings count: a resumed run keeps its first settings."""
 
     entry: dict[str, Any]
-    """The manifest's."""
+    """The stage's entry in the manifest."""
     run: RunDirectory
     seeds: Seeds
     """The stage's node of the seed tree."""
     scene: Scene
     policies: Policies
-    """Everyone who can act already."""
+    """Policies by path: ready skills, and those that earlier stages trained."""
 
     @property
     def name(self) -> str:
-        """The stage's."""
+        """Name of the stage."""
         return str(self.entry["name"])
 
     @property
@@ -44,48 +44,48 @@ class StageRun:
 
     @property
     def budget(self) -> int:
-        """Environment steps."""
+        """Budget in environment steps."""
         return int(self.entry["budget"])
 
     @property
     def continues(self) -> bool:
-        """Whether it had ended, and was then given more steps."""
+        """True for a finished stage that was given more steps."""
         return bool(self.entry.get("continued"))
 
     @property
     def target(self) -> Target | None:
-        """Where the stage may end early."""
-        told = self.entry.get("target")
-        return None if told is None else Target(**told)
+        """The target at which the stage ends early; None: without target."""
+        target = self.entry.get("target")
+        return None if target is None else Target(**target)
 
     @property
     def best(self) -> KeepBest | None:
-        """What keeps the best weights; None: the last ones count."""
+        """A new store of the best weights; None: the last ones count."""
         if self.run.manifest.get("keep") != "best":
             return None
         return KeepBest("return" if self.target is None else self.target.of)
 
 
 class StageLearner(Protocol):
-    """Who learns in a stage: one agent, or a population."""
+    """The learner of a stage: one agent, several agents, or a population."""
 
     schema: Any
-    """Of the headers of its checkpoints."""
+    """Schema of the headers of its checkpoints."""
 
     def open(self) -> Any | None:
-        """Make the environments; the state to begin with, if checkpoints hold one."""
+        """Make the environments; return the initial state, if checkpoints hold one."""
         ...
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Stand where a checkpoint says, or at the start where ``extra`` is empty."""
+        """Restore a checkpoint, or prepare to start where ``extra`` is empty."""
         ...
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
-        """Learn until the stage is over; by name, those who learnt, as they end."""
+        """Learn until the stage is over; return the trained policies, by name."""
         ...
 
     def states(self) -> dict[str, Any]:
-        """By name, all that those have learnt who may learn on in a later stage."""
+        """Return the states of learners that may continue in a later stage, by name."""
         ...
 
     def close(self) -> None:
@@ -94,10 +94,10 @@ class StageLearner(Protocol):
 
 
 MakeLearner = Callable[[StageRun], StageLearner]
-"""Who is to learn in a stage, by its entry in the manifest."""
+"""A function that makes the learner of a stage, by its entry in the manifest."""
 
 
 def begin_as(algorithm: Algorithm, state: Any, policy: AgentPolicy, steps: int) -> None:
-    """Give a fresh ``state`` the weights of a policy that learnt from so many steps, in place."""
+    """Give a fresh ``state`` the weights of a policy that learnt from ``steps`` steps, in place."""
     algorithm.set_weights(state, policy.weights)
     state.obs_count.fill_(max(1.0, steps))

@@ -38,14 +38,14 @@ from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, prefixed, unprefixed
 
 EARLY = 0.25
-"""Share of a stage's budget after which it is said what has not begun."""
+"""Share of a stage's budget after which skills without a call are reported."""
 
 
 class OneAgent:
-    """A stage's learner where nothing evolves.
+    """The learner of a stage without a population.
 
     Args:
-        make_collectors: says where collectors run.
+        make_collectors: makes the collectors, here or in other processes.
     """
 
     schema: Any = Checkpoint
@@ -53,92 +53,97 @@ class OneAgent:
     def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
         if stage.entry.get("evolution") is not None:
             raise DeclarationError(f"stage {stage.name!r} evolves: it needs a population to train")
-        self.stage, self._open = stage, ExitStack()
+        self.stage = stage
+        self._resources = ExitStack()
         self._make_collectors = make_collectors
 
     def open(self) -> Any:
-        """Make the environments and the agent; the agent's state."""
+        """Make the environments and the agent; return the agent's state."""
         stage, config, scene = self.stage, self.stage.config, self.stage.scene
         manifest = stage.run.manifest
-        every, episodes = manifest.get("eval_every"), manifest.get("eval_episodes", 0)
+        every = manifest.get("eval_every")
+        episodes = manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
         make = partial(_seeded, self.maker(), stage.seeds / "global")
         self.collectors = self._make_collectors(make, config.num_envs, workers, 1, scene.name)
-        self._open.callback(self.collectors.close)
+        self._resources.callback(self.collectors.close)
         self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes, config.num_envs)
-        self._open.callback(self.evaluation.close)
+        self._resources.callback(self.evaluation.close)
         self.episodes = Episodes(scene.log_info)
         self.best = stage.best
         return fresh
 
     def make_agents(self) -> Any:
-        """Make who learns; the fresh state that checkpoints hold, or None."""
+        """Make the learning algorithms; return the fresh state that checkpoints hold, or None."""
         stage, scene = self.stage, self.stage.scene
         spaces = scene.observation_space, scene.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
         self.start = None
         if not stage.continues:
             self.start = start_of(stage.run, stage.name, stage.name, self.algorithm)
-        return self._beginning()
+        return self._initial_state()
 
-    def _beginning(self) -> Any:
-        """What the agent is before it learns here."""
+    def _initial_state(self) -> Any:
+        """Return the agent's state at the start of this stage."""
         state = self.algorithm.init([self.stage.seeds / "member" / 0])
         if self.start is not None:
             begin_as(self.algorithm, state, *self.start)
         return state
 
     def maker(self) -> MakeCollector:
-        """What makes collectors in which the agent acts; it may be sent to other machines."""
+        """Return a function that makes collectors; it may be sent to other machines."""
         return partial(_collector, self.stage.scene, self.algorithm)
 
     def learner_from(self, state: Any, extra: dict[str, Tensor], log: StageLog) -> Learner:
-        """Who learns, from this state on."""
+        """Return the learner that continues from ``state``."""
         stage, config = self.stage, self.stage.config
         stack = Stack(self.algorithm, state_to(state, resolve_device(config.device)))
-        found = learner_of(
-            stack, config.num_envs, stage.seeds, row_steps=stage.scene.row_steps,
+        learner = learner_of(
+            stack,
+            config.num_envs,
+            stage.seeds,
+            row_steps=stage.scene.row_steps,
             goes_on_at=log.at["steps"],
-        )  # fmt: skip
-        keep_to_guide(found, stage.entry.get("guide_kl"))
-        if stage.name in stage.entry.get("starts", {}) and isinstance(found, ReplayLearner):
-            found.act_from_the_start()
-        return found
+        )
+        keep_to_guide(learner, stage.entry.get("guide_kl"))
+        if stage.name in stage.entry.get("starts", {}) and isinstance(learner, ReplayLearner):
+            learner.act_from_the_start()
+        return learner
 
     def policies(self) -> dict[str, AgentPolicy]:
-        """By name, who learns, as they are now."""
+        """Return the present policies of the learners, by name."""
         (stack,) = self.learner.stacks
         return {self.stage.name: AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))}
 
     def states(self) -> dict[str, Any]:
-        """All that the agent has learnt."""
+        """Return the present states of the learners, by name."""
         (stack,) = self.learner.stacks
         return {self.stage.name: state_to(stack.state, "cpu")}
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
-        """An episode in each environment of an arena, (n, 4); see ``episodes_of``."""
+        """Play an episode in each environment of an arena, (n, 4); see ``episodes_of``."""
         (policy,) = self.policies().values()
         return episodes_of(policy, arena, seeds)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[Any, dict[str, Tensor]]:
-        """Return the state, and what else a checkpoint holds beside ``extra``, with that."""
+        """Return the state and all other tensors of a checkpoint, ``extra`` included."""
         (stack,) = self.learner.stacks
         return state_to(stack.state, "cpu"), extra | self.best_tensors()
 
     def best_tensors(self) -> dict[str, Tensor]:
-        """Return what a checkpoint holds of the best weights."""
+        """Return a checkpoint's tensors of the best weights."""
         return {} if self.best is None else self.best.tensors()
 
     def best_header(self) -> dict[str, Any]:
-        """Return what its header says of them."""
+        """Return the header's entries of the best weights."""
         return {} if self.best is None else self.best.header()
 
     def _save_final(self, log: StageLog, *, spent: bool) -> None:
-        """Write what more steps continue from; environments begin new episodes then.
+        """Write the state from which more steps continue, in new episodes.
 
         Args:
-            spent: the budget is, so that the state is a checkpoint, too.
+            spent: the budget is spent, so the state is a checkpoint, too.
         """
         whole = prefixed("learner", self.learner.kept(requested=False))
         needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
@@ -147,7 +152,7 @@ class OneAgent:
         log.save_final(state, extra, spare, self.best_header(), spent=spent)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Stand where a checkpoint says."""
+        """Restore a checkpoint."""
         self.learner = self.learner_from(state, extra, log)
         self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         self._steps_before = at.steps
@@ -161,8 +166,9 @@ class OneAgent:
             resumed(log, lambda: begin_episodes(learner, collectors, extra, at, self.stage.seeds))
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
-        """Learn until the budget is spent or the target is reached."""
-        target, made = self.stage.target, self.collectors.steps_made
+        """Learn until the budget is spent or the target is reached; return the policies."""
+        target = self.stage.target
+        made = self.collectors.steps_made
 
         def on_tick(tick: Tick) -> None:
             log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
@@ -171,17 +177,17 @@ class OneAgent:
             log.tell_endless(self.episodes.tally)
             if tick.since < EARLY * self.stage.budget <= tick.steps:
                 self.tell_early(tick.steps, log)
-            # Where the best is kept, the last weights must have their chance.
+            # If the best weights count, the last ones must be evaluated, too.
             last = self.best is not None and tick.steps >= self.stage.budget
-            found = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
+            evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
             log.at["evaluation_steps"] += self.evaluation.spent()
-            if found:
+            if evaluation:
                 log.tell_slow(self.evaluation.took, self.evaluation.after)
             if self.best is not None:
-                self.best.see(found, tick.steps, self.states)
-            log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | found)
-            # No checkpoint where it ends: a run resumed from the one before comes here again.
-            if target is not None and target.reached(found, self.stage.name) is not None:
+                self.best.see(evaluation, tick.steps, self.states)
+            log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | evaluation)
+            # No checkpoint at the end: a run that resumes from the previous one comes here again.
+            if target is not None and target.reached(evaluation, self.stage.name) is not None:
                 raise _TargetReached
             if log.stop_requested:
                 raise _Stopped
@@ -205,7 +211,7 @@ class OneAgent:
                 on_checkpoint=on_checkpoint,
             )
         except (_TargetReached, _Stopped) as end:
-            # What was collected since the update was made, too.
+            # Count the steps collected since the update, too.
             log.at["steps"] = self._steps_before + self.collectors.steps_made - made
             if isinstance(end, _Stopped):
                 log.stopped()
@@ -215,37 +221,37 @@ class OneAgent:
                 log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
         else:
             self._save_final(log, spent=True)
-            if self.stage.entry["kind"] == "skill" and self._learnt_nothing():
+            if self.stage.entry["kind"] == "skill" and self._is_unchanged():
                 log.tell_learnt_nothing()
         log.tell_absent(self.episodes.tally, over=True)
         log.tell_endless(self.episodes.tally)
         if self.best is not None and self.best.metrics:
-            self._end_with(self.best)
+            self._load_best(self.best)
             log.kept_best(self.best)
         return self.policies()
 
-    def _end_with(self, best: KeepBest) -> None:
-        """Let all who learn have what they had at the best evaluation."""
+    def _load_best(self, best: KeepBest) -> None:
+        """Set the learners' states to those of the best evaluation."""
         for stack, state in zip(self.learner.stacks, best.states.values(), strict=True):
             stack.state = state_to(state, stack.state.params.device)
 
     def tell_early(self, steps: int, log: StageLog) -> None:
-        """Say what has gone wrong so far, while it can still be stopped; nothing for one agent."""
+        """Report problems so far, while training can still be stopped; none for one agent."""
 
-    def _learnt_nothing(self) -> bool:
-        """Whether its weights are those that it began with."""
+    def _is_unchanged(self) -> bool:
+        """Return True if the weights are still the initial ones."""
         (stack,) = self.learner.stacks
-        before = AgentPolicy.of(self.algorithm, self._beginning()).weights
+        before = AgentPolicy.of(self.algorithm, self._initial_state()).weights
         after = AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu")).weights
         return all(torch.equal(after[name], before[name]) for name in before)
 
     def close(self) -> None:
         """Release the environments."""
-        self._open.close()
+        self._resources.close()
 
 
 def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Collector:
-    """Make a collector whose process has global generators of its own."""
+    """Make a collector after seeding the global generators of its process."""
     seed_global_generators(seeds / first)
     return make(num_envs, first)
 
@@ -255,11 +261,11 @@ def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) ->
 
 
 class _TargetReached(Exception):
-    """Ends a loop: what it has learnt is good enough."""
+    """Signal that ends a loop: the target is reached."""
 
 
 class _Stopped(Exception):
-    """Ends a loop: a callback has asked for it."""
+    """Signal that ends a loop: a callback has returned False."""
 
 
 def train_stage(
@@ -270,12 +276,12 @@ def train_stage(
     policies: Policies | None = None,
     make_learner: MakeLearner = OneAgent,
 ) -> dict[str, AgentPolicy]:
-    """Train a stage to its end, or load it where it is done; by name, those who learnt.
+    """Train a stage to its end, or load it if it is done; return its policies, by name.
 
     Args:
         seeds: the stage's node of the seed tree.
-        policies: everyone who can act already.
-        make_learner: who is to learn, by the stage's entry.
+        policies: the policies so far, by path.
+        make_learner: makes the learner, by the stage's entry.
 
     Raises:
         TrainingError: training diverged.
@@ -283,13 +289,13 @@ def train_stage(
     """
     entry = run.stage(stage.name)
     if entry["status"] == "done":
-        drop_starts(run, stage.name)  # it may have been killed just before
+        drop_starts(run, stage.name)  # the run may have been killed just before
         return run.load_policies(stage.name)
-    known = policies or {}
-    scene = stage.scene(known)
+    earlier = policies or {}
+    scene = stage.scene(earlier)
     if keys := run.manifest.get("log_info"):
         scene = replace(scene, log_info=tuple(keys))
-    learner = make_learner(StageRun(entry, run, seeds, scene, known))
+    learner = make_learner(StageRun(entry, run, seeds, scene, earlier))
     evolves = entry.get("evolution") is not None
     with (
         global_generators(seeds / "global"),
@@ -298,8 +304,8 @@ def train_stage(
         try:
             fresh = learner.open()
             kind = None if fresh is None else type(fresh)
-            found = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
-            state, at, extra = found or (fresh, START, {})
+            checkpoint = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
+            state, at, extra = checkpoint or (fresh, START, {})
             log = StageLog(stage.name, run, listeners, at)
             learner.go_on(state, extra, log)
             policies = learner.train(log)
@@ -316,13 +322,13 @@ def train_stages(
     policies: Policies | None = None,
     make_learner: MakeLearner = OneAgent,
 ) -> dict[str, Policy]:
-    """Train stages one after another; by name, everyone who can act after them.
+    """Train stages one after another; return all policies after them, by path.
 
     Args:
-        policies: who can act before the first.
+        policies: the policies before the first stage.
     """
-    found = dict(policies or {})
+    by_path = dict(policies or {})
     root = Seeds(int(run.manifest["seed"]))
     for stage in stages:
-        found |= train_stage(stage, run, root / stage.name, listeners, found, make_learner)
-    return found
+        by_path |= train_stage(stage, run, root / stage.name, listeners, by_path, make_learner)
+    return by_path

@@ -41,7 +41,7 @@ from skillweave.types import Array, prefixed, unprefixed
 
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:
-    """Who learns in a stage where nothing evolves, from collectors that are made so."""
+    """Return the learner of a stage without a population."""
     kind = WovenAgents if "together" in stage.entry else OneAgent
     return kind(stage, make_collectors)
 
@@ -52,141 +52,149 @@ class WovenAgents(OneAgent):
     stage: Any
 
     def make_agents(self) -> None:
-        """Make who learns; checkpoints hold their states under ``extra``."""
-        entry, scene = self.stage.entry, self.scene
+        """Make the learning algorithms; checkpoints hold their states under ``extra``."""
+        entry = self.stage.entry
+        scene = self.scene
         self.together = Together(**entry["together"])
         self.first: str = entry["decides"]
         self.node = self.first.removesuffix(SELECTOR)
         configs = {self.first: self.stage.config} if self.first in entry["learns"] else {}
-        configs |= {name: config_from_json(own) for name, own in entry["algorithms"].items()}
+        configs |= {
+            name: config_from_json(settings) for name, settings in entry["algorithms"].items()
+        }
         self.algorithms: dict[str, Algorithm] = {}
         for name, config in configs.items():
-            grown, acts = self._as_grown(name, config), scene.chooses_from(self._below(name))
-            self.algorithms[name] = self._made(grown, acts) or make_algorithm(
-                grown, scene.observation_space, acts
+            grown = self._as_grown(name, config)
+            actions = scene.chooses_from(self._path_in_scene(name))
+            self.algorithms[name] = self._equal_algorithm(grown, actions) or make_algorithm(
+                grown, scene.observation_space, actions
             )
 
-    def _made(self, config: Any, action_space: Any) -> Algorithm | None:
-        """One that is there already: it need not be compiled again.
+    def _equal_algorithm(self, config: Any, action_space: Any) -> Algorithm | None:
+        """Return an algorithm with equal settings, if one exists: it need not be compiled again.
 
-        An algorithm holds nothing that is learnt, so several learners may have the same one.
+        An algorithm holds no weights, so several learners may share one.
         """
         for other in self.algorithms.values():
             if other.config == config and other.action_space == action_space:
                 return other
         return None
 
-    def _below(self, path: str) -> str:
-        """A path as it is in the hierarchy that this stage is of."""
+    def _path_in_scene(self, path: str) -> str:
+        """Return a path relative to the stage's hierarchy."""
         return path.removeprefix(self.node)
 
     def _as_grown(self, name: str, config: Any) -> Any:
-        """The settings, with the networks that ``name`` has grown in a population."""
-        before = self.stage.policies.get(name)
-        if not isinstance(before, AgentPolicy):
+        """Return the settings, with the networks that ``name`` has grown in a population."""
+        earlier = self.stage.policies.get(name)
+        if not isinstance(earlier, AgentPolicy):
             return config
-        had: Any = before.algorithm.config
-        return replace(
-            config, **{k: getattr(had, k) for k in ("network", "critic") if hasattr(had, k)}
-        )
+        settings: Any = earlier.algorithm.config
+        grown = {k: getattr(settings, k) for k in ("network", "critic") if hasattr(settings, k)}
+        return replace(config, **grown)
 
     @property
     def scene(self) -> WovenScene:
-        """Where they learn."""
+        """The scene of the stage."""
         scene: WovenScene = self.stage.scene
         return scene
 
     def maker(self) -> MakeCollector:
-        """What makes collectors in which all act; it may be sent to other machines."""
+        """Return a function that makes collectors; it may be sent to other machines."""
         return partial(_collector, self.scene, self._acting(), self._margins())
 
     def _acting(self) -> dict[str, Algorithm]:
-        """Who acts, by their paths in the hierarchy that this stage is of."""
-        return {self._below(k): a for k, a in self.algorithms.items()}
+        """Return the acting algorithms, by their paths in the stage's hierarchy."""
+        return {self._path_in_scene(k): a for k, a in self.algorithms.items()}
 
     def _margins(self) -> dict[str, float]:
-        """By the paths of critics, where calls are cut."""
-        own = {CRITIC: self.together.margin} if self.together.interrupt else {}
-        return own | dict(self.scene.margins)
+        """Return the margins of interruption, by the paths of critics."""
+        margin = {CRITIC: self.together.margin} if self.together.interrupt else {}
+        return margin | dict(self.scene.margins)
 
     def _guide_kl(self, name: str) -> float | None:
         """Return the KL within which a learner stays of its guide; None: without limit."""
         if name == self.first:
             kl: float | None = self.stage.entry.get("guide_kl")
             return kl
-        return self.scene.guide_kl.get(self._below(name))
+        return self.scene.guide_kl.get(self._path_in_scene(name))
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
-        """All learners, from a checkpoint, from what they learnt in earlier stages, or fresh."""
-        saved, parts = unprefixed("state", extra), dict[str, Learner]()
+        """Return all learners: from a checkpoint, from earlier stages, or fresh."""
+        saved = unprefixed("state", extra)
+        learners: dict[str, Learner] = {}
         for name, algorithm in self.algorithms.items():
             fresh: Any = algorithm.init([self.stage.seeds / name / "member" / 0])
             device = resolve_device(algorithm.config.device)
-            before, reference = self._before(name), None
-            if before is not None:
+            earlier = self._earlier_policy(name)
+            state = fresh
+            reference = None
+            if earlier is not None:
                 if not saved:
-                    self._tell_lost_state(name, log)
-                fresh = self._as_before(name, algorithm, fresh, *before)
-                reference = self._reference(name, algorithm, fresh, device, log)
+                    self._report_lost_state(name, log)
+                state = self._earlier_state(name, algorithm, fresh, *earlier)
+                reference = self._reference(name, algorithm, state, device, log)
             if saved:
-                fresh = state_from(unprefixed(name, saved), fresh, f"{log.run.path}: {name}")
-            stack = Stack(algorithm, state_to(fresh, device))
-            learnt_before = before is not None or name in self.stage.entry.get("starts", {})
-            part = self._part(name, stack, log, learnt_before=learnt_before)
+                state = state_from(unprefixed(name, saved), state, f"{log.run.path}: {name}")
+            stack = Stack(algorithm, state_to(state, device))
+            learnt_before = earlier is not None or name in self.stage.entry.get("starts", {})
+            learner = self._learner(name, stack, log, learnt_before=learnt_before)
             if reference is not None:
-                part.reference = reference  # type: ignore[attr-defined]
-            keep_to_guide(part, self._guide_kl(name))
-            parts[name] = part
+                learner.reference = reference  # type: ignore[attr-defined]
+            keep_to_guide(learner, self._guide_kl(name))
+            learners[name] = learner
         weights = self.stage.entry["task_weights"]
-        found = WovenLearner(parts, self.node, self.together.task_weight, weights)
+        joint = WovenLearner(learners, self.node, self.together.task_weight, weights)
         if extra:
-            told = checked_tensor(extra, "counts", (len(parts), 2), torch.int64, str(log.run.path))
-            if not ((told >= 0) & (told < 2**53)).all():
+            shape = (len(learners), 2)
+            counts = checked_tensor(extra, "counts", shape, torch.int64, str(log.run.path))
+            if not ((counts >= 0) & (counts < 2**53)).all():
                 raise RunError(f"{log.run.path}: its counts of rows and updates are out of range")
-            found.counts = dict(zip(parts, told.tolist(), strict=True))
-        return found
+            joint.counts = dict(zip(learners, counts.tolist(), strict=True))
+        return joint
 
-    def _before(self, name: str) -> tuple[AgentPolicy, int] | None:
-        """What ``name`` has learnt before: in earlier stages, or in the run that it starts from.
+    def _earlier_policy(self, name: str) -> tuple[AgentPolicy, int] | None:
+        """Return the earlier policy of ``name``, with the steps that it learnt from.
 
-        Beside the policy, from how many steps it learnt.
+        It is from earlier stages, or from the run that this one starts from; None: it is new.
         """
-        found = self.stage.policies.get(name)
-        if isinstance(found, AgentPolicy):
-            return found, self._steps_of(name)
+        policy = self.stage.policies.get(name)
+        if isinstance(policy, AgentPolicy):
+            return policy, self._steps_of(name)
         if self.stage.continues:
-            return None  # all is in its final state
+            return None  # its final state holds everything
         return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
 
-    def _tell_lost_state(self, name: str, log: StageLog) -> None:
-        """Say so where the file of a state was deleted."""
-        latest, path = self._latest_stage(name), state_path(self.stage.run, name)
-        kept = latest.get("kept", {}).get("kept")
-        if latest and latest.get("evolution") is None and kept != "before" and not path.exists():
+    def _report_lost_state(self, name: str, log: StageLog) -> None:
+        """Report a deleted file of a state."""
+        latest = self._latest_stage(name)
+        path = state_path(self.stage.run, name)
+        choice = latest.get("kept", {}).get("kept")
+        if latest and latest.get("evolution") is None and choice != "before" and not path.exists():
             log.tell(
-                f"{path} is not there any more, so {name!r} goes on with its weights alone, and "
+                f"{path} is not there any more, so {name!r} continues with its weights alone, and "
                 "learns otherwise than without the interruption"
             )
 
-    def _as_before(
+    def _earlier_state(
         self, name: str, algorithm: Algorithm, fresh: Any, policy: AgentPolicy, steps: int
     ) -> Any:
-        """The state that ``name`` ended its latest stage with; else its weights alone."""
-        found = load_state(self.stage.run, name, fresh)
-        if found is None:
+        """Return the state of ``name`` at the end of its latest stage; else its weights alone."""
+        state = load_state(self.stage.run, name, fresh)
+        if state is None:
             begin_as(algorithm, fresh, policy, steps)
-            found = fresh
-        return found
+            state = fresh
+        return state
 
     def _reference(
         self, name: str, algorithm: Algorithm, state: Any, device: torch.device, log: StageLog
     ) -> Reference | None:
-        """What a skill that was trained before is to stay near: this state."""
+        """Return the reference policy of a skill that was trained before: that of ``state``."""
         rollouts = algorithm.store == "rollout"
         if self.together.reference_kl is None or decides(name) or not rollouts:
             return None
         if not self._stages_of(name):
-            return None  # it starts from another run, to learn what this one asks for
+            return None  # it starts from another run, to learn the task of this one
         rate = success_rate(self._latest_stage(name))
         if rate == 0.0:
             log.tell(
@@ -195,46 +203,48 @@ class WovenAgents(OneAgent):
             )
             return None
         params = algorithm.acting_params(state, device=device)
-        # Who seldom succeeded has little to lose, and much to learn.
+        # A skill that seldom succeeded has little to lose, and much to learn.
         return Reference(
             params,
             torch.ones(1, dtype=torch.float32, device=device),
             self.together.reference_kl / rate,
         )
 
-    def _part(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
-        """The learner of the selector, or of a skill."""
-        num_envs, seeds = self.stage.config.num_envs, self.stage.seeds / name
-        config, row_steps = stack.algorithm.config, self.scene.steps_of_row(self._below(name))
+    def _learner(self, name: str, stack: Stack, log: StageLog, *, learnt_before: bool) -> Learner:
+        """Return the learner of the selector, or of a skill."""
+        num_envs = self.stage.config.num_envs
+        seeds = self.stage.seeds / name
+        config = stack.algorithm.config
+        row_steps = self.scene.steps_of_row(self._path_in_scene(name))
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
-            whole = self._below(name) in (SELECTOR, CRITIC)
-            quota = 0 if whole else max(1, round(rows * self.together.quota / row_steps))
+            learns_all_rows = self._path_in_scene(name) in (SELECTOR, CRITIC)
+            quota = 0 if learns_all_rows else max(1, round(rows * self.together.quota / row_steps))
             return RolloutLearner(stack, seeds, quota)
         store = store_of(stack.algorithm, num_envs)
-        found = ReplayLearner(
+        learner = ReplayLearner(
             [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
         )
         if learnt_before:
-            found.act_from_the_start()
-        return found
+            learner.act_from_the_start()
+        return learner
 
     def _stages_of(self, name: str) -> list[dict[str, Any]]:
-        """The stages before in which ``name`` has learnt."""
+        """Return the entries of finished stages in which ``name`` has learnt."""
         stages = self.stage.run.manifest["stages"]
         return [s for s in stages if name in s["learns"] and s["status"] == "done"]
 
     def _latest_stage(self, name: str) -> dict[str, Any]:
-        """The latest of them; empty where there is none."""
+        """Return the latest entry of a finished stage in which ``name`` has learnt, or {}."""
         return next(reversed(self._stages_of(name)), {})
 
     def _steps_of(self, name: str) -> int:
-        """Environment steps that ``name`` has learnt from in earlier stages."""
+        """Return the environment steps of earlier stages in which ``name`` has learnt."""
         return sum(s.get("steps", 0) for s in self._stages_of(name))
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
-        """Learn until the stage is over; skills that learnt nothing are told."""
-        found = super().train(log)
+        """Learn until the stage is over, and report skills that learnt nothing."""
+        policies = super().train(log)
         assert isinstance(self.learner, WovenLearner)
         for name, (rows, updates) in self.learner.counts.items():
             if decides(name):
@@ -248,48 +258,51 @@ class WovenAgents(OneAgent):
             elif not rows:
                 log.tell(
                     f"skill {name!r} was never called in {log.at['steps']:,} steps, so it learnt "
-                    "nothing: perhaps its initiation() holds nowhere that the other skills lead "
-                    "to, or the selector never chooses it"
+                    "nothing: perhaps its initiation() is never True where the other skills "
+                    "lead, or the selector never chooses it"
                 )
-        return found
+        return policies
 
     def tell_early(self, steps: int, log: StageLog) -> None:
-        """Name skills that were not called so far."""
+        """Report skills that were not called so far."""
         assert isinstance(self.learner, WovenLearner)
         for name, (rows, _) in self.learner.counts.items():
             if not rows and not decides(name):
                 log.tell(
-                    f"skill {name!r} was not called in the first {steps:,} steps; it begins to "
+                    f"skill {name!r} was not called in the first {steps:,} steps; it starts to "
                     "learn once its initiation() is True where other skills end"
                 )
 
     def policies(self) -> dict[str, AgentPolicy]:
-        """By name, who learns, as they are now."""
+        """Return the present policies of the learners, by name."""
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
         return {k: AgentPolicy.of(s.algorithm, state_to(s.state, "cpu")) for k, s in stacks}
 
     def states(self) -> dict[str, Any]:
-        """By name, all that they have learnt."""
+        """Return the present states of the learners, by name."""
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
         return {name: state_to(stack.state, "cpu") for name, stack in stacks}
 
     def play(self, arena: Collector, seeds: Seeds) -> Array:
-        """An episode in each environment of an arena, (N, 4), by the hierarchy as it is now."""
-        player = _woven(self.scene, self._acting(), self._margins(), arena.engine)
+        """Play an episode of the hierarchy in each environment of an arena, (N, 4)."""
+        player = _joint_collector(self.scene, self._acting(), self._margins(), arena.engine)
         requests = {
             name: Request(
-                0, (s.algorithm.acting_params(s.state),), s.state.gamma.cpu().numpy(),
-                seeds / name, greedy=self.scene.is_greedy(self._below(name)),
+                0,
+                (s.algorithm.acting_params(s.state),),
+                s.state.gamma.cpu().numpy(),
+                seeds / name,
+                greedy=self.scene.is_greedy(self._path_in_scene(name)),
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
-        }  # fmt: skip
+        }
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
-        asked = replace(
-            requests.pop(self.first, ready), below={self._below(k): r for k, r in requests.items()}
-        )
+        of_selector = requests.pop(self.first, ready)
+        of_skills = {self._path_in_scene(k): r for k, r in requests.items()}
+        request = replace(of_selector, below=of_skills)
         with torch_threads(1), global_generators(seeds / "global"):
             limit = longest_evaluation(arena.engine.time_limit)
-            return player.play(asked, seeds / "start", limit)
+            return player.play(request, seeds / "start", limit)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""
@@ -307,18 +320,19 @@ def _collector(
     num_envs: int,
     first: int,
 ) -> Collector:
-    found = _woven(scene, algorithms, margins, make_engine(scene.spec, num_envs, first=first))
-    found.log_info = scene.log_info
-    return found
+    engine = make_engine(scene.spec, num_envs, first=first)
+    collector = _joint_collector(scene, algorithms, margins, engine)
+    collector.log_info = scene.log_info
+    return collector
 
 
-def _woven(
+def _joint_collector(
     scene: WovenScene,
     algorithms: Mapping[str, Algorithm],
     margins: Mapping[str, float],
     engine: Engine,
 ) -> WovenCollector:
-    """A collector of these environments in which all act."""
+    """Return a collector in which the selector and all skills act."""
     acting = {k: Acting([(a, 1)], engine.num_envs) for k, a in algorithms.items()}
     selector = acting.pop(SELECTOR, None)
     return scene.woven(engine, selector, acting, margins)

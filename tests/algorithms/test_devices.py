@@ -138,7 +138,7 @@ def test_a_selector_near_its_guide_learns_where_its_state_is_and_is_kept_on_the_
         batch.reference = learner.reference
         monkeypatch.setattr(learner._store, "rollout", lambda *about: batch)
         learner.learn(0, 0, 0.0)
-        learner._asked = algorithm.acting_params(learner.stacks[0].state, 0.0), 0.0
+        learner._requested = algorithm.acting_params(learner.stacks[0].state, 0.0), 0.0
         assert learner.reference.coef.device == THERE
         assert learner.kept()["reference_coef"].device.type == "cpu"
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skillweave.buffers.priorities import FAN_OUT, FLOOR, Priorities, SumTrees
+from skillweave.buffers.priorities import EPSILON, FAN_OUT, Priorities, SumTrees
 
 
 def filled(values) -> SumTrees:
@@ -93,7 +93,7 @@ def test_weights_by_hand():
 def test_no_priority_is_zero():
     priorities = Priorities(1, 2, 1.0)
     priorities.update(np.zeros(2, int), np.array([0, 1]), np.zeros(2, np.float32))
-    assert priorities.written(2)["priority"].tolist() == [pytest.approx([FLOOR, FLOOR])]
+    assert priorities.written(2)["priority"].tolist() == [pytest.approx([EPSILON, EPSILON])]
 
 
 def test_new_slots_get_their_members_highest_priority_and_others_none():

@@ -350,8 +350,8 @@ def test_a_checkpoint_of_other_settings_is_refused():
         ReplayStore(8, 1, 1, gym.spaces.Box(-1, 1, (3,)), (), np.int64).load(state)
     assert str(error.value) == (
         "the checkpoint's replay buffer does not fit: 'obs' is torch.float32 (4, 2), where "
-        "torch.float32 (4, 3) belongs; go on with the settings that it was written with, or "
-        "begin a new run"
+        "torch.float32 (4, 3) belongs; continue with the settings that it was written with, or "
+        "start a new run"
     )
     with pytest.raises(SkillweaveError, match=r"'priority' is missing"):
         make(8, prioritized=True).load(state)

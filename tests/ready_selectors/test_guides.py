@@ -287,7 +287,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "the guide has no effect": {"guide": AUTOMATON, "guide_restrict": False},
     "only PPO can be kept near": {"guide": AUTOMATON, "guide_kl": 0.1, "selector": OFF},
     "has nothing to choose": {"guide": by_rule},
-    "says only at decisions": {
+    "returns only at decisions": {
         "guide": by_rule, "call_steps": Lengths(1, 2), "selector": OFF
     },
     "the guide restricts which skill": {"guide": AUTOMATON, "interrupt": True},
@@ -317,7 +317,7 @@ def test_a_run_with_another_guide_is_refused(whole, tmp_path):
     weights = run.save_weights(tmp_path / "weights")
     other = Automaton({"a": "wait"}, {})
     for declared, message in (
-        (declare(learn="together"), "has a guide, but that of this hierarchy has no guide"),
+        (declare(learn="together"), "has a guide, but the selector of this hierarchy has no guide"),
         (declare(learn="together", guide=other), "another checksum"),
     ):
         with pytest.raises(SkillweaveError, match=message):
@@ -325,7 +325,9 @@ def test_a_run_with_another_guide_is_refused(whole, tmp_path):
         with pytest.raises(SkillweaveError, match=message):
             declared.load_weights(weights)
     plain = declare().train(tmp_path / "plain", quiet=True)
-    with pytest.raises(SkillweaveError, match="has no guide, but that of this hierarchy has a"):
+    with pytest.raises(
+        SkillweaveError, match="has no guide, but the selector of this hierarchy has a"
+    ):
         declare(guide=AUTOMATON).load(plain.path)
 
 

@@ -169,7 +169,7 @@ def test_a_ready_selector_takes_no_steps():
     assert ready.plain_agent().steps == 64
     assert declare(SMALL, Learnt(), selector_steps=1000).total_steps == 1064
     assert not ready.is_data
-    with pytest.raises(SkillweaveError, match=r"nothing of this hierarchy is trained.*set steps"):
+    with pytest.raises(SkillweaveError, match=r"no part of this hierarchy is trained.*set steps"):
         declare(by_rule).plain_agent()
     assert declare(by_rule, steps=50).plain_agent().steps == 50
 

@@ -80,7 +80,7 @@ def test_lines_of_metrics(tmp_path, capsys):
     file.unlink()
     agent().resume(run)
     said = capsys.readouterr().err
-    assert f"{file} was removed or shortened: curves lack what stood there" in said
+    assert f"{file} was removed or shortened: curves lack its lines" in said
     agent().train(tmp_path / "reference", quiet=True, checkpoint_every=32)
     assert policies(run) == policies(tmp_path / "reference")
     file.unlink()
@@ -101,7 +101,7 @@ def test_lines_of_metrics_of_a_finished_run_that_gets_more_steps(lost, tmp_path,
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     if lost == "all":
         file.unlink()
-    sentence = f"{file} was removed or shortened: curves lack what stood there"
+    sentence = f"{file} was removed or shortened: curves lack its lines"
     agent(128).train(run, resume=True)
     assert capsys.readouterr().err.count(sentence) == 1
     agent(128).train(whole, resume=True)
@@ -127,7 +127,7 @@ def test_a_state_to_go_on_with(runs, tmp_path, capsys):
     (run / "states" / "left.safetensors").unlink()
     tree().resume(run)
     said = capsys.readouterr().err
-    assert "left.safetensors is not there any more, so 'left' goes on with its weights" in said
+    assert "left.safetensors is not there any more, so 'left' continues with its weights" in said
     assert "selector.safetensors is not there" not in said
 
 

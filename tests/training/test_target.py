@@ -190,7 +190,7 @@ def test_skills_and_selector_have_targets_of_their_own(
     assert all(found[k]["steps"] < 200 for k in ("quick", "sure", "selector"))
     said = capsys.readouterr().err
     assert "sure: target reached after" in said
-    assert "success 1, at least 1 was asked" in said
+    assert "success 1, the target is 1" in said
 
 
 def test_the_success_of_an_agent_is_what_its_environment_tells(tmp_path: Path) -> None:
