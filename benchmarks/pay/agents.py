@@ -16,7 +16,7 @@ from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Selection, Skill, TrainDefaults
-from skillweave.api.run import Run
+from skillweave.api import Run
 from skillweave.runs.directory import RunDirectory
 
 HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
@@ -103,7 +103,7 @@ class Bench:
         self._score(run, task, agent, budget, started, keep, ("selector", "together"))
 
     def _skills(self) -> dict[str, Any]:
-        """The skills that were learnt on the first task from this seed."""
+        """Return the skills that were learnt on the first task from this seed."""
         policy = self._source_policy()
         return dict(zip(policy.labels, policy.skills.policies, strict=True))
 
@@ -115,7 +115,7 @@ class Bench:
         return hierarchy
 
     def _source_policy(self) -> Any:
-        """The hierarchy that was learnt on the first task from this seed."""
+        """Return the hierarchy that was learnt on the first task from this seed."""
         source = self.suite.tasks[0]
         run = self.suite.hierarchy(source, None).load(self._path(source, HIERARCHY))
         self._builds_on(source, HIERARCHY)
@@ -154,7 +154,7 @@ class Bench:
         return by_lot(hierarchy, self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
-        """The run of a hierarchy in which nobody learns."""
+        """Return the run of a hierarchy in which nobody learns."""
         path = self._path(task, agent)
         shutil.rmtree(path, ignore_errors=True)
         self.results.begin(path)
@@ -189,7 +189,7 @@ class Bench:
             self._learn(agent, task, BONUS)
 
     def tuned_weights(self) -> dict[str, float]:
-        """The weights with which F1 does best on the first task, from a seed of its own.
+        """Return the weights with which F1 does best on the first task, from a seed of its own.
 
         After a third of its steps, so that choosing takes no longer than learning.
         """
@@ -232,7 +232,7 @@ class Bench:
         )
 
     def _before(self, task: Task) -> Path:
-        """The run of the flat agent with which F3 begins a further task."""
+        """Return the run of the flat agent with which F3 begins a further task."""
         source = self.suite.tasks[0]
         before = source if task.starts_from is None else self.suite.task(task.starts_from)
         name = FLAT if before is source else TUNED
@@ -274,7 +274,7 @@ class Bench:
         return result
 
     def _found(self, task: Task, agent: str, budget: int, keep: bool = False) -> Result | None:
-        """A result that is there; not where others need its run, and that is not at its end."""
+        """Return a result that is there; not where others need its run, and that is not at its end."""
         found = self.results.find(self.suite.name, task.name, agent, self.seed, budget)
         return None if keep and not is_over(self._path(task, agent)) else found
 
@@ -305,7 +305,7 @@ class Bench:
 
 
 def is_over(path: Path) -> bool:
-    """Whether there is a run, and all its stages are done."""
+    """Return whether there is a run, and all its stages are done."""
     if not path.exists():
         return False
     return all(s["status"] == "done" for s in RunDirectory.open(path).manifest["stages"])

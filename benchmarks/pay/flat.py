@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import Agent, Skill
-from skillweave.api.run import Run
+from skillweave.api import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in

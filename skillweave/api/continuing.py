@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
-from skillweave.api.adoption import adopted, check_run, differences
+from skillweave.api.adoption import apply_manifest, check_run, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.hierarchy import training
@@ -14,10 +14,10 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
+from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import decides
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
+D = TypeVar("D", bound=Declaration | PlainAgent)
 
 EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
@@ -32,12 +32,12 @@ def to_continue(path: Path) -> RunDirectory | None:
 
 
 def prepared(
-    declared: Hierarchy | Agent,
+    declared: D,
     content: dict[str, Any],
     run: RunDirectory,
     evolve: Evolve,
     track: Sequence[str],
-) -> tuple[Hierarchy | Agent, str]:
+) -> tuple[D, str]:
     """Return a declaration as a run has it, and what people should know; the run is locked.
 
     Stages whose budgets have grown get the new ones.
@@ -49,7 +49,7 @@ def prepared(
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
     _check_same(declared, content, run)
-    own = adopted(declared, run) if isinstance(declared, Declaration) else declared
+    own = apply_manifest(declared, run)
     budgets = _budgets(own, content, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
     if tuple(track) != tuple(run.manifest.get("track", ())):
@@ -70,7 +70,9 @@ def prepared(
     return own, "; ".join(filter(None, sentences))
 
 
-def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: RunDirectory) -> None:
+def _check_same(
+    declared: Declaration | PlainAgent, content: Mapping[str, Any], run: RunDirectory
+) -> None:
     """Raise a RunError where a run is one of another declaration."""
     check_run(declared, run)
     manifest = run.manifest
@@ -83,7 +85,7 @@ def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: Ru
             f"{run.path} is the run of {one}, but it was to continue as {other}; choose another "
             "directory"
         )
-    mine, theirs = declared.recipe, manifest.get("recipe")
+    mine, theirs = content["recipe"], manifest.get("recipe")
     if mine and theirs and Path(mine).name != Path(theirs).name:
         raise RunError(
             f"{run.path} is a run of the recipe {theirs}, not of {mine}; choose another directory"
@@ -96,7 +98,7 @@ def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: Ru
 
 
 def _budgets(
-    declared: Hierarchy | Agent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
+    declared: Declaration | PlainAgent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
 ) -> dict[str, int]:
     """Return the budgets of a run's stages as they are declared now, where both have the stage."""
     stages: list[dict[str, Any]] = content["stages"]

@@ -65,7 +65,7 @@ class Player:
         info: Mapping[str, Any] | None = None,
         mask: Any = None,
     ) -> Any:
-        """The action for one observation, as the environment takes it.
+        """Return the action for one observation, as the environment takes it.
 
         Args:
             obs: what the environment's ``reset`` or ``step`` returned.
@@ -107,7 +107,7 @@ class Player:
         return allowed[None]
 
     def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
-        """The step that led to an observation."""
+        """Return the step that led to an observation."""
         assert self._before is not None
         obs, action = self._before
         no = np.zeros(1, bool)

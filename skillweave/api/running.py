@@ -9,11 +9,11 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
+from skillweave.api.adoption import Trained, caller_of
 from skillweave.api.continuing import prepared, to_continue
-from skillweave.api.run import Run
-from skillweave.api.starting import Spaces, StartFrom, starts
+from skillweave.api.starting import Directories, Spaces, starts
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
@@ -27,7 +27,7 @@ from skillweave.messages import absolute, as_path, short, shown_path
 from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
-from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
+from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
@@ -37,12 +37,9 @@ from skillweave.runs.trackers import make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
+from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
-
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
-
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
 """The Python file that is being read for what it declares; None: none is."""
@@ -59,20 +56,23 @@ def _may_train() -> None:
         )
 
 
+D = TypeVar("D", bound=Declaration | PlainAgent)
+
+
 def begin(
-    declared: Hierarchy | Agent,
+    declared: D,
     content: dict[str, Any],
     run_dir: str | Path | None,
     quiet: bool,
     track: Sequence[str],
     evolve: Evolve,
     cluster: Ray | None,
-    start_from: StartFrom = None,
+    start_from: Directories = None,
     note: str = "",
     callback: Callback | None = None,
     *,
     resume: bool = False,
-) -> Run:
+) -> Trained[D]:
     """Check everything, begin a run of this manifest, and train it; ``note`` is printed first.
 
     With ``resume``, continue what is in ``run_dir`` instead, if there is something.
@@ -103,7 +103,7 @@ def begin(
         make_trackers(track, None)  # a missing extra is said before anything is written
         if cluster is not None:
             cluster.check()
-        content = content | {"recipe": declared.recipe, "track": track}
+        content = content | {"track": track}
         if run_dir is None:
             run_dir = make_numbered(_run_name(declared, content), place)
             note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
@@ -121,15 +121,10 @@ def _kept_by_populations(content: dict[str, Any]) -> str:
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
-def caller_of(declared: Hierarchy | Agent) -> Caller:
-    """Return what messages call a declaration."""
-    return "hierarchy" if isinstance(declared, Declaration) else "agent"
-
-
-def _run_name(declared: Hierarchy | Agent, content: Mapping[str, Any]) -> str:
+def _run_name(declared: Declaration | PlainAgent, content: Mapping[str, Any]) -> str:
     """Return what a numbered directory is named after: recipe, hierarchy, or environment."""
     flat = isinstance(declared, Declaration) and content["kind"] == "agent"
-    name = "" if declared.recipe is None else Path(declared.recipe).stem
+    name = "" if content["recipe"] is None else Path(content["recipe"]).stem
     if not name and isinstance(declared, Declaration) and declared.name != Declaration.name:
         name = declared.name
     return (name or declared.spec.name) + ("-flat" if flat else "")
@@ -140,20 +135,8 @@ def _remove_if_empty(path: Path) -> None:
         path.rmdir()
 
 
-def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
-    """The finished run of this manifest in ``run_dir``: begun, or gone on with, where it is not.
-
-    Raises:
-        RunError: there is a run, but of another manifest.
-    """
-    run = begun(declared, content, run_dir)
-    if run is None:
-        return begin(declared, content, run_dir, True, (), None, None)
-    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
-
-
-def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
-    """The run of this manifest in ``run_dir``; None: it is not begun.
+def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
+    """Return the run of this manifest in ``run_dir``; None: it is not begun.
 
     Raises:
         RunError: there is a run, but of another manifest.
@@ -173,7 +156,7 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(
-    declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
+    declared: Declaration | PlainAgent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
 ) -> Spaces:
     """Check everything, and write into a manifest's stages how they are trained; the spaces."""
     observation_space, action_space = declared.check_spaces()
@@ -217,14 +200,14 @@ def _must_not_run_again(spec: EnvSpec) -> None:
 
 
 def go_on(
-    declared: Hierarchy | Agent,
+    declared: D,
     run: RunDirectory,
     quiet: bool,
     evolve: Evolve,
     cluster: Ray | None,
     note: str = "",
     callback: Callback | None = None,
-) -> Run:
+) -> Trained[D]:
     """Train what is left of a run; ``note``: what people should know first."""
     check_callback(callback)
     if not run.finished:
@@ -253,7 +236,7 @@ def go_on(
                 policy = training.train(declared, run, listeners, learner)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
-    return Run(declared_of(declared, run), run.path, policy)
+    return declared, run, policy
 
 
 H = TypeVar("H", bound=Declaration)
@@ -282,13 +265,6 @@ def apart_to_evolve(declared: H) -> tuple[H, str]:
         "Skills and selector cannot evolve together yet, so they learn apart here; "
         "learn='apart' in the declaration ends this message."
     )
-
-
-def declared_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
-    """What a run trained: a hierarchy, or its flat baseline."""
-    if run.manifest["kind"] == "agent" and isinstance(declared, Declaration):
-        return declared.plain_agent()
-    return declared
 
 
 def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack) -> Where:

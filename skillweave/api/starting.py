@@ -4,33 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.api.run import Run
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, close_matches, short
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
 from skillweave.spaces import same_space
-from skillweave.training.plain_agent import AGENT
+from skillweave.training.plain_agent import AGENT, PlainAgent
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
-
-OneRun = str | Path | Run
-StartFrom = OneRun | Mapping[str, OneRun] | None
-"""A run in which those who are to learn have learnt before, or such runs by the learners' names."""
+Directory = str | Path
+Directories = Directory | Mapping[str, Directory] | None
+"""The directory of a run to start from, or such directories by the learners' names."""
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """Of observations and of actions."""
 
 
 def starts(
-    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom, spaces: Spaces
+    declared: Declaration | PlainAgent,
+    content: dict[str, Any],
+    start_from: Directories,
+    spaces: Spaces,
 ) -> tuple[dict[str, Learnt], str]:
     """Who has learnt in another run, and what people should know of it.
 
@@ -60,15 +59,13 @@ def starts(
     return learnt, f"start from {where}: {', '.join(sorted(begun))}"
 
 
-def _place(run: OneRun, argument: str) -> Path:
+def _place(run: Directory, argument: str) -> Path:
     """Return the directory of a run.
 
     Raises:
         DeclarationError: it is a policy, or a file with one; the message says what can be done with
             it.
     """
-    if isinstance(run, Run):
-        run = run.path
     if (use := _use_of(run)) is not None:
         what, way = use
         raise DeclarationError(
@@ -118,7 +115,7 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 
 def _learnt_by_name(
-    content: dict[str, Any], start_from: Mapping[str, OneRun]
+    content: dict[str, Any], start_from: Mapping[str, Directory]
 ) -> tuple[dict[str, Learnt], dict[str, Path]]:
     """Return what each named learner begins with, and in which run that is.
 

@@ -18,7 +18,8 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Hierarchy
-from skillweave.api.running import begun, finish
+from skillweave.api.loading import finish
+from skillweave.api.running import begun
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
@@ -72,7 +73,7 @@ class Job:
             return told(error)
 
     def known(self, hierarchy: Hierarchy) -> float | str | None:
-        """What ``run`` would give, where nothing is left to be done; else None."""
+        """Return what ``run`` would give, where nothing is left to be done; else None."""
         try:
             run = begun(hierarchy, self._manifest(hierarchy), self.path)
             if run is None or not run.finished:
@@ -136,7 +137,7 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """The seeds that "0:20" or "0,3,7" names."""
+    """Return the seeds that "0:20" or "0,3,7" names."""
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
@@ -153,7 +154,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
-    """All combinations of the values of ``--set-each``, as settings; one without any if none."""
+    """Return all combinations of the values of ``--set-each``, as settings; one without any if none."""
     names, options = set[str](), []
     for setting in each:
         name, sign, text = (part.strip() for part in setting.partition("="))
@@ -236,7 +237,7 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
 
 
 def _task() -> Callable[..., Any]:
-    """A run as Ray does it: what runs on a node, or None where that is good; and the result.
+    """Return a run as Ray does it: what runs on a node, or None where that is good; and the result.
 
     It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
     """

@@ -9,7 +9,7 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
-from skillweave.api.declared import declared_by
+from skillweave.api.loading import declared_by
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
@@ -137,7 +137,7 @@ def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
 def _told(
     command: commands.Train | commands.Resume, trained: Run, render: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """What a run has come to, for programs and for people."""
+    """Return what a run has come to, for programs and for people."""
     manifest = trained.info()
     result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": manifest["stages"]}
     seconds = sum(p["seconds"] for p in manifest["stages"])
