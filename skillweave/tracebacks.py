@@ -1,4 +1,4 @@
-"""Which lines of a traceback are the user's own, and tracebacks that show only these.
+"""Lines of a traceback that are the user's own, and tracebacks that show only these.
 
 This module imports nothing of the library, so that ``types`` can stand on it.
 """
@@ -116,7 +116,7 @@ def _is_hidden(file: str) -> bool:
 
 
 def _name(frame: FrameType) -> str:
-    """Return what people call the file of a frame; in a notebook the cell."""
+    """Return the name of a frame's file for people; in a notebook the cell."""
     file = _file(frame)
     if file == SENT:  # the file is still known where it was a module's or a script's
         known = frame.f_globals.get("__file__")

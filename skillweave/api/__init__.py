@@ -1,4 +1,7 @@
-"""What users call: declare a ``Hierarchy`` or an ``Agent``, train it, get a ``Run``."""
+"""The public API: declare a ``Hierarchy`` or an ``Agent``, train it, get a ``Run``.
+
+The three classes refer to one another, so they are one module.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +77,7 @@ class Agent(PlainAgent):
         return agent_line(self)
 
     def _repr_html_(self) -> str:
-        """Return a table of what it declares, for notebooks."""
+        """Return a table of the declaration, for notebooks."""
         return agent_html(self)
 
     @checked_names
@@ -153,16 +156,16 @@ class Agent(PlainAgent):
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
-        """Return the agent of a run's ``manifest`` (``run.json``) that needs none of the user's code."""
+        """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
         (stage,) = manifest["stages"]
         config = config_from_json(stage["algorithm"])
-        found = cls(spec_of(manifest), config, int(stage["budget"]))
-        found.recorded = True
-        return found
+        agent = cls(spec_of(manifest), config, int(stage["budget"]))
+        agent.recorded = True
+        return agent
 
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
-        """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        """Load this agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
         self.validate()
         path = as_path(path, "path")
         return Run(self, path, read_agent(self.spec, *open_weights(path), path))
@@ -178,7 +181,9 @@ class Agent(PlainAgent):
         path = as_path(path, "path")
         tensors, header = open_weights(path)
         if header["kind"] != "agent" or "env" not in header:
-            raise RunError(f"{path} does not say which environment its agent is for")
+            raise RunError(
+                f"{path} does not name the environment of its agent; give the agent: agent.load_weights(path)"
+            )
         agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
@@ -200,13 +205,13 @@ class Hierarchy(Declaration):
     """
 
     recipe: str | None = None
-    """Where it was declared: a shipped recipe's name or a file; written into runs."""
+    """The place of the declaration: a shipped recipe's name or a file; written into runs."""
 
     def __repr__(self) -> str:
         return hierarchy_line(self)
 
     def _repr_html_(self) -> str:
-        """Return tables of what it declares, for notebooks."""
+        """Return tables of the declaration, for notebooks."""
         return hierarchy_html(self)
 
     @checked_names
@@ -234,10 +239,11 @@ class Hierarchy(Declaration):
         Args:
             run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
                 recipe, the hierarchy or the environment. A run that has learnt something is never
-                replaced; one without a checkpoint, which no process trains, is.
-            resume: continue the run in ``run_dir`` if it has learnt something, else begin. Its
+                replaced; one without a checkpoint is, unless a process trains it.
+
+            resume: continue the run in ``run_dir`` if it has learnt something, else start one. Its
                 settings count, and those that differ are named. If steps have grown, a finished run
-                learns on: in new episodes, with schedules over the new budget. Steps of stages
+                continues: in new episodes, with schedules over the new budget. Steps of stages
                 whose learners learn again in a later one go to that stage.
             seed: the root of every random stream.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
@@ -253,16 +259,16 @@ class Hierarchy(Declaration):
                 Skills and selector of a population cannot learn together yet: they learn apart.
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
-            start_from: another run, or its directory: whoever learns here and has learnt there, by
-                the same name, begins with its policy. Or several runs, by the name of who begins:
-                ``{"left": run, "right": other}``; a run of a plain agent fits any name. What is
-                taken over is the policy (of PPO and DQN all networks, of SAC and TD3
-                the actor). The task may be another one; spaces, networks and the names of a
-                selector's skills must be the same.
+
+            start_from: another run, or its directory: a learner that has learnt there, by the same
+                name, starts with its policy. Or several runs, by learner:
+                ``{"left": run, "right": other}``; a run of a plain agent fits any name. The policy
+                is copied (of PPO and DQN all networks, of SAC and TD3 the actor). The task may be
+                another one; spaces, networks and the names of a selector's skills must be the same.
             callback: a function that is called with a ``TrainEvent`` for each report of training
                 and each checkpoint. Where it returns False, the stage ends with what it has
                 learnt, as at a target, and the next one starts. An exception in it stops the
-                training and leaves ``train`` as it is; the run can be resumed from its last
+                training and leaves ``train`` unchanged; the run can be resumed from its last
                 checkpoint. It is called in this process, and is not stored in the run.
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
                 the mean return or by what its target is of; the last weights are evaluated, too.
@@ -293,11 +299,11 @@ class Hierarchy(Declaration):
             keep=keep,
             log_info=log_info,
         )
-        own, note = (self, "") if flat is not False else evolving(self, evolve)
-        content = training.manifest(own, seed=seed, flat=flat, how=how)
+        declared, note = (self, "") if flat is not False else evolving(self, evolve)
+        content = training.manifest(declared, seed=seed, flat=flat, how=how)
         trained = begin(
-            own,
-            content | {"recipe": own.recipe},
+            declared,
+            content | {"recipe": declared.recipe},
             run_dir,
             quiet,
             track,
@@ -350,42 +356,45 @@ class Hierarchy(Declaration):
 
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
-        """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        """Load this hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         self.validate()
         path = as_path(path, "path")
-        own = copied(self)  # it takes over how skills are called
-        policy = read_weights(own, path)
+        declared = copied(self)  # the file sets how skills are called
+        policy = read_weights(declared, path)
         plain = isinstance(policy, AgentPolicy)
-        return Run(self.plain_agent() if plain else own, path, policy)
+        return Run(self.plain_agent() if plain else declared, path, policy)
 
     @staticmethod
     @checked_names
     def pretrained(name: str) -> Run:
-        """Return the shipped recipe ``name`` with its shipped weights."""
+        """Load the shipped recipe ``name`` with its shipped weights."""
         return hierarchy_in(name, Hierarchy).load_weights(weights_path(name))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
-        """Return the hierarchy of a run's ``manifest`` that needs none of the user's code."""
+        """Return the hierarchy of a run's ``manifest``, without the user's code."""
         entries = {s["name"]: s for s in manifest["skills"]}
         return cls._recorded(spec_of(manifest), manifest, entries)
 
     @classmethod
     def _recorded(
-        cls, spec: EnvSpec, told: dict[str, Any], entries: dict[str, dict[str, Any]]
+        cls, spec: EnvSpec, manifest: dict[str, Any], entries: dict[str, dict[str, Any]]
     ) -> Hierarchy:
-        """Return a hierarchy of a run, or one below it, from the entries of its skills by their paths."""
+        """Return a run's hierarchy, or one below it, from the entries of its skills by path."""
         skills = []
         for name, entry in entries.items():
             if "/" in name:
                 continue
-            own = {k: entry[k] for k in ("max_steps", "call_steps") if k in entry} | {"name": name}
+            attributes: dict[str, Any] = {
+                k: entry[k] for k in ("max_steps", "call_steps") if k in entry
+            }
+            attributes["name"] = name
             if "hierarchy" in entry:
-                own["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
-            skills.append(type(name, (RecordedSkill,), own)())
-        found = cls(spec, skills, call_steps=calls_from_json(told))
-        found.recorded = True
-        return found
+                attributes["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
+            skills.append(type(name, (RecordedSkill,), attributes)())
+        hierarchy = cls(spec, skills, call_steps=calls_from_json(manifest))
+        hierarchy.recorded = True
+        return hierarchy
 
 
 class Run:
@@ -394,7 +403,7 @@ class Run:
     Args:
         declaration: what was trained.
         path: its directory, or its weights file.
-        policy: who acts.
+        policy: the trained policy.
     """
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
@@ -405,7 +414,7 @@ class Run:
         return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
 
     def _repr_html_(self) -> str:
-        """Return a table of what it is, and of its stages, for notebooks."""
+        """Return tables of the declaration and the stages, for notebooks."""
         return run_html(self.path, self.declaration)
 
     @property
@@ -437,13 +446,13 @@ class Run:
 
         Args:
             episodes: whole episodes.
-            seed: picks them.
-            deterministic: act greedily, else sample. Of a hierarchy it is about the selector;
+            seed: the seed that picks the episodes.
+            deterministic: act greedily, else sample. In a hierarchy this is about the selector;
                 ``greedy_skills`` is about its skills.
             skill: score this skill alone, as if the selector always chose it. The hierarchy's
                 reflexes are in force, also where it was trained without them. Returns are the
-                environment's; ``skills`` has its call in each episode, by its own reward and
-                success: from where it may start to its own end.
+                environment's; ``skills`` has its call in each episode, from the step in which it
+                may start to its own end, by its own reward and success.
             num_envs: environments that exist at once; None: at most as many as in training. It
                 does not change the result of a greedy policy; what is sampled differs with it.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
@@ -462,10 +471,10 @@ class Run:
         if save and (skill is not None or engine != "sync"):
             raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
         if save:
-            must_be_own(self.path)  # said before anything is played
+            must_be_own(self.path)  # an error comes before anything is played
         policy = self._policy(skill)
         with EpisodeProgress(episodes, quiet=quiet) as progress:
-            found = evaluate(
+            score = evaluate(
                 policy,
                 self.declaration.spec,
                 episodes=episodes,
@@ -477,8 +486,8 @@ class Run:
                 engine=engine,
             )
         if save:
-            save_evaluation(RunDirectory.open(self.path), found, seed, deterministic)
-        return found
+            save_evaluation(RunDirectory.open(self.path), score, seed, deterministic)
+        return score
 
     @checked_names
     def render(
@@ -497,7 +506,7 @@ class Run:
         A notebook shows the film that is returned.
 
         Args:
-            path: the file; its ending says which, ``.gif`` or ``.mp4``. None: ``film.gif`` in the
+            path: the file, ``.gif`` or ``.mp4``. None: ``film.gif`` in the
                 run's folder, with a skill's name where it acts alone. A policy without a folder of
                 its own (a weights file, a copy of the hub's) writes its film where Python runs.
             episodes: how many, one after another.
@@ -516,7 +525,7 @@ class Run:
         seed = whole_number(seed, "seed", 0)
         plain = isinstance(self.declaration, PlainAgent)
         skills = () if plain else self.hierarchy.skills
-        told = render_policy(
+        film = render_policy(
             self.declaration.spec,
             policy,
             path,
@@ -530,41 +539,41 @@ class Run:
         )
         if path.parent.resolve() == self.path.resolve():
             track_film(RunDirectory.open(self.path), path)
-        return Film(told)
+        return Film(film)
 
     def _film_path(self, skill: str | None) -> Path:
-        """Return where a film is written if nobody says where."""
+        """Return the default path of a film."""
         ending = "" if skill is None else "-" + skill.replace("/", ".")
         if self.path.is_dir() and not is_copy_of_hub(self.path):
             return self.path / f"film{ending}.gif"
         return Path(f"{self.path.name.removesuffix('.safetensors')}{ending}.gif")
 
     @checked_names
-    def act(self, obs: Any, **told: Any) -> Any:
+    def act(self, obs: Any, **given: Any) -> Any:
         """Return the greedy action for one observation.
 
-        It remembers what a policy remembers, so call ``reset`` where an episode begins.
+        A policy with a memory needs ``reset`` at the start of each episode.
 
         Args:
             obs: what the environment's ``reset`` or ``step`` returned.
-            **told: ``reward``, ``info``, ``mask``: see ``Player.act``.
+            **given: ``reward``, ``info``, ``mask``: see ``Player.act``.
 
         Returns:
             The action, as the environment takes it.
         """
         if self._player is None:
             self._player = self.player()
-        return self._player.act(obs, **told)
+        return self._player.act(obs, **given)
 
     @checked_names
     def reset(self) -> None:
-        """For ``act``: a new episode begins."""
+        """Start a new episode for ``act``."""
         if self._player is not None:
             self._player.reset()
 
     @checked_names
     def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
-        """Return the policy for one environment, with a memory of its own.
+        """Return a player: the policy for one environment, with a memory of its own.
 
         Args:
             deterministic: act greedily, else sample; as in ``evaluate``.
@@ -694,14 +703,14 @@ class Run:
         One that sampled actions on request is under ``evaluation_sampled``.
         """
         run = RunDirectory.open(self.path)
-        told = {
+        scores = {
             "evaluation": load_evaluation(run),
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
-        return run.manifest | {k: v.to_json() for k, v in told.items() if v is not None}
+        return run.manifest | {k: v.to_json() for k, v in scores.items() if v is not None}
 
     def _training_envs(self) -> int | None:
-        """As many environments as stood side by side in training; None: nothing was trained."""
+        """Return the number of environments in training; None: nothing was trained."""
         if self.path.is_dir():
             return RunDirectory.open(self.path).num_envs
         declared = self.declaration

@@ -38,19 +38,19 @@ def prepared(
     evolve: Evolve,
     track: Sequence[str],
 ) -> tuple[D, str]:
-    """Return a declaration as a run has it, and what people should know; the run is locked.
+    """Return a declaration with a run's manifest applied, and sentences; the run is locked.
 
     Stages whose budgets have grown get the new ones.
 
     Args:
-        content: the manifest of the declaration, as a new run would have it.
+        content: the manifest that a new run of the declaration would have.
 
     Raises:
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
     _check_same(declared, content, run)
-    own = apply_manifest(declared, run)
-    budgets = _budgets(own, content, run, evolve)
+    declared = apply_manifest(declared, run)
+    budgets = _budgets(declared, content, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
     if tuple(track) != tuple(run.manifest.get("track", ())):
         known = ", ".join(run.manifest.get("track", ())) or "none"
@@ -67,7 +67,7 @@ def prepared(
         sentences.append(
             f"{run.path} is finished, so nothing is trained; to train it for longer, give it {more}"
         )
-    return own, "; ".join(filter(None, sentences))
+    return declared, "; ".join(filter(None, sentences))
 
 
 def _check_same(
@@ -110,13 +110,13 @@ def _budgets(
         if not isinstance(evolve, Mapping) or set(evolve) <= names:
             plan(stages, evolve)
     theirs = {entry["name"]: entry for entry in run.manifest["stages"]}
-    found = {}
+    budgets = {}
     for stage in stages:
         if (entry := theirs.get(stage["name"])) is not None:
             members, known = _members(stage), _members(entry)
             # A population's budget is that of all members.
-            found[stage["name"]] = stage["budget"] // members * known
-    return found
+            budgets[stage["name"]] = stage["budget"] // members * known
+    return budgets
 
 
 def _members(entry: Mapping[str, Any]) -> int:
@@ -124,20 +124,20 @@ def _members(entry: Mapping[str, Any]) -> int:
 
 
 def _more(stages: Sequence[Mapping[str, Any]], budgets: Mapping[str, int]) -> dict[str, int]:
-    """Return by how much the budgets of stages are larger now."""
-    found: dict[str, int] = {}
+    """Return by stage the steps that its budget has grown by."""
+    more: dict[str, int] = {}
     for entry in stages:
         heir = _heir(stages, entry)["name"]
         declared = budgets.get(entry["name"], entry["budget"])
-        found[heir] = found.get(heir, 0) + declared - entry["budget"]
-    return found
+        more[heir] = more.get(heir, 0) + declared - entry["budget"]
+    return more
 
 
 def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
-    """Give stages of a run more steps, and write that; sentences about it.
+    """Give stages of a run more steps, and write that; return sentences about it.
 
-    A stage whose learners learn again in a later one stays as it is: what it would learn now, that
-    stage would not know of. The later one gets its steps, too.
+    A stage whose learners learn again in a later one stays as it is, as the later one would not
+    start from the new weights. The later one gets its steps, too.
     """
     stages: list[dict[str, Any]] = run.manifest["stages"]
     more = _more(stages, budgets)
@@ -182,19 +182,19 @@ MADE_AT_THE_END = (
     "sha256",
     "policies",
 )
-"""Of a stage's entry what training writes again when it has continued."""
+"""Fields of a stage's entry that training writes again when it has continued."""
 
 
 def _heir(stages: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the latest stage in which one learns who learns in this one."""
-    own = set(entry["learns"])
-    return next(other for other in reversed(stages) if own & set(other["learns"]))
+    """Return the latest stage with a learner of this one."""
+    learners = set(entry["learns"])
+    return next(other for other in reversed(stages) if learners & set(other["learns"]))
 
 
 def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None:
     """Raise a RunError where a stage cannot be given more steps."""
     name = entry["name"]
-    new = f"Begin a new run with what it has learnt: {start_words(run)}"
+    new = f"Start a new run from what it has learnt: {start_words(run)}"
     if entry.get("evolution"):
         raise RunError(
             f"{run.path}: stage {name!r} is a population, which cannot be given more steps, as "
@@ -227,8 +227,8 @@ def _algorithms(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence on each selector that stays as it is, while skills of it learn on."""
-    found = []
+    """Return a sentence on each selector that stays as it is while its skills continue."""
+    sentences = []
     for at, entry in enumerate(stages):
         node = entry["name"].rpartition("/")[0]
         if entry["status"] != "done" or entry in grown or not decides(str(entry["decides"])):
@@ -242,8 +242,8 @@ def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any
             if name.startswith(within)
         ]
         if skills:
-            found.append(
+            sentences.append(
                 f"{entry['name']} stays as it is, so it still chooses for {', '.join(skills)} as "
                 "they were; give it more steps, too"
             )
-    return found
+    return sentences

@@ -1,4 +1,4 @@
-"""Who acts in a film: the name that is written under a frame, and its colour."""
+"""Labels of a film: the acting skill's name and colour; apart, as they need skills and pictures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skillweave.types import Memory, Policy
 def labels_of(
     policy: Policy, skills: Sequence[Skill], alone: str | None
 ) -> Callable[[Memory], tuple[str, RGB]]:
-    """From a policy's memory to who acts, and its colour.
+    """Return a function from a policy's memory to the acting skill's name and colour.
 
     Args:
         skills: of the hierarchy that acts; none: a plain agent.

@@ -1,4 +1,4 @@
-"""What ``Hierarchy``, ``Agent`` and ``Run`` say of themselves: a line, and tables for notebooks."""
+"""Lines and tables about ``Hierarchy``, ``Agent`` and ``Run``, for notebooks; HTML stays here."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from skillweave.training.plain_agent import PlainAgent
 
 
 def hierarchy_line(declared: Declaration) -> str:
-    """Return what ``repr`` says of a hierarchy."""
+    """Return the ``repr`` of a hierarchy."""
     names = ", ".join(s.name for s in declared.skills)
     return printable(f"<{type(declared).__name__} of {names} on {declared.spec.name}>")
 
 
 def agent_line(declared: PlainAgent) -> str:
-    """Return what ``repr`` says of a plain agent."""
+    """Return the ``repr`` of a plain agent."""
     kind = _kind(declared.algorithm)
     return printable(f"<{type(declared).__name__} of {kind} on {declared.spec.name}>")
 
@@ -40,13 +40,13 @@ def agent_html(declared: PlainAgent) -> str:
 
 
 def run_html(path: Path, declared: Declaration | PlainAgent) -> str:
-    """Return tables of a run: what was trained, its stages, and its latest saved evaluation."""
+    """Return tables of a run: its declaration, its stages, and its latest saved evaluation."""
     if isinstance(declared, PlainAgent):
         rows, skills = list(_agent_facts(declared)), []
     else:
         rows, skills = list(_hierarchy_facts(declared)), [_skills(declared)]
-    where = "run" if path.is_dir() else "weights"
-    shown = [facts([(where, path), *rows]), *skills]
+    kind = "run" if path.is_dir() else "weights"
+    shown = [facts([(kind, path), *rows]), *skills]
     try:
         run = RunDirectory.open(path) if path.is_dir() else None
         saved = None if run is None else load_evaluation(run)
@@ -77,7 +77,7 @@ def _agent_facts(declared: PlainAgent) -> Iterator[tuple[str, object]]:
 
 
 def _skills(declared: Declaration) -> Markup:
-    """Return a table of a hierarchy's skills; a column in which nothing stands is left out."""
+    """Return a table of a hierarchy's skills; empty columns are left out."""
     head = ["skill", "policy", "defines", "about", "max_steps"]
     rows = []
     for path, skill in every_skill(declared.skills):
@@ -92,7 +92,7 @@ def _skills(declared: Declaration) -> Markup:
 
 
 def _learns_by(owner: Declaration, skill: Skill) -> str:
-    """Return how a skill gets its policy."""
+    """Return the source of a skill's policy: learnt, ready, a hierarchy or an algorithm."""
     if isinstance(skill, RecordedSkill):
         return "learnt"
     if inner_of(skill) is not None:

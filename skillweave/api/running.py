@@ -1,4 +1,4 @@
-"""How ``train`` and ``resume`` go: check, write a run, train it."""
+"""The course of ``train`` and ``resume``: check everything, write a run, train it."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ from skillweave.training.stage import CRITIC, assign_workers, check_replay, chec
 from skillweave.training.stage_log import Listener
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
-"""The Python file that is being read for what it declares; None: none is."""
+"""The Python file that is being read for its declaration; None: none is."""
 
 
 def _may_train() -> None:
-    """Raise a DeclarationError while a Python file is only read for what it declares."""
+    """Raise a DeclarationError while a Python file is only read for its declaration."""
     if (file := READING.get()) is not None:
         raise DeclarationError(
-            f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
+            f"{file} starts training on import. This command only needs its declaration. Put "
             "what trains inside a block that begins with: if __name__ == '__main__':\nIf a skill "
             "is made of what it trains, train that once in another file, and load it here: "
             "Agent(...).load(directory).as_skill(name)"
@@ -73,7 +73,7 @@ def begin(
     *,
     resume: bool = False,
 ) -> Trained[D]:
-    """Check everything, begin a run of this manifest, and train it; ``note`` is printed first.
+    """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
 
     With ``resume``, continue what is in ``run_dir`` instead, if there is something.
     """
@@ -92,15 +92,15 @@ def begin(
         raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
-        stack.enter_context(collected_notices())  # they are told by the progress, later
+        stack.enter_context(collected_notices())  # the progress prints them later
         spaces = _plan(declared, content, evolve, cluster)
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
-            own, told = prepared(declared, content, run, evolve, track)
+            declared, sentences = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
-            return go_on(own, run, quiet, evolve, cluster, told, callback)
-        learnt, told = starts(declared, content, start_from, spaces)
-        note = " ".join(filter(None, (note, told, _kept_by_populations(content))))
-        make_trackers(track, None)  # a missing extra is said before anything is written
+            return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
+        learnt, origin = starts(declared, content, start_from, spaces)
+        note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
+        make_trackers(track, None)  # a missing extra is reported before anything is written
         if cluster is not None:
             cluster.check()
         content = content | {"track": track}
@@ -114,7 +114,7 @@ def begin(
 
 
 def _kept_by_populations(content: dict[str, Any]) -> str:
-    """Return a sentence where ``keep="best"`` changes nothing; empty if it does everywhere."""
+    """Return a sentence on the stages in which ``keep="best"`` changes nothing; may be empty."""
     names = [stage["name"] for stage in content["stages"] if stage.get("evolution")]
     if content["keep"] != "best" or not names:
         return ""
@@ -122,7 +122,7 @@ def _kept_by_populations(content: dict[str, Any]) -> str:
 
 
 def _run_name(declared: Declaration | PlainAgent, content: Mapping[str, Any]) -> str:
-    """Return what a numbered directory is named after: recipe, hierarchy, or environment."""
+    """Return the stem of a numbered directory: the recipe, the hierarchy, or the environment."""
     flat = isinstance(declared, Declaration) and content["kind"] == "agent"
     name = "" if content["recipe"] is None else Path(content["recipe"]).stem
     if not name and isinstance(declared, Declaration) and declared.name != Declaration.name:
@@ -136,7 +136,7 @@ def _remove_if_empty(path: Path) -> None:
 
 
 def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
-    """Return the run of this manifest in ``run_dir``; None: it is not begun.
+    """Return the run of this manifest in ``run_dir``; None: it is not started.
 
     Raises:
         RunError: there is a run, but of another manifest.
@@ -158,7 +158,7 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
 def _plan(
     declared: Declaration | PlainAgent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
 ) -> Spaces:
-    """Check everything, and write into a manifest's stages how they are trained; the spaces."""
+    """Check everything, and complete the entries of a manifest's stages; return the spaces."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
     check_several(content["stages"], declared.spec)
@@ -176,7 +176,7 @@ def _plan(
             acts = declared.chooses_from(stage["decides"], action_space)
         check_replay(stage, observation_space, acts)
         for name, config in stage.get("algorithms", {}).items():
-            if not name.endswith(CRITIC):  # it keeps nothing
+            if not name.endswith(CRITIC):  # it has no replay
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
@@ -185,13 +185,13 @@ def _plan(
 
 @contextmanager
 def _surroundings() -> Iterator[None]:
-    """Train in surroundings that the user has made for other things."""
+    """Train with steady streams and normal tensors, whatever the user's program has set."""
     with steady_streams(), normal_tensors():
         yield
 
 
 def _must_not_run_again(spec: EnvSpec) -> None:
-    """Raise a DeclarationError where processes would run the program again that starts them."""
+    """Raise a DeclarationError where processes would run the program that starts them."""
     if not why_no_processes() and (why := runs_again()):
         raise DeclarationError(
             f"{spec.name} is to be stepped in {spec.workers} processes, but {why}\n"
@@ -208,7 +208,7 @@ def go_on(
     note: str = "",
     callback: Callback | None = None,
 ) -> Trained[D]:
-    """Train what is left of a run; ``note``: what people should know first."""
+    """Train what is left of a run; ``note`` is printed first."""
     check_callback(callback)
     if not run.finished:
         _may_train()
@@ -227,7 +227,7 @@ def go_on(
         for tracker in trackers:
             stack.callback(tracker.close)
         listeners: tuple[Listener, ...] = (progress, *trackers)
-        if callback is not None:  # last: what it is called with is written by then
+        if callback is not None:  # last: the report that it receives is written by then
             listeners = (*listeners, TrainCallback(callback, run))
         make = _where(cluster, run, progress, stack)
         learner = make_learner(run.manifest["stages"], evolve, make)
@@ -243,54 +243,54 @@ H = TypeVar("H", bound=Declaration)
 
 
 def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
-    """Return the hierarchy as it can evolve, and a sentence on what differs from the declaration.
+    """Return the hierarchy as it can evolve, and a sentence on differences from the declaration.
 
     Skills and selector cannot evolve together, so where that is declared they learn apart.
     """
-    asked = evolve if isinstance(evolve, Mapping) else {"": evolve}
-    if all(how is None for how in asked.values()):
+    by_stage = evolve if isinstance(evolve, Mapping) else {"": evolve}
+    if all(evolution is None for evolution in by_stage.values()):
         return declared, ""
     return apart_to_evolve(declared)
 
 
 def apart_to_evolve(declared: H) -> tuple[H, str]:
-    """Return a copy of a hierarchy that learns apart, and the sentence that says so."""
-    found = copied(declared)
-    changed = [h for _, h in every_hierarchy(found) if h.learns_together and h.learn == "together"]
+    """Return a copy of a hierarchy that learns apart, and a sentence about it."""
+    copy = copied(declared)
+    changed = [h for _, h in every_hierarchy(copy) if h.learns_together and h.learn == "together"]
     if not changed:
         return declared, ""
-    for own in changed:
-        own.learn = "apart"
-    return found, (
+    for hierarchy in changed:
+        hierarchy.learn = "apart"
+    return copy, (
         "Skills and selector cannot evolve together yet, so they learn apart here; "
         "learn='apart' in the declaration ends this message."
     )
 
 
 def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack) -> Where:
-    """Where collectors of a run, and parts of its populations, run.
+    """Return the placement of a run's collectors, and of parts of its populations.
 
     A cluster is left when ``stack`` is closed.
 
     Raises:
-        RunError: the run was begun with another number of collectors.
+        RunError: the run was started with another number of collectors.
     """
     _check(cluster)
     if cluster is None or run.finished:
         return HERE
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
     counts = [s.get("workers", 1) for s in left]
-    asked = cluster.collectors
-    if asked is not None and any(s.get("workers", 1) != workers_of(s, asked) for s in left):
+    wanted = cluster.collectors
+    if wanted is not None and any(s.get("workers", 1) != workers_of(s, wanted) for s in left):
         raise RunError(
-            f"{run.path} was begun with {', '.join(map(str, sorted(set(counts))))} collectors, and "
-            f"goes on with as many, as results depend on it; leave out collectors={asked}"
+            f"{run.path} was started with {', '.join(map(str, sorted(set(counts))))} collectors, "
+            f"and continues with as many, as results depend on it; leave out collectors={wanted}"
         )
     alone = [s["name"] for s in left if s.get("evolution") and s.get("workers", 1) == 1]
     if alone:
         progress.message(
-            f"{', '.join(alone)}: the population trains in this process, as nobody said into how "
-            "many parts it is to be split: Ray(collectors=4), --collectors 4"
+            f"{', '.join(alone)}: the population trains in this process, as no number of "
+            "collectors was given: Ray(collectors=4), --collectors 4"
         )
     return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
 

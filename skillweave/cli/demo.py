@@ -35,7 +35,7 @@ MOSTLY = 0.75
 
 @dataclass
 class Demo:
-    """Trains, scores and films, and says what comes out of it.
+    """A demonstration that trains, scores and films two tasks and prints the results.
 
     Args:
         command: as it was given.
@@ -137,7 +137,7 @@ class Demo:
         self.say(f"   Film: {film['path']}")
 
     def _report(self, run: Run) -> None:
-        """Write a report, unless what draws its charts is not installed."""
+        """Write a report, unless the library that draws its charts is not installed."""
         try:
             page = run.report(self.command.out / "mission.html", episodes=10, films=1)
         except MissingExtra as error:

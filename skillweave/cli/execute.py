@@ -72,8 +72,8 @@ def _sweep(command: commands.Sweep) -> int:
 
 
 def _evaluate(command: commands.Evaluate) -> None:
-    found = target(command)
-    score = found.evaluate(
+    trained = target(command)
+    score = trained.evaluate(
         command.episodes,
         seed=command.seed,
         deterministic=command.deterministic,
@@ -81,17 +81,17 @@ def _evaluate(command: commands.Evaluate) -> None:
         num_envs=command.num_envs,
         quiet=command.quiet,
     )
-    result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}
+    result = {"target": command.target, "env": trained.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
-        save_score(found, score, command.seed, command.deterministic)
+        save_score(trained, score, command.seed, command.deterministic)
     tell(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
-    found = target(command)
+    trained = target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
-    result = found.render(
+    result = trained.render(
         path,
         episodes=command.episodes,
         seed=command.seed,
@@ -105,8 +105,8 @@ def _render(command: commands.Render) -> None:
 
 def _plot(command: commands.Plot) -> None:
     runs = open_runs(command.runs)
-    own = (command.metric, command.agent, *command.label)
-    if len(runs) == 1 and all(word is None for word in own) and command.band == "iqr":
+    of_several = (command.metric, command.agent, *command.label)
+    if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
         paths = [str(path) for path in plot_run(runs[0], command.out)]
         tell(command, {"paths": paths}, "\n".join(paths))
         return
@@ -130,9 +130,9 @@ def _plot(command: commands.Plot) -> None:
 
 def _report(command: commands.Report) -> None:
     run, why_not, trained = RunDirectory.open(command.run), None, None
-    told = run.manifest.get("recipe")
-    # Code of our own is as good as told: with it, the skills' rewards and successes are known.
-    recipe = command.recipe or (told if told in recipes.names() else None)
+    named = run.manifest.get("recipe")
+    # A shipped recipe's code is trusted: with it, the skills' rewards and successes are known.
+    recipe = command.recipe or (named if named in recipes.names() else None)
     if run.finished:
         try:
             trained = load_run(command.run, recipe)
@@ -152,18 +152,18 @@ def _report(command: commands.Report) -> None:
         deterministic=command.deterministic,
         quiet=command.quiet,
     )
-    _tell_page(command, page)
+    _report_page(command, page)
 
 
 def _compare(command: commands.Compare) -> None:
-    _tell_page(command, write_comparison(open_runs(command.runs), command.out))
+    _report_page(command, write_comparison(open_runs(command.runs), command.out))
 
 
-def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:
-    lines = [told["verdict"].replace("`", "")] if "verdict" in told else []
-    lines += [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
-    lines += [f"missing: {line}" for line in told["missing"]]
-    tell(command, told, "\n".join(lines))
+def _report_page(command: commands.Output, page: dict[str, Any]) -> None:
+    lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
+    lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
+    lines += [f"missing: {line}" for line in page["missing"]]
+    tell(command, page, "\n".join(lines))
 
 
 def _list(command: commands.List) -> None:
@@ -178,8 +178,8 @@ def _list(command: commands.List) -> None:
         lines.append(f"  {r['name']:<22} {r['about']}{' [weights]' if r['pretrained'] else ''}")
     if runs:
         lines.append("runs:")
-        told = [{k: one_line(v) for k, v in r.items()} for r in runs]
-        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in told]
+        printable = [{k: one_line(v) for k, v in r.items()} for r in runs]
+        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in printable]
     tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 
@@ -189,13 +189,13 @@ def _info(command: commands.Info) -> None:
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
         tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
         return
-    found = RunDirectory.open(command.target)
-    m = found.manifest
-    saved = load_evaluation(found)
-    sampled = load_evaluation(found, deterministic=False)
-    told = {} if saved is None else {"evaluation": saved.to_json()}
-    told |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    tell(command, m | told, "\n".join(run_lines(m, [saved, sampled], command.target)))
+    run = RunDirectory.open(command.target)
+    m = run.manifest
+    saved = load_evaluation(run)
+    sampled = load_evaluation(run, deterministic=False)
+    scores = {} if saved is None else {"evaluation": saved.to_json()}
+    scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
+    tell(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
 
 
 def _weights(command: commands.Weights) -> None:
@@ -206,11 +206,11 @@ def _weights(command: commands.Weights) -> None:
 
 def _export(command: commands.Export) -> None:
     if not command.onnx:
-        raise DeclarationError("say as what to export: --onnx")
+        raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
-    found = target(command).export(command.out or Path(f"{name}-onnx"))
-    told = {"path": str(found.path), "files": list(found.files), "code": found.code}
-    tell(command, told, str(found))
+    export = target(command).export(command.out or Path(f"{name}-onnx"))
+    result = {"path": str(export.path), "files": list(export.files), "code": export.code}
+    tell(command, result, str(export))
 
 
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
@@ -228,12 +228,12 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
 
 def _run_line(path: Path) -> dict[str, Any]:
     try:
-        found = RunDirectory.open(path)
+        run = RunDirectory.open(path)
     except RunError as error:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
-    status = "finished" if found.finished else "unfinished"
+    status = "finished" if run.finished else "unfinished"
     return {"path": str(path), "status": status} | {
-        k: found.manifest[k] for k in ("kind", "env", "seed")
+        k: run.manifest[k] for k in ("kind", "env", "seed")
     }
 
 

@@ -21,7 +21,7 @@ from skillweave.skills import Skill
 PLAIN = ("call_steps", "steps", "learn")
 """Fields of a hierarchy that are set by themselves."""
 OF_SKILLS = ("steps", "task_weight", "target_return", "target_success")
-"""The same of a skill; its other settings are its algorithm's."""
+"""Fields of a skill that are set by themselves; its other settings are its algorithm's."""
 GROUPS = {
     "apart": "apart",
     "together": "together",
@@ -130,7 +130,10 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
-    """``config`` with the fields at these paths set to values parsed from (full name, text)."""
+    """Return ``config`` with the fields at these paths set to parsed values.
+
+    ``changes``: by path, the full name and the text of the value.
+    """
     known, hints = [f.name for f in fields(config)], annotations_of(type(config))
     values: dict[str, Any] = {}
     deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
@@ -160,7 +163,7 @@ _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:
-    """``text`` as a value of the annotated type."""
+    """Return ``text`` as a value of the annotated type."""
     options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None

@@ -1,4 +1,4 @@
-"""What ``skillweave info`` tells people about a run."""
+"""Lines of ``skillweave info`` about a run, for people. Apart from the command, for its tests."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ def run_lines(
         if kept := p.get("kept"):
             lines.append(f"    {kept_words(kept)}")
     lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in m["versions"].items())]
-    for told in saved:
-        if told is not None:
-            how = "greedy" if told.deterministic else "sampled"
-            lines.append(f"  evaluated {one_line(told.made)}, seed {told.seed}, {how}:")
-            lines += [f"    {line}" for line in told.evaluation.for_people().splitlines()]
+    for score in saved:
+        if score is not None:
+            how = "greedy" if score.deterministic else "sampled"
+            lines.append(f"  evaluated {one_line(score.made)}, seed {score.seed}, {how}:")
+            lines += [f"    {line}" for line in score.evaluation.for_people().splitlines()]
     return lines

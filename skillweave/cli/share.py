@@ -1,4 +1,4 @@
-"""The commands that talk to the Hugging Face Hub: ``push`` and ``pull``."""
+"""The commands for the Hugging Face Hub: ``push`` and ``pull``."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from skillweave.runs.hub import check_name, hub
 
 
 def push(command: commands.Push) -> tuple[dict[str, Any], str]:
-    """Put a run on the hub; what happened, as JSON and for people."""
+    """Put a run on the hub; return the result as JSON and for people."""
     _no_bars()
-    told = push_run(command.run, command.name, command.private)
-    lines = [f"{told['url']}: {len(told['files'])} files", *told["missing"]]
+    pushed = push_run(command.run, command.name, command.private)
+    lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
     lines.append(f"load it: skillweave.from_hub({command.name!r})")
-    return told, "\n".join(lines)
+    return pushed, "\n".join(lines)
 
 
 def pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
-    """Copy a run from the hub; where it is now, as JSON and for people."""
+    """Copy a run from the hub; return its new place as JSON and for people."""
     _no_bars()
     name = check_name(command.name).partition("/")[2]
     path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
@@ -33,5 +33,5 @@ def pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
 
 def _no_bars() -> None:
     """Keep the hub's library from drawing a bar for each file."""
-    hub()  # a missing extra is said
+    hub()  # a missing extra is reported
     importlib.import_module("huggingface_hub.utils").disable_progress_bars()

@@ -1,7 +1,7 @@
-"""``sweep``: many runs of a recipe, here in processes or on Ray; the table of what came out.
+"""``sweep``: many runs of a recipe, here in processes or on Ray, and a table of their results.
 
-Each run is an ordinary run directory. So whoever is stopped, the sweep or one of its runs, goes on
-where it stood when the same command is given again.
+Each run is an ordinary run directory. A sweep that was stopped, or one of its runs, continues when
+the same command is given again.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.messages import short, told, whole_number
+from skillweave.messages import error_text, short, whole_number
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
 
 MOST = 10_000
 """Runs of a sweep."""
 RETRIES = 20
-"""How often Ray begins a run again whose machine was lost; it goes on from its checkpoint."""
+"""Most restarts of a run whose machine was lost; it continues from its checkpoint."""
 EVALUATION_SEED = 0
 """Picks the episodes of each run's evaluation, which is greedy."""
 
@@ -47,14 +47,14 @@ class Job:
     """One run of a sweep."""
 
     settings: str
-    """What it differs in from the others, beside the seed: "selector.gamma=0.99"; may be empty."""
+    """Its settings beside the seed, as "selector.gamma=0.99"; may be empty."""
     seed: int
     path: Path
     flat: bool
     evaluate: int
 
     def run(self, code: bytes) -> float | str:
-        """Train it, or what is left of it, and evaluate it: its mean return, or what went wrong."""
+        """Train it, or what is left of it, and evaluate it; return its mean return or an error."""
         try:
             if not (self.path.parent / MARK).exists():
                 raise RunError(
@@ -63,17 +63,17 @@ class Job:
                 )
             hierarchy = unpacked(code)
             trained = finish(hierarchy, self._manifest(hierarchy), self.path)
-            found = trained.evaluate(
+            score = trained.evaluate(
                 self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True, quiet=True
             )
-            return float(found.mean)
+            return float(score.mean)
         except SkillweaveError as error:
             return str(error)
         except Exception as error:
-            return told(error)
+            return error_text(error)
 
     def known(self, hierarchy: Hierarchy) -> float | str | None:
-        """Return what ``run`` would give, where nothing is left to be done; else None."""
+        """Return the result of ``run`` where nothing is left to do; else None."""
         try:
             run = begun(hierarchy, self._manifest(hierarchy), self.path)
             if run is None or not run.finished:
@@ -92,7 +92,7 @@ class Job:
 
 
 def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
-    """Train all runs of a sweep; what came out, as JSON and for people."""
+    """Train all runs of a sweep; return the results as JSON and for people."""
     whole_number(command.evaluate, "evaluate", 1)
     if command.jobs is not None:
         whole_number(command.jobs, "jobs", 1)
@@ -108,11 +108,11 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"could not write {out}: {error.strerror}") from error
-    found: dict[Job, float | str] = {}
+    results: dict[Job, float | str] = {}
     jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
         code = packed(hierarchy, command.recipe)
-        must_be_same_code(out, command.recipe)  # each time, as the recipe was read anew
+        must_be_same_code(out, command.recipe)  # each time, as the recipe was read again
         for seed in seeds:
             path = out / _file_name(settings, seed)
             job = Job(settings, seed, path, command.flat, command.evaluate)
@@ -120,20 +120,20 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
             if (known := job.known(hierarchy)) is None:
                 tasks.append((code, job))
             else:
-                found[job] = known
+                results[job] = known
     run = _on_ray if command.ray is not None else _in_processes
     try:
         for job, result in run(tasks, command) if tasks else ():
-            found[job] = result
+            results[job] = result
             if not command.quiet:
-                says = result if isinstance(result, str) else f"return {result:.1f}"
-                line = f"{len(found)} of {len(jobs)}: {job.path.name}: {says}"
+                score = result if isinstance(result, str) else f"return {result:.1f}"
+                line = f"{len(results)} of {len(jobs)}: {job.path.name}: {score}"
                 say(line)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(found)} of {len(jobs)} runs are finished; the same command goes on"
+            f"{len(results)} of {len(jobs)} runs are finished; the same command continues"
         ) from None
-    return summary([(j.settings, j.seed, j.path, found[j]) for j in jobs], out)
+    return summary([(j.settings, j.seed, j.path, results[j]) for j in jobs], out)
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -154,7 +154,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return all combinations of the values of ``--set-each``, as settings; one without any if none."""
+    """Return all combinations of the values of ``--set-each``; without any, one empty one."""
     names, options = set[str](), []
     for setting in each:
         name, sign, text = (part.strip() for part in setting.partition("="))
@@ -174,12 +174,12 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
 def _hierarchies(
     command: commands.Sweep, choices: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[str, Hierarchy]]:
-    """For each choice its name, and the hierarchy with these settings."""
+    """Yield for each choice its name, and the hierarchy with these settings."""
     for choice in choices:
         hierarchy = recipes.load(command.recipe)
         apply_overrides(hierarchy, [*command.set, *choice])
         hierarchy.scale(command.scale)
-        # Runs share the cores, so each has one process, or as many as the recipe says: the same
+        # Runs share the cores, so each has one process, or as many as the recipe sets: the same
         # number on every machine.
         hierarchy.env = replace(hierarchy.spec, workers=hierarchy.spec.workers or 1)
         yield ", ".join(choice), hierarchy
@@ -194,19 +194,19 @@ Tasks = Sequence[tuple[bytes, Job]]
 
 
 def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
-    """Each run in a process of its own, so many at once as there are cores."""
+    """Do each run in a process of its own, as many at once as there are cores."""
     with processes(min(command.jobs or cores(), len(tasks))) as pool:
         due = {pool.submit(job.run, code): job for code, job in tasks}
         for future in as_completed(due):
             try:
                 yield due[future], future.result()
             except ProcessEnded as error:
-                says = f"{error}; the same command goes on with it (fewer at once: --jobs)"
-                yield due[future], says
+                message = f"{error}; the same command continues it (fewer at once: --jobs)"
+                yield due[future], message
 
 
 def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
-    """Each run as a task of Ray; one whose machine is lost goes on elsewhere."""
+    """Do each run as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
         from skillweave.collecting.actors import LOST, check_versions
@@ -224,9 +224,9 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
             try:
                 there, result = ray.get(ref)
             except LOST as error:
-                yield job, f"its process was lost again and again: {told(error)}"
+                yield job, f"its process was lost repeatedly: {error_text(error)}"
             except ray.exceptions.RayError as error:
-                yield job, told(error)
+                yield job, error_text(error)
             else:
                 if there is None:
                     yield job, result
@@ -237,9 +237,10 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
 
 
 def _task() -> Callable[..., Any]:
-    """Return a run as Ray does it: what runs on a node, or None where that is good; and the result.
+    """Return the function that does a run on a node of Ray.
 
-    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
+    It returns the node's versions where they do not fit, else None; and the run's result. It is
+    sent to the nodes as code, so that it can report a node without Skillweave.
     """
     from skillweave.collecting.stationed import actor_class
 

@@ -1,4 +1,4 @@
-"""What came out of a sweep: interquartile means over seeds, with intervals."""
+"""The table of a sweep: interquartile means over seeds, with intervals; no run is trained here."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ import numpy as np
 from skillweave.reporting.report.seeds import over_seeds
 
 Result = tuple[str, int, Path, float | str]
-"""Settings, seed, directory, and the mean return or what went wrong."""
+"""Settings, seed, directory, and the mean return or an error."""
 
 
 def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
-    """A sweep as JSON, and as a table: a line for each choice of settings, over its seeds."""
+    """Return a sweep as JSON, and as a table with a line for each choice of settings."""
     groups, failed, runs = list[dict[str, Any]](), list[dict[str, str]](), list[dict[str, Any]]()
-    for settings, own in itertools.groupby(results, lambda result: result[0]):
+    for settings, rows in itertools.groupby(results, lambda result: result[0]):
         returns = []
-        for _, seed, path, found in own:
-            if isinstance(found, str):
-                failed.append({"run": str(path), "error": found})
+        for _, seed, path, score in rows:
+            if isinstance(score, str):
+                failed.append({"run": str(path), "error": score})
                 continue
-            returns.append(found)
-            told = {"run": str(path), "settings": settings, "seed": seed, "return": found}
-            runs.append(told)
+            returns.append(score)
+            runs.append({"run": str(path), "settings": settings, "seed": seed, "return": score})
         group: dict[str, Any] = {"settings": settings or "as declared", "runs": len(returns)}
         if returns:
             over = over_seeds(np.array(returns))

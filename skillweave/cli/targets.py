@@ -1,4 +1,4 @@
-"""What a command names: a run, a weights file, a shipped recipe."""
+"""Load the policy that a command names: of a run, a weights file, or a shipped recipe."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
-from skillweave.messages import told, whole_number
+from skillweave.messages import error_text, whole_number
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -131,13 +131,13 @@ class _Film:
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
-    """What the environment shows now, reduced to at most ``MAX_WIDTH``."""
+    """Return what the environment shows now, reduced to at most ``MAX_WIDTH``."""
     name = type(env.unwrapped).__name__
     try:
         frame: Any = env.render()
     except (Exception, SystemExit) as error:
         raise EnvError(
-            f"{name} cannot be filmed: its render() raised {told(error)}.{hint(error)}"
+            f"{name} cannot be filmed: its render() raised {error_text(error)}.{hint(error)}"
         ) from error
     if not isinstance(frame, np.ndarray):
         raise EnvError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
