@@ -436,7 +436,7 @@ def test_who_is_not_named_begins_afresh(source, tmp_path):
 def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_path):
     _, plain = other_runs
     for start, says in (
-        ({}, r"start_from is \{\}; name who begins"),
+        ({}, r"start_from is \{\}; name the run of each"),
         ({"lefft": source}, r"names 'lefft', which does not learn here.*Close matches: left"),
         ({"push": source}, r"names 'push', which does not learn here; here learn left, other"),
         ({"left": tmp_path / "no"}, "holds no run"),

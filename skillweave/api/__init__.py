@@ -182,7 +182,8 @@ class Agent(PlainAgent):
         tensors, header = open_weights(path)
         if header["kind"] != "agent" or "env" not in header:
             raise RunError(
-                f"{path} does not name the environment of its agent; give the agent: agent.load_weights(path)"
+                f"{path} does not name the environment of its agent; declare the agent, and "
+                "use its load_weights"
             )
         agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
@@ -683,7 +684,7 @@ class Run:
 
     @checked_names
     def as_skill(self, name: str, **attributes: Any) -> Skill:
-        """Return all of it as one skill of another hierarchy.
+        """Return the whole policy as one skill of another hierarchy.
 
         Args:
             name: of the skill.

@@ -41,23 +41,23 @@ class NumpyActor:
             self._nets = {}
 
     def rows(self, obs: Any) -> Array:
-        """One observation or a batch as (B, *shape), with the dtype of the space."""
+        """Return one observation or a batch as (B, *shape), with the dtype of the space."""
         return np.asarray(obs, self._space.dtype).reshape(-1, *self._space.shape)
 
     def output(self, rows: Array, field: str = "network") -> Array:
-        """The output of a network's head, (B, out); ``field`` is its field of the config."""
+        """Return the output of a network's head, (B, out); ``field`` is its field of the config."""
         if field in self._nets:
             return self._nets[field](self._vectors(rows) if self._one_hot else rows)
         with torch.inference_mode():
             actor = ActingParams({}, *self.algorithm.scaling(self.state))
             inputs = self.algorithm.inputs(actor, to_tensor(rows)[None])
-            found: Array = self._all[field](self._views, inputs)[0].numpy()
-        return found
+            output: Array = self._all[field](self._views, inputs)[0].numpy()
+        return output
 
     def _vectors(self, rows: Array) -> Array:
         vector, _ = self.algorithm.obs.split(to_tensor(rows))
-        found: Array = vector.numpy()
-        return found
+        array: Array = vector.numpy()
+        return array
 
 
 class NumpyPPOActor(NumpyActor):
@@ -71,7 +71,7 @@ class NumpyPPOActor(NumpyActor):
         self._choices = algorithm.head.discrete and not algorithm.codec.multi
 
     def sample(self, rows: Array, rng: np.random.Generator) -> Sampled:
-        """Actions (B, …) in policy units, log-probabilities, entropies and values (B,) float32."""
+        """Return actions (B, …) in policy units; log-probabilities, entropies, values (B,)."""
         head, value = self.output(rows), self.output(rows, "critic")[:, 0]
         value = value * self._scale + self._mean
         if not self._choices:
@@ -87,7 +87,7 @@ class NumpyPPOActor(NumpyActor):
         return action, log_p[np.arange(len(rows)), action], entropy, value
 
     def _drawn(self, head: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Actions, log-probabilities and entropies in torch, for all other action spaces."""
+        """Return actions, log-probabilities and entropies by torch, for all other action spaces."""
         outputs, heads = torch.from_numpy(head), self.algorithm.head
         log_std = None if self._log_std is None else self._log_std[0]
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))

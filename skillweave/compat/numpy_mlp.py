@@ -25,8 +25,8 @@ class NumpyMLP:
 
     def __init__(self, views: Views, prefix: str, network: Network) -> None:
         def copy(name: str) -> Array | None:
-            found: Tensor | None = views.get(f"{prefix}.{name}")
-            return None if found is None else found[0].detach().numpy().copy()
+            weights: Tensor | None = views.get(f"{prefix}.{name}")
+            return None if weights is None else weights[0].detach().numpy().copy()
 
         kinds = ("weight", "bias", "norm_weight", "norm_bias")
         layers = ([copy(f"{i}.{kind}") for kind in kinds] for i in itertools.count())
@@ -35,11 +35,11 @@ class NumpyMLP:
 
     @staticmethod
     def fits(network: Network) -> bool:
-        """Whether its activation is one of those that are written here."""
+        """Return whether this class has the network's activation."""
         return network.activation in _ACTIVATIONS
 
     def __call__(self, x: Array) -> Array:
-        """(B, in) float32 to (B, out)."""
+        """Map (B, in) float32 to (B, out)."""
         for weight, bias, norm_weight, norm_bias in self._layers[:-1]:
             x = x @ weight
             x += bias

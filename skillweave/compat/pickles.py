@@ -1,4 +1,4 @@
-"""Reads checkpoints of ``torch.save`` without running code from them.
+"""Read checkpoints of ``torch.save`` without running code from them.
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
@@ -32,7 +32,7 @@ _STORAGES = {
 
 
 class Inert:
-    """Stands for an object that holds nothing that is needed, such as a loss of torch's."""
+    """A stand-in for an object that is not needed, such as a loss of torch's."""
 
     def __setstate__(self, state: Any) -> None:
         """Ignore it."""
@@ -58,7 +58,7 @@ class _Held:
 
 
 class _Maker:
-    """A function that the pickle may call, and do nothing else with."""
+    """A function that the pickle may only call."""
 
     __slots__ = ("_function",)
 
@@ -73,7 +73,7 @@ class _Maker:
 
 
 def read_torch_pickle(path: Path) -> Any:
-    """What ``torch.save`` wrote, if it is tensors, numbers, arrays and plain containers.
+    """Return the content of a ``torch.save``: tensors, numbers, arrays and plain containers.
 
     Raises:
         RunError: the file is missing, damaged, too large or nested too deep, or names
@@ -91,25 +91,25 @@ def read_torch_pickle(path: Path) -> Any:
             prefix = name.removesuffix("data.pkl")
             return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
     except zipfile.BadZipFile as error:
-        told = shortened(str(error))  # it may quote much of the file
+        reason = shortened(str(error))  # it may quote much of the file
         raise RunError(
-            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {told}"
+            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {reason}"
         ) from error
     except SkillweaveError as error:
         raise RunError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
-        told = f"{type(error).__name__}: {shortened(str(error))}"
-        raise RunError(f"{path} is damaged: {told}") from error
+        reason = f"{type(error).__name__}: {shortened(str(error))}"
+        raise RunError(f"{path} is damaged: {reason}") from error
 
 
 class _Plain:
-    """Turns what was read into plain tensors, Python numbers and containers."""
+    """A conversion of a pickle's objects to plain tensors, Python numbers and containers."""
 
     def __init__(self) -> None:
         self._results: dict[int, tuple[Any, int]] = {}
 
     def __call__(self, data: Any, depth: int = 0) -> tuple[Any, int]:
-        """The same in plain objects, and their number if nothing were shared."""
+        """Return an object in plain objects, and their number if nothing were shared."""
         if id(data) in self._results:
             return self._results[id(data)]
         if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
@@ -144,7 +144,7 @@ class _Reader(pickle.Unpickler):
         super().__init__(data, encoding="utf-8")
         self._file, self._prefix = file, prefix
         self._storages: dict[tuple[str, torch.dtype], Tensor] = {}
-        # Made anew for each file: a pickle may set attributes of a class.
+        # Made again for each file: a pickle may set attributes of a class.
         self._inert = type("Inert", (Inert,), {})
 
     def find_class(self, module: str, name: str) -> Any:
@@ -199,7 +199,7 @@ def _scalar(dtype: _DType, data: bytes) -> Any:
 
 
 class _Array(np.ndarray[Any, Any]):
-    """What arrays are rebuilt as: never more than numbers."""
+    """A rebuilt array, of numbers alone."""
 
     def __new__(cls, *_: Any) -> _Array:
         return super().__new__(cls, 0)

@@ -53,12 +53,12 @@ class TransitionBuffer:
         self._after = after
 
     def sample(self, batch: int, beta: float = 1.0) -> Sample:
-        """B transitions at random; see ``ReplayStore.sample``."""
+        """Return B transitions at random; see ``ReplayStore.sample``."""
         assert self._buffer, "sample() before add()"
         return self._buffer.sample(batch, self._gamma, self._rngs, min(1.0, beta))
 
     def at(self, index: Array) -> Sample:
-        """The transitions (B,) at ``index`` of a sample from another buffer of equal steps."""
+        """Return the transitions (B,) at the ``index`` of a sample from another buffer."""
         assert self._buffer, "at() before add()"
         return self._buffer.at(np.asarray(index)[None], None, self._gamma)
 

@@ -15,7 +15,7 @@ _messages: list[str] = []
 
 
 def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
-    """A new Weights & Biases run, for a training loop of the user; offline without login or key.
+    """Start a Weights & Biases run for a user's training loop; offline without login or key.
 
     Raises:
         MissingExtra: wandb is not installed.

@@ -49,7 +49,7 @@ AXES = {
 
 @dataclass(frozen=True)
 class Line:
-    """What is drawn of several seeds; arrays (G,)."""
+    """A line of several seeds; arrays (G,)."""
 
     label: str
     seeds: int
@@ -126,7 +126,7 @@ def plot_curves(
 
 
 def _groups(runs: Paths | Mapping[str, Paths]) -> dict[str, list[RunDirectory]]:
-    """The runs of each line, by its name."""
+    """Return the runs of each line, by its name."""
     if isinstance(runs, Mapping):
         return {str(label): open_runs(_paths(own)) for label, own in runs.items()}
     return {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
@@ -150,7 +150,7 @@ def _renamed(
 
 
 def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None) -> str:
-    """The metric that is drawn; every run has it."""
+    """Return the metric that is drawn; every run has it."""
     known = [set(_curves_of(run, agent)) for run in runs]
     common = set.intersection(*known)
     if metric is None:
@@ -171,7 +171,7 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
 
 
 def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
-    """Curves by metric: of an agent, or of the whole policy over all steps of the run."""
+    """Return curves by metric: of an agent, or of the whole policy over all steps of the run."""
     all_curves = read_curves(run)
     if agent is not None:
         wanted = {c.stage: c.points for c in all_curves if c.agent == agent}
@@ -190,7 +190,7 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
 
 
 def _joined(parts: Sequence[tuple[int, Curve]]) -> Curve:
-    """Curves one after another, each moved by the steps before it."""
+    """Join curves one after another, each moved by the steps before it."""
     return [(before + x, y) for before, points in parts for x, y in points]
 
 
@@ -210,7 +210,7 @@ def _line(
 
 
 def _binary(runs: Sequence[RunDirectory]) -> bool:
-    """Whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
+    """Return whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
     saved = [load_evaluation(run) for run in runs]
     returns = [r for e in saved if e is not None for r in e.evaluation.returns]
     return bool(returns) and is_binary(returns)
@@ -286,13 +286,13 @@ def _save(figure: Any, out: Path) -> tuple[Path, ...]:
 
 
 def _shortened(label: str, width: float) -> str:
-    """A name that fits into the figure."""
+    """Return a name that fits into the figure."""
     most = math.floor(width * 14)
     return label if len(label) <= most else f"{label[: most - 1]}…"
 
 
 def _steps(value: float, _: Any = None) -> str:
-    """Steps on an axis: 200k, 1.5M."""
+    """Return steps for an axis: 200k, 1.5M."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"

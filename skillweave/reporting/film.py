@@ -14,7 +14,7 @@ LARGEST = 50_000_000
 
 
 class Film(dict[str, Any]):
-    """What was filmed: ``path``, ``frames`` and ``episodes``. A notebook shows the film."""
+    """A film's ``path``, ``frames`` and ``episodes``. A notebook shows the film."""
 
     def __repr__(self) -> str:
         returns = ", ".join(f"{episode['return']:.1f}" for episode in self["episodes"])
@@ -22,17 +22,17 @@ class Film(dict[str, Any]):
 
     def _repr_html_(self) -> str:
         """Return the film as a part of the page."""
-        path, told = Path(self["path"]), paragraph(repr(self).strip("<>"))
+        path, caption = Path(self["path"]), paragraph(repr(self).strip("<>"))
         try:
             data = path.read_bytes() if path.stat().st_size <= LARGEST else None
         except OSError as error:
-            return joined([told, paragraph(f"The film cannot be read: {error.strerror}.")])
+            return joined([caption, paragraph(f"The film cannot be read: {error.strerror}.")])
         if data is None:
-            return joined([told, paragraph("It is too large to be shown here.")])
+            return joined([caption, paragraph("It is too large to be shown here.")])
         text = base64.b64encode(data).decode()
         if path.suffix.lower() == ".gif":
             shown = f'<img src="data:image/gif;base64,{text}" style="max-width: 100%">'
         else:
             source = f"data:video/mp4;base64,{text}"
             shown = f'<video src="{source}" controls loop muted style="max-width: 100%"></video>'
-        return joined([Markup(shown), told])
+        return joined([Markup(shown), caption])

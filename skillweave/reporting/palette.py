@@ -20,5 +20,5 @@ OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
 
 
 def color_of(index: int, wanted: RGB | None = None) -> RGB:
-    """The colour of skill number ``index``: the one it asks for, else the palette's."""
+    """Return the colour of skill number ``index``: its own, else the palette's."""
     return PALETTE[index % len(PALETTE)] if wanted is None else wanted

@@ -1,4 +1,4 @@
-"""How training and evaluation go, for people: live on a terminal or in a notebook, else as lines.
+"""Progress of training and evaluation: live on a terminal or in a notebook, else as lines.
 
 Everything goes to stderr, so that stdout stays clean for results; in a notebook below the cell.
 """
@@ -65,7 +65,7 @@ class Progress:
             self._display = None
 
     def plan(self, stages: Iterable[Mapping[str, Any]]) -> None:
-        """All stages of the run, as its manifest lists them."""
+        """Set all stages of the run, as its manifest lists them."""
         for stage in stages:
             self._plan[stage["name"]] = int(stage["budget"])
             if stage["status"] == "done":
@@ -74,7 +74,7 @@ class Progress:
         self._several = len(self._plan) > 1
 
     def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on; ``budget`` in environment steps."""
+        """Start a stage, or continue it; ``budget`` in environment steps."""
         self._plan[name] = budget
         self._begun = self._shown = time.monotonic()
         self._recent.clear()
@@ -87,7 +87,7 @@ class Progress:
         self._display.draw()
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made after ``steps`` and ``seconds`` of training."""
+        """Report an update after ``steps`` and ``seconds`` of training."""
         self._recent.append((steps, seconds))
         self._spent[name] = steps, seconds
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
@@ -105,7 +105,7 @@ class Progress:
         self._show(name, steps, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over."""
+        """End a stage."""
         if name not in self._plan:
             self.stage(name, steps)
         self._spent[name] = steps, seconds
@@ -116,7 +116,7 @@ class Progress:
         self._show(name, steps, metrics, speed, f"done in {_clock(seconds)}")
 
     def message(self, text: str) -> None:
-        """A line of text, above the bars where there are any."""
+        """Show a line of text, above the bars where there are any."""
         text = printable(text)
         LOG.info("%s", text)
         if self._display is None:
@@ -135,8 +135,8 @@ class Progress:
             seconds = self._left_in_all(name)
             in_all = f"{_clock(seconds)} left in all" if seconds else ""
             numbers = (f"{k} {v:.4g}" for k, v in metrics.items() if k.startswith(INFO))
-            told = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
-            self._line(f"{self._numbered(name)}: {told}")
+            text = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
+            self._line(f"{self._numbered(name)}: {text}")
             if name in self._over:
                 for agent, _, acts, reward in _agents(metrics):
                     self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
@@ -259,8 +259,8 @@ class EpisodeProgress:
         if self._display is not None:
             self._draw(now)
             return
-        told = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
-        say(f"{self._name}: {told}")
+        text = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
+        say(f"{self._name}: {text}")
         self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._begun))
 
     def _draw(self, now: float) -> None:

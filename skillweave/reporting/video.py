@@ -54,7 +54,7 @@ def render_policy(
         max_steps: of an episode; None: the environment's own limit, at most ``LONG_EPISODE``.
         label: from the policy's memory after ``act`` to who acted, and its colour.
         fps: steps shown per second; None: as many as the environment says, so in real time.
-        every: one frame for so many steps, and one for the end of each episode.
+        every: steps for each frame; each episode's end has a frame of its own.
         rng: for ``act``; None: derived from ``seed``.
         quiet: no progress.
 
@@ -92,7 +92,7 @@ def render_policy(
 
 
 class _Film:
-    """Frames of episodes as they are played, and what is told of each."""
+    """Frames of episodes as they are played, and the facts about each."""
 
     def __init__(
         self, env: gym.Env[Any, Any], video: VideoWriter, every: int, label: Label
@@ -131,7 +131,7 @@ class _Film:
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
-    """Return what the environment shows now, reduced to at most ``MAX_WIDTH``."""
+    """Return the environment's picture, reduced to at most ``MAX_WIDTH``."""
     name = type(env.unwrapped).__name__
     try:
         frame: Any = env.render()

@@ -36,7 +36,7 @@ class PPO(Agent):
         self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **own)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
-        """Sampled actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
+        """Sample actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
         if action is not None or grad:
             raise DeclarationError("getAction(action=, grad=) is a part of learning: use learn()")
         return self.native.sample(state)
@@ -47,9 +47,9 @@ class PPO(Agent):
         Last come the observations (N, ...) after the last step. Returns the loss.
         """
         *steps, _, after = experiences
-        found = self.native.learn_steps(*steps, after)
-        value_part = self.vf_coef * found["value_loss"] - self.ent_coef * found["entropy"]
-        return float(found["policy_loss"] + value_part)
+        losses = self.native.learn_steps(*steps, after)
+        value_part = self.vf_coef * losses["value_loss"] - self.ent_coef * losses["entropy"]
+        return float(losses["policy_loss"] + value_part)
 
 
 class DQN(Agent):
@@ -68,11 +68,11 @@ class DQN(Agent):
         self._start(locals(), gym.spaces.Discrete(action_dim), loss="mse")
 
     def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
-        """Actions (B,) int64: with probability ``epsilon`` any of those allowed, else the best."""
+        """Return actions (B,) int64: any allowed one with probability ``epsilon``, or the best."""
         return self.native.act(state, explore=False, epsilon=epsilon, mask=action_mask)
 
     def learn(self, experiences: Any) -> float:
-        """One gradient step; the loss."""
+        """Make one gradient step; return the loss."""
         return self.native.learn_sample(self.gamma, *experiences[:5])[0]["loss"]
 
 
@@ -96,11 +96,11 @@ class RainbowDQN(Agent):
         self.beta, self.prior_eps = beta, prior_eps
 
     def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
-        """The best actions (B,) int64; with noise in the weights while ``training``."""
+        """Return the best actions (B,) int64; with noise in the weights while ``training``."""
         return self.native.act(state, explore=training, mask=action_mask)
 
     def learn(self, experiences: Any, n_step: bool = False, per: bool = False) -> Any:
-        """One gradient step; the loss, the samples' indices and their new priorities.
+        """Make one gradient step; return the loss, the samples' indices and their new priorities.
 
         After the five of every sample come, with ``per``, weights and indices; with ``n_step``
         the five again, summed over n steps: only these are learnt from then.
@@ -138,11 +138,11 @@ class TD3(Agent):
         self._start(locals(), actions, **own)
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
-        """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""
+        """Return actions (B, A) float32: random with probability ``epsilon``, or noisy."""
         return self.native.act(state, epsilon=epsilon)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> Any:
-        """One gradient step; the actor's loss, None where it is not its turn, and the critics'."""
+        """Make one gradient step; return the losses of actor (or None) and critics."""
         state = self.native.member.state
         state.target_noise.fill_(policy_noise)
         state.target_noise_clip.fill_(noise_clip)

@@ -19,7 +19,7 @@ COMPLEMENT = ("gamma", "gae_lambda")
 
 
 def chart(description: str, height: int, **rest: Any) -> Spec:
-    """What all charts have in common; as wide as the page lets it be."""
+    """Return the specification that all charts share, as wide as its place in the page."""
     schema = "https://vega.github.io/schema/vega-lite/v6.json"
     size = {
         "width": "container",
@@ -30,20 +30,20 @@ def chart(description: str, height: int, **rest: Any) -> Spec:
 
 
 def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
-    """The encoding of a number that need not begin at zero."""
+    """Return the encoding of a number that need not begin at zero."""
     scale = {"zero": False, "nice": True} | rest.pop("scale", {})
     return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
 
 
 def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
-    """The encoding of steps: 200k, 1M."""
+    """Return the encoding of steps: 200k, 1M."""
     label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
     axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
     return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
 
 
 def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]:
-    """Layers that show the nearest point under the pointer, with a box of its values."""
+    """Return layers that show the nearest point under the pointer, with a box of its values."""
     near = {"name": "near", "select": {"type": "point", "on": "pointerover", "nearest": True,
             "encodings": ["x"], "clear": "pointerout"}}  # fmt: skip
     opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
@@ -55,20 +55,20 @@ def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]
 
 
 def curve(label: str, color: str) -> Spec:
-    """One agent's metric over its steps; the page sets the values and the name of the metric."""
-    own = {"value": color}
-    told = [
+    """Return a chart of one agent's metric; the page sets its values and its name."""
+    hue = {"value": color}
+    tooltip = [
         {"field": "x", "type": "quantitative", "title": STEPS, "format": ",d"},
         {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~r"},
     ]
     mark = {"type": "line", "strokeWidth": 2, "strokeJoin": "round", "aria": False}
-    layers = [{"mark": mark, "encoding": {"color": own}}, *hover(told, own)]
+    layers = [{"mark": mark, "encoding": {"color": hue}}, *hover(tooltip, hue)]
     encoding = {"x": steps_axis(), "y": number_axis("y", "", axis={"tickCount": 5})}
     return chart(f"Learning curve of {label}", 190, encoding=encoding, layer=layers)
 
 
 def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
-    """Decisions over two coordinates, coloured by skill; the page sets values and names."""
+    """Return a chart of decisions over two coordinates; the page sets values and names."""
     scale = {"domain": list(skills), "range": list(colors)}
     shapes = ["circle", "square", "triangle-up", "diamond", "cross", "triangle-down"]
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
@@ -81,28 +81,28 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
                     {"field": "y", "format": ",.4~r"}],
     }  # fmt: skip
     mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
-    return chart("What the selector chose over two coordinates", 360, mark=mark, encoding=encoding)
+    return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
 
 def family_tree(lineage: Lineage, color: str) -> Spec:
-    """Fitness by generation, each member joined to its parent; the winner's line in colour."""
+    """Return a chart of fitness by generation, each member joined to its parent."""
     path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}
     dots, lines = [], []
     for key, born in lineage.born.items():
         if born.fitness is None:
             continue
-        told: dict[str, Any] = {
+        dot: dict[str, Any] = {
             "x": born.generation + 1,
             "y": round(born.fitness, 3),
             "won": key in path,
         }
         what = "winner's line" if key in path else "other members"
-        told |= {"member": born.member, "how": what_changed(born), "what": what}
-        dots.append(told)
+        dot |= {"member": born.member, "how": what_changed(born), "what": what}
+        dots.append(dot)
         parent = lineage.parent(born)
         if parent is not None and parent.fitness is not None:
             ends: dict[str, Any] = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
-            lines.append({k: told[k] for k in ("x", "y", "won", "what")} | ends)
+            lines.append({k: dot[k] for k in ("x", "y", "won", "what")} | ends)
     axis = {"tickMinStep": 1, "format": "d"}
     x = number_axis("x", "generation", axis=axis)
     y = number_axis("y", "fitness: mean return")
@@ -129,7 +129,7 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
 
 
 def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
-    """For each setting that differed: its values by generation, the winner's line in colour."""
+    """Return a chart for each setting that differed: its values by generation."""
     everyone = list(lineage.born.values())
     path = lineage.path(lineage.winner)
     shown = [k for k in lineage.winner.settings if len({str(b.settings[k]) for b in everyone}) > 1]
@@ -140,9 +140,9 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
     words = any(isinstance(b.settings[name], str) for b in everyone)
 
     def value(born: Born) -> Any:
-        told = born.settings[name]
-        told = sum(told) if isinstance(told, list) else told
-        return 1.0 - told if name in COMPLEMENT else told
+        setting_value = born.settings[name]
+        number = sum(setting_value) if isinstance(setting_value, list) else setting_value
+        return 1.0 - number if name in COMPLEMENT else number
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
     if not words:
@@ -166,14 +166,14 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
 
 
 def setting_title(name: str) -> str:
-    """What the axis of a setting is called."""
+    """Return the title of a setting's axis."""
     if name == "hidden":
         return "hidden units, all layers"
     return f"1 − {name}" if name in COMPLEMENT else name
 
 
 def what_changed(born: Born) -> str:
-    """What a member's mutation did, in words."""
+    """Return a member's mutation in words."""
     if not born.changes:
         return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
             born.mutation, born.mutation
@@ -185,18 +185,18 @@ def what_changed(born: Born) -> str:
 
 
 def short(value: Any) -> str:
-    """A setting's value in few letters."""
+    """Return a setting's value in few letters."""
     if isinstance(value, list):
         return "-".join(map(str, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def hex_of(color: RGB) -> str:
-    """A colour as the web writes it."""
+    """Return a colour as the web writes it."""
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
 def ink_on(color: RGB) -> str:
-    """Black or white, whichever is read better on a colour (WCAG 2)."""
+    """Return black or white, whichever is read better on a colour (WCAG 2)."""
     red, green, blue = ((c / 255) ** 2.2 for c in color)
     return "#000" if 0.2126 * red + 0.7152 * green + 0.0722 * blue > 0.18 else "#fff"

@@ -1,4 +1,4 @@
-"""What a run's files say in words: what was trained and how, and what is missing."""
+"""Facts of a run's files in words: what was trained and how, and what is missing."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ MADE = {
     "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
     "succeeded", "compared", "greedy_judged", "stopped", "best", "continued",
 }  # fmt: skip
-"""Of a stage's entry what training wrote, or what follows from settings of the hierarchy."""
+"""Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
 
 
 def name_of(run: RunDirectory) -> str:
-    """What a run is called: the name of its directory."""
+    """Return the name of a run: that of its directory."""
     return run.path.resolve().name
 
 
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
-    """What was trained, by name."""
+    """Return facts about the training, by name."""
     m = run.manifest
     found = [("Environment", m["env"])]
     if m["env_kwargs"]:
@@ -55,7 +55,7 @@ def _call_length(m: Mapping[str, Any]) -> str:
 
 
 def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
-    """A row for each stage: how long it took, and how it ended; ``steps``: how far it is."""
+    """Return a row for each stage; ``steps``: by stage, the steps of its last metrics."""
     rows = []
     for entry in run.manifest["stages"]:
         final = (entry.get("final") or {}).get("return")
@@ -87,7 +87,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
 
 
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
-    """A sentence for each stage that is not done; ``steps``: how far metrics say that it is."""
+    """Return a sentence for each unfinished stage; ``steps``: those of its last metrics."""
     found = []
     for entry in run.manifest["stages"]:
         name, budget = entry["name"], entry["budget"]
@@ -107,9 +107,9 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
 
 
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
-    """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
+    """Return every setting in a run's manifest by its dotted name, without seed and results."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
-    told = (
+    names = (
         "kind",
         "learn",
         "call_steps",
@@ -127,7 +127,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "eval_episodes",
         "keep",
     )
-    found |= {k: m[k] for k in told if k in m}
+    found |= {k: m[k] for k in names if k in m}
     for skill in m.get("skills", ()):
         own = {k: v for k, v in skill.items() if k != "name"}
         found |= flat(f"skills.{skill['name']}", own)
@@ -140,7 +140,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> str:
-    """A value of a setting, for people."""
+    """Return a value of a setting, for people."""
     if value is None:
         return "none"
     if isinstance(value, bool):

@@ -9,7 +9,7 @@ from skillweave.reporting.report.charts import STEPS, Spec, chart, number_axis, 
 
 
 def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:
-    """Colours of groups by their letters; the page has the legend."""
+    """Return the colours of groups by their letters; the page has the legend."""
     scale = {"domain": list(names), "range": list(colors)}
     return {"field": field, "type": "nominal", "scale": scale, "legend": None}
 
@@ -17,7 +17,7 @@ def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str,
 def scores(
     names: Sequence[str], colors: Sequence[str], rows: dict[str, Any], binary: bool = False
 ) -> Spec:
-    """A dot for each run; of each group the interquartile mean and its interval.
+    """Return a chart with a dot for each run, and each group's interquartile mean and interval.
 
     Args:
         binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
@@ -28,7 +28,7 @@ def scores(
     color = _color("group", names, colors)
     axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
     x = number_axis("x", f"{what} of a run", axis=axis)
-    told = [
+    tooltip = [
         {"field": "group"},
         {"field": "x", "title": "interquartile mean", "format": form},
         {"field": "low", "title": "from", "format": form},
@@ -44,13 +44,13 @@ def scores(
         {"data": {"values": rows["bars"]},
          "transform": [{"filter": "isValid(datum.low)"}],
          "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
-         "encoding": {**between, "y": y, "color": color, "tooltip": told}},
+         "encoding": {**between, "y": y, "color": color, "tooltip": tooltip}},
         {"data": {"values": rows["dots"]},
          "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
          "encoding": {"x": x, "y": y, "color": color, "tooltip": run}},
         {"data": {"values": rows["bars"]},
          "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
-         "encoding": {"x": x, "y": y, "color": color, "tooltip": told}},
+         "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip}},
     ]  # fmt: skip
     if not any("low" in bar for bar in rows["bars"]):
         del layer[0]  # an axis over nothing is warned of
@@ -58,9 +58,9 @@ def scores(
 
 
 def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spec:
-    """An agent's metric over its steps, a line and a band for each group."""
+    """Return a chart of an agent's metric, with a line and a band for each group."""
     color = _color("what", names, colors)
-    told = [
+    tooltip = [
         {"field": "what", "title": "group"},
         {"field": "x", "title": STEPS, "format": ",d"},
         {"field": "y", "title": "value", "format": ",.4~r"},
@@ -75,6 +75,6 @@ def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spe
     layer: list[Spec] = [
         {"mark": band, "encoding": low_high},
         {"mark": line, "encoding": {"y": number_axis("y", "")}},
-        {"mark": dot, "encoding": {"y": number_axis("y", ""), "tooltip": told}},
+        {"mark": dot, "encoding": {"y": number_axis("y", ""), "tooltip": tooltip}},
     ]
     return chart(f"Learning curves of {label}", 220, encoding=encoding, layer=layer)

@@ -41,7 +41,7 @@ def over_seeds(values: Array) -> OverSeeds:
 
 
 def on_one_grid(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[Array, Array] | None:
-    """Curves of several seeds at the same steps: (G,) steps and (seeds, G) values.
+    """Return curves of several seeds at the same steps: (G,) steps and (seeds, G) values.
 
     Between points the values are interpolated; where one curve has not begun or is over, there is
     nothing. None: they have no steps in common.

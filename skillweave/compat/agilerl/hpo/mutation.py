@@ -16,7 +16,7 @@ _WORDS = {
 
 
 class Mutations:
-    """What changes from one generation to the next; probabilities are relative to their sum."""
+    """Mutations between generations; probabilities are relative to their sum."""
 
     def __init__(
         self, algo: Any, no_mutation: float, architecture: float, new_layer_prob: float,
@@ -40,7 +40,7 @@ class Mutations:
         self.rng = np.random.default_rng(random_seed() if rand_seed is None else rand_seed)
 
     def mutation(self, population: list[Any], pre_training_mut: bool = False) -> list[Any]:
-        """The same agents, each changed in at most one way; its ``mut`` names the change."""
+        """Return the agents, each changed in at most one way; its ``mut`` names the change."""
         kinds = self._kinds * [not pre_training_mut, 1, 1, 1, 1]
         for i, agent in enumerate(population if kinds.any() else ()):
             agent.mut = "None"
