@@ -124,7 +124,7 @@ class Player:
         )
 
     def _seen(self, obs: Any) -> Array:
-        """One observation as a batch of one."""
+        """Return one observation as a batch of one."""
         batch = np.empty((1, *self._shape), self._dtype)
         try:
             put_observation(self._space, batch, 0, obs)

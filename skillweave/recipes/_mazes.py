@@ -76,9 +76,9 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
 
 
 def walls_of(env: gym.Env[Any, Any]) -> Array:
-    """Which cells of a maze are walls, rows from the north, (rows, columns) bool."""
-    told: Any = env.unwrapped
-    return np.array([[cell == 1 for cell in row] for row in told.maze.maze_map])
+    """Return the walls of a maze, rows from the north, (rows, columns) bool."""
+    maze_env: Any = env.unwrapped
+    return np.array([[cell == 1 for cell in row] for row in maze_env.maze.maze_map])
 
 
 class MazePool(PoolWrapper):
@@ -94,7 +94,7 @@ class MazePool(PoolWrapper):
 
 
 def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """One ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
+    """Make one ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
 
     Raises:
         MissingExtra: gymnasium-robotics is missing.
@@ -109,12 +109,12 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
 
 
 def many(maze: str, num_envs: int, threads: int, seed: int) -> MazePool:
-    """The same in EnvPool, several times as fast."""
+    """Make the mazes in EnvPool, several times as fast."""
     return MazePool(envpool(MAZES[maze], num_envs, threads, seed, **ENDS))
 
 
 def spec(maze: str = "large") -> EnvSpec:
-    """The maze of this name, for ``Hierarchy(env=...)``.
+    """Return the maze of this name, for ``Hierarchy(env=...)``.
 
     Raises:
         DeclarationError: there is none of this name.
@@ -158,7 +158,7 @@ class ShortestPath:
         return int(row), int(column)
 
     def __call__(self, obs: Array) -> Array:
-        """The skill for each observation, (n,) by name."""
+        """Return the skill for each observation, (n,) by name."""
         return np.array([self._skill(one) for one in obs])
 
     def _skill(self, one: Array) -> str:
@@ -169,7 +169,7 @@ class ShortestPath:
 
 
 def ways_to(walls: Array, goal: tuple[int, ...]) -> dict[tuple[int, ...], str]:
-    """By cell, the direction in which the way to ``goal`` is shortest (breadth first)."""
+    """Return by cell the direction of the shortest way to ``goal`` (breadth first)."""
     found: dict[tuple[int, ...], str] = {goal: "approach"}
     queue = deque([goal])
     while queue:

@@ -38,7 +38,7 @@ def train_off_policy(
 
 
 def _learn(agent: Any, memory: Any, n_step_memory: Any, n_step: bool, per: bool) -> float:
-    """One gradient step; returns its loss, or that of the critics where there is an actor."""
+    """Make one gradient step; return its loss, or the critics' loss where there is an actor."""
     if not per and n_step_memory is None:
         found = agent.learn(memory.sample(agent.batch_size))
         losses = [x for x in (found if isinstance(found, tuple) else (found,)) if x is not None]
