@@ -1,8 +1,8 @@
-"""What bounds the hierarchy with the tutorial's three skills.
+"""Ablation: the limits of the hierarchy with the tutorial's three skills.
 
     python -m benchmarks.ablation [--seeds 0 1 2]
 
-The skills are trained once a seed, as the recipe says; then only the selector is trained anew,
+The skills are trained once a seed, as the recipe says; then only the selector is trained again,
 with one thing changed at a time. The last rows train the landing skill with other settings and
 score it alone, since the selector cannot be better than what it selects from.
 """
@@ -54,7 +54,7 @@ LANDINGS: dict[str, dict[str, float]] = {
 
 
 def trained_skills(seed: int, only: str | None = None, **settings: float) -> dict[str, Policy]:
-    """The recipe's skills after training, without a selector to speak of."""
+    """Return the recipe's skills after training, without a selector to speak of."""
     h = recipes.load("lunar-lander")
     regroup(h, selector_steps=1)
     if only is not None:

@@ -24,7 +24,7 @@ def train_bare(
     steps: int,
     on_tick: Callable[[Tick, Stack], None],
 ) -> Stack:
-    """Train an agent; ``on_tick`` is told of every report."""
+    """Train an agent; ``on_tick`` is called with every report."""
     scene = skill_scene(spec)
     algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
     stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))

@@ -1,4 +1,4 @@
-"""How fast experience is collected: in one process and in several, and with calls of any length.
+"""Speed of collecting: in one process and in several, and with calls of any length.
 
     python -m benchmarks.collecting [workers] [calls] [together] [--rounds 3] [--steps 40000]
 
@@ -48,7 +48,7 @@ NETWORK = Network((64, 64), "tanh")
 
 
 class Flat(gym.ObservationWrapper[Any, Any, Any]):
-    """What is in each of the 7 × 7 cells that MiniGrid shows, and whether a door there is shut."""
+    """MiniGrid's 7 × 7 cells in view as numbers: kinds, and shut doors."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -110,7 +110,7 @@ def _step_alone(steps: int, ready: Any) -> None:
 
 
 def alone(steps: int) -> float:
-    """The environments of two workers, stepped by two processes that do nothing else."""
+    """Return the environments of two workers, stepped by two processes that do nothing else."""
     context = multiprocessing.get_context("fork")
     ready = context.Barrier(3)
     processes = [context.Process(target=_step_alone, args=(steps, ready)) for _ in range(2)]
@@ -166,7 +166,7 @@ TOGETHER: dict[str, list[str]] = {
 
 
 def together(changed: list[str], steps: int) -> tuple[float, float]:
-    """Of the selector over frozen skills, then of all who learn together."""
+    """Measure the selector over frozen skills, then all learners together."""
     hierarchy = recipes.load("lunar-lander")
     budgets = ["apart.skill_steps=5000", "skills.landing.steps=5000"]
     budgets += [f"apart.selector_steps={steps}"]
@@ -181,7 +181,7 @@ def together(changed: list[str], steps: int) -> tuple[float, float]:
 def compared(
     measure: Callable[[], dict[str, float]], ratios: dict[str, tuple[str, str]], rounds: int
 ) -> dict[str, Any]:
-    """Steps per second by name, measured once a round, and the median of ratios within rounds."""
+    """Return steps per second by name, measured once a round, and the median of ratios."""
     found: list[dict[str, float]] = []
     for _ in range(rounds):
         found.append(measure())

@@ -60,7 +60,7 @@ CASES = (
 
 
 def at_random(name: str) -> float:
-    """The mean return of a random policy."""
+    """Return the mean return of a random policy."""
     env = gym.make(name)
     env.action_space.seed(0)
     returns = []
@@ -76,7 +76,7 @@ def at_random(name: str) -> float:
 
 
 def learn(case: Case, seed: int, compile: bool) -> dict[str, Any]:
-    """One run, scored on Gymnasium's environment with seeds that training never saw."""
+    """Train once; return the score on Gymnasium's environment with seeds new to training."""
     algorithm = ALGORITHMS[case.algorithm]
     found, seconds = scored(EnvSpec(case.env), algorithm, case.steps, seed, EPISODES, compile)
     score, chance = found.mean, at_random(case.env)

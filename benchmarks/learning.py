@@ -1,4 +1,4 @@
-"""What each algorithm learns, with settings that are the same for all seeds.
+"""Results of each algorithm, with the same settings for all seeds.
 
     python -m benchmarks.learning [dqn sac td3 ppo default-ppo …] [--seeds 0 1 2 3 4] [--compile]
 

@@ -40,7 +40,7 @@ THREADS = {"small": 1, "zoo": 2}  # for both: one is faster where the matrices a
 
 
 def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float:
-    """Steps/s after the warm-up: one gradient step for each environment step."""
+    """Return steps/s after the warm-up: one gradient step for each environment step."""
     kind: Any = {"dqn": DQN, "sac": SAC, "td3": TD3}[name]
     extra = {"double": False} if name == "dqn" else {}
     config = kind(
@@ -57,7 +57,7 @@ def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float
 
 
 def theirs(name: str, size: str, steps: int, seed: int) -> float:
-    """The same with Stable-Baselines3."""
+    """Return the steps/s of Stable-Baselines3."""
     import stable_baselines3 as sb3
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
@@ -82,7 +82,7 @@ def theirs(name: str, size: str, steps: int, seed: int) -> float:
 
 
 def floor(name: str, size: str) -> float:
-    """Updates/s if an update were nothing but the matrix products of its hidden layers."""
+    """Return updates/s if an update were only the matrix products of its hidden layers."""
     torch.set_num_threads(THREADS[size])
     n_in, n_out = SIZES[name][size]
     x, w = torch.randn(BATCH[name], n_in), torch.randn(n_in, n_out)

@@ -90,7 +90,7 @@ class ToHallway(Skill):
     """
 
     def __init__(self, name: str, room: Array, target: int, other: int) -> None:
-        """``room``: which cells are inside, (104,) bool."""
+        """Set ``room``: the cells inside, (104,) bool."""
         self.name, self.room = name, room
         self.starts = room.copy()
         self.starts[other] = True
@@ -140,7 +140,7 @@ def hallway_skills() -> list[Skill]:
 
 
 def moves() -> list[Skill]:
-    """The four moves of the environment as skills."""
+    """Return the four moves of the environment as skills."""
     return [Move(name, action) for action, name in enumerate(MOVES)]
 
 

@@ -82,7 +82,7 @@ class Leave(sw.Skill):
 
 
 # 1. A function of observations (n, 3) to skills (n,), by name or by number. One with a second
-#    argument is told of the last call, too: its skill, why it ended, whether it succeeded.
+#    argument receives the last call, too: its skill, how it ended, and its success.
 def rule(obs: Array) -> Array:
     with_key = np.where(obs[:, DOOR] == 1, "leave", "open_door")
     return np.where(obs[:, KEY] == 1, with_key, "get_key")

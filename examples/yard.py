@@ -58,7 +58,7 @@ class Yard(gym.Env[np.ndarray, np.ndarray]):
 
 
 def near(place: np.ndarray, point: np.ndarray) -> bool:
-    """Whether ``place`` is at ``point``."""
+    """Return whether ``place`` is at ``point``."""
     return bool(np.hypot(*(place - point)) < NEAR)
 
 
@@ -110,12 +110,12 @@ class Reach(sw.Skill):
 
 
 def algorithm(**how: Any) -> sw.PPO:
-    """Who learns."""
+    """Return the learner's settings."""
     return sw.PPO(**how)
 
 
 def declare(steps: int = 300_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:
-    """The hierarchy; ``how`` changes any of its settings."""
+    """Return the hierarchy; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "steps": steps,
         "together": sw.Together(task_weight=0.0),

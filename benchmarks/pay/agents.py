@@ -1,4 +1,4 @@
-"""How each agent of the protocol is trained and scored: the hierarchy, and F0 to F4."""
+"""Training and scoring of each agent of the protocol: the hierarchy, and F0 to F4."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Bench:
         return dict(zip(policy.labels, policy.skills.policies, strict=True))
 
     def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
-        """Skills are greedy, or sample, as on the first task, if neither the suite says it nor a
+        """Let skills be greedy, or sample, as on the first task, if neither the suite sets it nor a
         stage in which they go on learning finds it out."""
         if hierarchy.selection.greedy_skills is None and not hierarchy.learns_together:
             regroup(hierarchy, greedy_skills=self._source_policy().skills.greedy)
@@ -154,7 +154,7 @@ class Bench:
         return by_lot(hierarchy, self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
-        """Return the run of a hierarchy in which nobody learns."""
+        """Return the run of a hierarchy without a learner."""
         path = self._path(task, agent)
         shutil.rmtree(path, ignore_errors=True)
         self.results.begin(path)
@@ -274,12 +274,12 @@ class Bench:
         return result
 
     def _found(self, task: Task, agent: str, budget: int, keep: bool = False) -> Result | None:
-        """Return a result that is there; not where others need its run, and that is not at its end."""
+        """Return a stored result; None where others need its run, and that is not finished."""
         found = self.results.find(self.suite.name, task.name, agent, self.seed, budget)
         return None if keep and not is_over(self._path(task, agent)) else found
 
     def _builds_on(self, task: Task, agent: str) -> None:
-        """What follows needs this result, so it is of other code if this one is."""
+        """Note that further results need this one, so they are of other code if it is."""
         path = self.results.file(self.suite.name, task.name, agent, self.seed)
         self._on_older |= read(path).code != CODE
 
@@ -312,7 +312,7 @@ def is_over(path: Path) -> bool:
 
 
 def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:
-    """The same skills under a ready selector: nothing is learnt any more."""
+    """Return the same skills under a ready selector, without further learning."""
     skills: list[Skill] = list(hierarchy.skills)
     return Hierarchy(
         hierarchy.env,

@@ -32,7 +32,7 @@ class Flat(Agent):
     """F3: the run in which it has learnt another task."""
 
     def stages(self) -> list[Stage]:
-        """Its only stage."""
+        """Return its only stage."""
         spec, skill = self.spec, self.learns
         return [
             Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))

@@ -167,7 +167,7 @@ def _pickle_bytes(rng: random.Random, path: Path) -> tuple[str, str, bool]:
 
 
 def _hostile(rng: random.Random, path: Path) -> tuple[str, str, bool]:
-    """A pickle that is no checkpoint, or a checkpoint with something more in it."""
+    """Return a pickle that is no checkpoint, or a checkpoint with something more in it."""
     name, program = rng.choice(programs())
     entries = _entries(path)
     key = _pickle_name(entries)
@@ -215,7 +215,7 @@ def _builds() -> dict[str, bytes]:
 
 
 def _sizes() -> dict[str, bytes]:
-    """Sizes that are not there."""
+    """Return pickles with sizes that are not there."""
     eight = struct.pack("<Q", 2**62)
     return {
         "BINUNICODE8 of 4 EiB": b"\x8d" + eight + b"x",
@@ -239,7 +239,7 @@ def _sizes() -> dict[str, bytes]:
 
 
 def _shapes() -> dict[str, bytes]:
-    """Structures that are deep, endless, or grow when they are shown."""
+    """Return structures that are deep, endless, or grow when they are shown."""
     bomb = b"]" + b"".join(b"q" + bytes([i]) + b"]h" + bytes([i]) + b"ah" + bytes([i]) + b"a"
                            for i in range(60))  # fmt: skip
     return {
@@ -256,7 +256,7 @@ def _shapes() -> dict[str, bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """A value as a pickle's opcodes, without header, memo and end."""
+    """Return a value as a pickle's opcodes, without header, memo and end."""
     data = pickletools.optimize(pickle.dumps(value, 2))
     return data[2:-1]
 
@@ -270,7 +270,7 @@ def _text(text: str) -> bytes:
 
 
 def _zip(rng: random.Random, path: Path) -> tuple[str, str, bool]:
-    """Entries are missing, doubled, renamed, or far larger than they look."""
+    """Return zips with entries missing, doubled, renamed, or far larger than they look."""
     entries = _entries(path)
     name = rng.choice(sorted(entries))
     kind = rng.choice(

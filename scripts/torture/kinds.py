@@ -94,12 +94,12 @@ class Leaning(Skill):
     max_steps = 9
 
     def initiation(self, obs: Any) -> Any:
-        """Where it leans."""
+        """Return whether the pole leans."""
         return obs[:, 2] > 0.01
 
 
 def leans_left(obs: Any) -> Any:
-    """Where the pole is about to fall to the left."""
+    """Return where the pole is about to fall to the left."""
     return obs[:, 2] < -0.15
 
 
@@ -133,7 +133,7 @@ class Kind:
 
 
 def _before(run: Path) -> Path:
-    """Where the run is that another one starts from."""
+    """Return where the run is that another one starts from."""
     return run.with_name(f"{run.name}-before")
 
 
@@ -149,8 +149,8 @@ EVOLVES: dict[str, Any] = {
 }  # fmt: skip
 
 
-def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
-    """Two skills and a selector."""
+def hierarchy_of(steps: int, skill: Any, selector: Any) -> Hierarchy:
+    """Return two skills and a selector."""
     return Hierarchy(
         IN_PYTHON,
         [Left(), Balance()],
@@ -164,7 +164,7 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
 
 
 def alone(env: Any, algorithm: Any, steps: int) -> Agent:
-    """One agent."""
+    """Return one agent."""
     often = TrainDefaults(checkpoint_every=max(1, steps // 5))
     return Agent(env, algorithm, steps, train_defaults=often)
 
@@ -201,10 +201,10 @@ def together_replay(steps: int) -> Hierarchy:
 
 KINDS: dict[str, Kind] = {
     "skills and selector": Kind(
-        lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
+        lambda: hierarchy_of(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
     ),
     "skills and selector, replay": Kind(
-        lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
+        lambda: hierarchy_of(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
     ),
     "replay of continuous actions": Kind(
         lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)

@@ -29,7 +29,7 @@ ASKED = re.compile(
 
 @dataclass(frozen=True)
 class Change:
-    """What was done to which file."""
+    """A change of a file."""
 
     file: str
     kind: str
@@ -195,7 +195,7 @@ def _keys(holder: Any) -> Any:
 
 
 def dump(rng: random.Random, tree: Any) -> str:
-    """A tree as JSON, with what ``json.dumps`` would not write."""
+    """Return a tree as JSON, with what ``json.dumps`` would not write."""
     text = json.dumps(tree, indent=rng.choice((None, 2)))
     depth = rng.choice((100, 2_000, 100_000))
     text = text.replace(f'"{DEEP}"', "[" * depth + "]" * depth)
@@ -250,7 +250,7 @@ def _line(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]
 
 
 def _raw_header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """The outer header: dtypes, shapes, offsets; the checksum stays as it is."""
+    """Return the outer header: dtypes, shapes, offsets; the checksum stays as it is."""
     data = path.read_bytes()
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
@@ -262,7 +262,7 @@ def _raw_header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str,
 
 
 def _header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """Skillweave's own header, its checksum made right again where JSON can say it."""
+    """Change Skillweave's own header, and correct its checksum where JSON can hold it."""
     tensors, header = _parts(path)
     where, how = mutate_tree(rng, header)
     return where, how, _seal(rng, path, folder, tensors, header)

@@ -1,4 +1,4 @@
-"""What is mutated: small runs and files of every kind, each with what a user does with it."""
+"""Samples for mutation: small runs and files of every kind, each with its use."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from scripts.torture.kinds import (
     Kind,
     Tiny,
     alone,
+    hierarchy_of,
     together,
     together_replay,
-    woven,
 )
 from skillweave import (
     PPO,
@@ -58,7 +58,7 @@ Play = dict[str, Any]
 """What a policy does, so that two can be compared by ==."""
 ROWS = 32
 PLOTTED = 5
-"""Plotting takes a second, so of the cases that change a .jsonl file one in so many is plotted, and
+"""Plotting takes a second, so one in this number of cases that change a .jsonl file is plotted, and
 each in which the file is empty, or no file any more. 1: all are."""
 CART_SPACE = gym.make(CART).observation_space
 
@@ -79,13 +79,13 @@ class Sample:
 
 
 def play(run: Run) -> Play:
-    """A trained policy's actions, and an episode of its."""
+    """Return a trained policy's actions, and an episode of its."""
     score = run.evaluate(1)
     return plays(run.policy) | {"returns": score.returns, "lengths": score.lengths}
 
 
 def plays(policy: Policy) -> Play:
-    """A policy's actions on fixed observations, greedy and sampled."""
+    """Return a policy's actions on fixed observations, greedy and sampled."""
     known = Tiny.observation_space if isinstance(policy.observation_space, Dict) else CART_SPACE
     # Not the policy's own bounds: a file may say others, and it must act the same all the same.
     fits = policy.observation_space.shape == known.shape
@@ -104,7 +104,7 @@ def plays(policy: Policy) -> Play:
 
 
 def looked_at(run: Path, changed: str) -> None:
-    """The commands that only read."""
+    """Run the commands that only read."""
     with contextlib.redirect_stdout(io.StringIO()):
         execute.run(commands.Info(target=str(run)))
     found = RunDirectory.open(run)
@@ -186,7 +186,7 @@ class _Stop(Exception):
 
 
 def unfinished(kind: Kind, cuts: int) -> Callable[[Path], None]:
-    """Make a run that was stopped after so many checkpoints."""
+    """Make a run that was stopped after ``count`` checkpoints."""
 
     def make(folder: Path) -> None:
         saved, count = RunDirectory.save_checkpoint, 0
@@ -298,7 +298,7 @@ def agent(folder: Path) -> None:
 
 
 # Few steps to resume: there are many cases.
-SHORT = Kind(lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)))
+SHORT = Kind(lambda: hierarchy_of(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)))
 SHORT_REPLAY = Kind(
     lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 200)
 )
