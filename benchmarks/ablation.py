@@ -101,10 +101,14 @@ def main() -> None:
             policy = trained_skills(seed, "landing", **settings)["landing"]
             found.setdefault(name, []).append(alone(policy, seed))
         rows = [
-            [k, *(f"{m:.1f}" for m, _ in v), f"{median(m for m, _ in v):.1f}",
-             f"{median(s for _, s in v):.0%}"]
+            [
+                k,
+                *(f"{m:.1f}" for m, _ in v),
+                f"{median(m for m, _ in v):.1f}",
+                f"{median(s for _, s in v):.0%}",
+            ]
             for k, v in found.items()
-        ]  # fmt: skip
+        ]
         done = [f"seed {s}" for s in given.seeds[: len(rows[0]) - 3]]
         print(table(["variant", *done, "median", "solved"], rows), flush=True)
     report("ablation", {"seeds": given.seeds, "scores": found})

@@ -33,9 +33,13 @@ def train_bare(
     collectors = Collectors([scene.collector(config.num_envs, acting)])
     try:
         train(
-            learner, collectors, Episodes(), seeds, steps,
+            learner,
+            collectors,
+            Episodes(),
+            seeds,
+            steps,
             on_tick=lambda tick: on_tick(tick, stack),
-        )  # fmt: skip
+        )
     finally:
         collectors.close()
     return stack

@@ -71,9 +71,13 @@ class Sleeping(gym.Env[Array, Any]):
 
 def small(collectors: int, each: int = EACH, rows: int = ROWS) -> PPO:
     return PPO(
-        num_envs=each * collectors, n_steps=rows, batch_size=256, update_epochs=EPOCHS,
-        network=NETWORK, normalize_obs=False,
-    )  # fmt: skip
+        num_envs=each * collectors,
+        n_steps=rows,
+        batch_size=256,
+        update_epochs=EPOCHS,
+        network=NETWORK,
+        normalize_obs=False,
+    )
 
 
 def trained(env: Any, config: PPO, steps: int, workers: int, cluster: Ray | None) -> dict[str, Any]:
@@ -95,10 +99,12 @@ def scale(given: argparse.Namespace) -> dict[str, Any]:
                 speed = trained(Sleeping, small(count), steps, count, Ray(count))["speed"]
                 found[count] = max(found.get(count, 0.0), speed)
     share = {count: speed / (count * found[1]) for count, speed in found.items()}
-    print(table(
-        ("collectors", "steps/s", "of linear"),
-        [(n, f"{s:,.0f}", f"{share[n]:.2f}") for n, s in found.items()],
-    ))  # fmt: skip
+    print(
+        table(
+            ("collectors", "steps/s", "of linear"),
+            [(n, f"{s:,.0f}", f"{share[n]:.2f}") for n, s in found.items()],
+        )
+    )
     return {"steps_per_second": found, "of_linear": share}
 
 
@@ -300,10 +306,13 @@ def sweep(given: argparse.Namespace) -> dict[str, Any]:
         same = sum(result(out, seed) == result(whole, seed) for seed in range(seeds))
         values = [[run["return"] for run in found["runs"]] for found in (answer, undisturbed)]
     return {
-        "finished_when_killed": kills, "trained_again": again, "equal": same,
-        "runs_in_table": len(answer["runs"]), "failed": len(answer["failed"]),
+        "finished_when_killed": kills,
+        "trained_again": again,
+        "equal": same,
+        "runs_in_table": len(answer["runs"]),
+        "failed": len(answer["failed"]),
         "same_table": values[0] == values[1],
-    }  # fmt: skip
+    }
 
 
 def costs(given: argparse.Namespace) -> dict[str, Any]:
@@ -390,9 +399,14 @@ def saturation(given: argparse.Namespace) -> dict[str, Any]:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
-    "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
-    "population": population, "sweep": sweep,
-}  # fmt: skip
+    "scale": scale,
+    "overhead": overhead,
+    "equal": equal,
+    "costs": costs,
+    "saturation": saturation,
+    "population": population,
+    "sweep": sweep,
+}
 
 
 def main() -> None:

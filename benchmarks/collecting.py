@@ -68,9 +68,13 @@ def grid(render_mode: str | None = None) -> gym.Env[Any, Any]:
 
 def ours(workers: int, steps: int, cluster: Ray | None = None, env: Any = grid) -> float:
     config = PPO(
-        num_envs=ENVS, n_steps=ROWS, batch_size=BATCH, update_epochs=EPOCHS, network=NETWORK,
+        num_envs=ENVS,
+        n_steps=ROWS,
+        batch_size=BATCH,
+        update_epochs=EPOCHS,
+        network=NETWORK,
         normalize_obs=False,
-    )  # fmt: skip
+    )
     with tempfile.TemporaryDirectory() as folder:
         spec = EnvSpec(env, engine="sync", workers=workers)
         run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True, cluster=cluster)
@@ -86,9 +90,14 @@ def stable_baselines(steps: int) -> float:
     torch.set_num_threads(1)
     env = make_vec_env(grid, ENVS, vec_env_cls=SubprocVecEnv)
     model = Theirs(
-        "MlpPolicy", env, n_steps=ROWS, batch_size=BATCH, n_epochs=EPOCHS, device="cpu",
+        "MlpPolicy",
+        env,
+        n_steps=ROWS,
+        batch_size=BATCH,
+        n_epochs=EPOCHS,
+        device="cpu",
         policy_kwargs={"net_arch": [64, 64]},
-    )  # fmt: skip
+    )
     began = time.perf_counter()
     model.learn(steps)
     found = model.num_timesteps / (time.perf_counter() - began)
@@ -220,9 +229,11 @@ def main() -> None:
         "workers": (of_workers, 1, {f"two workers / {k}": ("two workers", k) for k in others}),
         "calls": (of_calls, 10, {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}),
         "together": (
-            of_together, 10, {f"{k} / selector alone": (k, f"selector, {k}") for k in TOGETHER}
+            of_together,
+            10,
+            {f"{k} / selector alone": (k, f"selector, {k}") for k in TOGETHER},
         ),
-    }  # fmt: skip
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -82,10 +82,16 @@ def learn(case: Case, seed: int, compile: bool) -> dict[str, Any]:
     score, chance = found.mean, at_random(case.env)
     share = (score - chance) / (case.reference - chance)
     return {
-        "algorithm": case.algorithm, "env": case.env, "steps": case.steps, "seed": seed,
-        "score": round(score, 1), "random": round(chance, 1), "reference": case.reference,
-        "share": round(share, 2), "seconds": round(seconds),
-    }  # fmt: skip
+        "algorithm": case.algorithm,
+        "env": case.env,
+        "steps": case.steps,
+        "seed": seed,
+        "score": round(score, 1),
+        "random": round(chance, 1),
+        "reference": case.reference,
+        "share": round(share, 2),
+        "seconds": round(seconds),
+    }
 
 
 def main() -> None:

@@ -118,9 +118,12 @@ def main() -> None:
         found = agreement(run, runner, given.episodes)
     here, there, ratio = (median(t[i] for t in times) for i in range(3))
     result = found | {
-        "export_s": exporting, "here_us": 1e6 * here, "runner_us": 1e6 * there, "ratio": ratio,
+        "export_s": exporting,
+        "here_us": 1e6 * here,
+        "runner_us": 1e6 * there,
+        "ratio": ratio,
         "runner_us_best": 1e6 * min(t[1] for t in times),
-    }  # fmt: skip
+    }
     row = ("episodes", "alike", "ties", "steps", "here_us", "runner_us", "ratio")
     print(table(row, [[f"{result[k]:.4g}" for k in row]]))
     report("export", result)

@@ -65,9 +65,13 @@ BLIND = EnvSpec("CartPole-v1", wrappers=(NoVelocities,))
 FREEWAY = EnvSpec(functools.partial(minatar, "freeway"))
 
 REPLAY: dict[str, Any] = {
-    "num_envs": 8, "learning_rate": 1e-3, "learning_rate_schedule": "linear", "gamma": 0.99,
-    "tau": 0.01, "compile": True,
-}  # fmt: skip
+    "num_envs": 8,
+    "learning_rate": 1e-3,
+    "learning_rate_schedule": "linear",
+    "gamma": 0.99,
+    "tau": 0.01,
+    "compile": True,
+}
 RECURRENT = PPO(
     gamma=0.99,
     gae_lambda=0.95,

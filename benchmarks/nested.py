@@ -74,12 +74,10 @@ def _half_done(path: Path) -> bool:
 def weights(run: RunDirectory) -> dict[str, dict[str, bytes]]:
     """Return all that every stage has learnt."""
     return {
-        f"{stage['name']}.{name}": {
-            k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()
-        }
+        f"{stage['name']}.{name}": {k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()}
         for stage in run.manifest["stages"]
         for name, policy in run.load_policies(stage["name"]).items()
-    }  # fmt: skip
+    }
 
 
 def one(case: str, steps: int, seed: int) -> dict[str, Any]:
@@ -99,9 +97,14 @@ def one(case: str, steps: int, seed: int) -> dict[str, Any]:
     solved = float(np.mean(np.array(found.returns) > 1))
     usage = found.to_json()["skill_usage"]
     return {
-        "seed": seed, "solved": solved, "length": float(np.mean(found.lengths)), "steps": spent,
-        "seconds": seconds, "usage": usage, "same": same,
-    }  # fmt: skip
+        "seed": seed,
+        "solved": solved,
+        "length": float(np.mean(found.lengths)),
+        "steps": spent,
+        "seconds": seconds,
+        "usage": usage,
+        "same": same,
+    }
 
 
 def main() -> None:

@@ -44,10 +44,16 @@ def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float
     kind: Any = {"dqn": DQN, "sac": SAC, "td3": TD3}[name]
     extra = {"double": False} if name == "dqn" else {}
     config = kind(
-        num_envs=ENVIRONMENTS, update_ratio=1.0, learning_starts=WARM_UP, batch_size=BATCH[name],
-        buffer_size=50_000, network=Network(SIZES[name][size], "relu"), threads=THREADS[size],
-        compile=compile, **extra,
-    )  # fmt: skip
+        num_envs=ENVIRONMENTS,
+        update_ratio=1.0,
+        learning_starts=WARM_UP,
+        batch_size=BATCH[name],
+        buffer_size=50_000,
+        network=Network(SIZES[name][size], "relu"),
+        threads=THREADS[size],
+        compile=compile,
+        **extra,
+    )
     # The same engine as theirs.
     ticks: list[Tick] = []
     spec = EnvSpec(ENVS[name], engine="sync")
@@ -69,9 +75,13 @@ def theirs(name: str, size: str, steps: int, seed: int) -> float:
             return True
 
     common: dict[str, Any] = {
-        "batch_size": BATCH[name], "buffer_size": 50_000, "learning_starts": WARM_UP,
-        "policy_kwargs": {"net_arch": list(SIZES[name][size])}, "device": "cpu", "seed": seed,
-    }  # fmt: skip
+        "batch_size": BATCH[name],
+        "buffer_size": 50_000,
+        "learning_starts": WARM_UP,
+        "policy_kwargs": {"net_arch": list(SIZES[name][size])},
+        "device": "cpu",
+        "seed": seed,
+    }
     env = make_vec_env(ENVS[name], n_envs=ENVIRONMENTS, seed=seed)
     kind: Any = {"dqn": sb3.DQN, "sac": sb3.SAC, "td3": sb3.TD3}[name]
     model = kind("MlpPolicy", env, train_freq=1, gradient_steps=-1, **common)

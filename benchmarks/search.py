@@ -39,9 +39,15 @@ PRIOR = {
     "clip_coef": Range(0.05, 0.5),
 }
 MUTATIONS = Mutations(
-    none=0.2, hyperparameters=0.6, parameters=0.0, architecture=0.2, activation=0.0,
-    ranges=PRIOR, units=(16, 256), layers=(1, 3),
-)  # fmt: skip
+    none=0.2,
+    hyperparameters=0.6,
+    parameters=0.0,
+    architecture=0.2,
+    activation=0.0,
+    ranges=PRIOR,
+    units=(16, 256),
+    layers=(1, 3),
+)
 # A generation is short, and while no member can land, the best one is so by chance. By truncation
 # that member replaces the worst one only; by tournaments all others may be replaced at once.
 EVOLVED = Evolution(
@@ -70,9 +76,14 @@ def search(way: str, seed: int) -> dict[str, Any]:
     config, steps, evolve = WAYS[way]
     with tempfile.TemporaryDirectory() as folder:
         run = train_agent(
-            "LunarLander-v3", config, steps, Path(folder) / "run", seed=seed, quiet=True,
+            "LunarLander-v3",
+            config,
+            steps,
+            Path(folder) / "run",
+            seed=seed,
+            quiet=True,
             evolve=evolve,
-        )  # fmt: skip
+        )
         score = run.evaluate(100)
         (stage,) = run.info()["stages"]
     return {

@@ -27,9 +27,17 @@ def stable_baselines3(steps: int, seed: int) -> float:
 
     env = make_vec_env("LunarLander-v3", n_envs=16, seed=seed)
     model = sb3.PPO(
-        "MlpPolicy", env, n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4,
-        ent_coef=0.01, device="cpu", seed=seed,
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        n_steps=1024,
+        batch_size=64,
+        gae_lambda=0.98,
+        gamma=0.999,
+        n_epochs=4,
+        ent_coef=0.01,
+        device="cpu",
+        seed=seed,
+    )
     threads = torch.get_num_threads()
     started = time.perf_counter()
     model.learn(steps)

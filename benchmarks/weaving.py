@@ -72,10 +72,15 @@ def main() -> None:
     for source in asked.runs:
         found.append(trained_selector(source, asked.mission, asked.seed, asked.steps))
         rows = [
-            (r["run"], f"{r['steps']:,}", f"{r['seconds']:.1f}", f"{r['ratio']:.2f}",
-             f"{r['complete']:.0%}")
+            (
+                r["run"],
+                f"{r['steps']:,}",
+                f"{r['seconds']:.1f}",
+                f"{r['ratio']:.2f}",
+                f"{r['complete']:.0%}",
+            )
             for r in found
-        ]  # fmt: skip
+        ]
         header = ("skills of", "steps", "s", "÷ flat PPO's steps a second", "complete")
         print(table(header, rows), flush=True)
     ratios = [r["ratio"] for r in found]

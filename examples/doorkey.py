@@ -97,9 +97,15 @@ class Goal(sw.Skill):
 def algorithm(kind: type[sw.PPO] = sw.PPO, **how: Any) -> sw.PPO:
     """Return the learner's settings; ``encoder="cells"``: a cell's numbers are kinds of things."""
     return kind(
-        num_envs=16, n_steps=128, update_epochs=4, gamma=0.99, gae_lambda=0.95,
-        learning_rate_schedule="constant", network=sw.Network(hidden=(64,), encoder="cells"), **how,
-    )  # fmt: skip
+        num_envs=16,
+        n_steps=128,
+        update_epochs=4,
+        gamma=0.99,
+        gae_lambda=0.95,
+        learning_rate_schedule="constant",
+        network=sw.Network(hidden=(64,), encoder="cells"),
+        **how,
+    )
 
 
 def declare(

@@ -115,9 +115,13 @@ class A2CAlgorithm(Algorithm):
         with torch.no_grad():
             following = self.value(state, next_obs).unflatten(1, lead)
             advantage = gae(
-                rollout.reward, rollout.discount, value, following, rollout.last,
+                rollout.reward,
+                rollout.discount,
+                value,
+                following,
+                rollout.last,
                 torch.full_like(state.gamma, self.config.gae_lambda),
-            )  # fmt: skip
+            )
             returns = advantage + value
         mask = None if rollout.mask is None else rollout.mask.flatten(1, 2)
         head = self.actor(leaves, inputs)

@@ -147,9 +147,15 @@ def main() -> None:
     options = make_options_env(hierarchy, 8, GAMMA)
     env = SB3VecEnv(options, args.seed)
     model = PPO(
-        "MlpPolicy", env, n_steps=32, batch_size=64, learning_rate=1e-3,
-        gamma=GAMMA**CALL_STEPS, seed=args.seed, device="cpu",
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        n_steps=32,
+        batch_size=64,
+        learning_rate=1e-3,
+        gamma=GAMMA**CALL_STEPS,
+        seed=args.seed,
+        device="cpu",
+    )
     for skill in hierarchy.skills:
         assert skill.policy is not None
         alone = evaluate(skill.policy, "CartPole-v1", episodes=args.episodes)

@@ -243,19 +243,33 @@ class Bench:
     # What all share
 
     def _score(
-        self, run: Run, task: Task, agent: str, budget: int, started: float,
-        keep: bool = False, stages: tuple[str, ...] = (), greedy: bool | None = None,
-    ) -> Result:  # fmt: skip
+        self,
+        run: Run,
+        task: Task,
+        agent: str,
+        budget: int,
+        started: float,
+        keep: bool = False,
+        stages: tuple[str, ...] = (),
+        greedy: bool | None = None,
+    ) -> Result:
         greedy = self.suite.greedy if greedy is None else greedy
         found = run.evaluate(self.suite.episodes, deterministic=greedy)
         usage = found.to_json()["skill_usage"]
         return self._save(run, task, agent, budget, started, found.returns, usage, keep, stages)
 
     def _save(
-        self, run: Run, task: Task, agent: str, budget: int, started: float,
-        returns: Sequence[float], usage: dict[str, float], keep: bool = False,
+        self,
+        run: Run,
+        task: Task,
+        agent: str,
+        budget: int,
+        started: float,
+        returns: Sequence[float],
+        usage: dict[str, float],
+        keep: bool = False,
         stages: tuple[str, ...] = (),
-    ) -> Result:  # fmt: skip
+    ) -> Result:
         scores = [float(r) / self.suite.unit for r in returns]
         curve = curve_of(run.path, self.suite.unit, stages) if stages else []
         spent = sum(int(s["steps"]) for s in run.info()["stages"])
@@ -265,9 +279,19 @@ class Bench:
         begun = self.results.begun_by(run.path)
         code = CODE if begun == CODE and not self._on_older else ""
         result = Result(
-            self.suite.name, task.name, agent, self.seed, score, spent, budget, seconds,
-            [*curve, (spent, score)], scores, usage, code,
-        )  # fmt: skip
+            self.suite.name,
+            task.name,
+            agent,
+            self.seed,
+            score,
+            spent,
+            budget,
+            seconds,
+            [*curve, (spent, score)],
+            scores,
+            usage,
+            code,
+        )
         self.results.save(result)
         if not keep:
             shutil.rmtree(run.path, ignore_errors=True)

@@ -69,8 +69,11 @@ class _FlatLearner(OneAgent):
         """Make the environments and the agent."""
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
-            skill_scene(self._flat.spec), self.stage.seeds,
-            manifest["eval_every"], manifest["eval_episodes"], self.stage.config.num_envs,
-        )  # fmt: skip
+            skill_scene(self._flat.spec),
+            self.stage.seeds,
+            manifest["eval_every"],
+            manifest["eval_episodes"],
+            self.stage.config.num_envs,
+        )
         self._open.callback(self.evaluation.close)
         return fresh

@@ -31,9 +31,11 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 
 NAMES = (
-    "skills and selector", "replay of continuous actions", "population, replay",
+    "skills and selector",
+    "replay of continuous actions",
+    "population, replay",
     "start from another run",
-)  # fmt: skip
+)
 """Together they write every file that a training writes."""
 FAULTS = ("no space, once", "no space from here on", "an error, once", "death")
 SENTENCE = 3

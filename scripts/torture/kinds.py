@@ -140,13 +140,19 @@ def _before(run: Path) -> Path:
 NET = Network((6,))
 LEARNS: dict[str, Any] = {"num_envs": 4, "n_steps": 16, "batch_size": 32, "update_epochs": 2}
 REPLAYS: dict[str, Any] = {
-    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 200, "update_ratio": 0.25,
+    "num_envs": 4,
+    "batch_size": 8,
+    "learning_starts": 40,
+    "buffer_size": 200,
+    "update_ratio": 0.25,
     "network": Network((6,), "relu"),
-}  # fmt: skip
+}
 EVOLVES: dict[str, Any] = {
-    "population": 3, "generations": 3, "episodes": 2,
+    "population": 3,
+    "generations": 3,
+    "episodes": 2,
     "mutations": Mutations(units=(4, 16), layers=(1, 2)),
-}  # fmt: skip
+}
 
 
 def hierarchy_of(steps: int, skill: Any, selector: Any) -> Hierarchy:
@@ -244,9 +250,7 @@ KINDS: dict[str, Kind] = {
             IN_PYTHON,
             [Leaning(), Balance()],
             call_steps=4,
-            algorithm=PPO(
-                **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
-            ),
+            algorithm=PPO(**LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))),
             selector=DQN(**REPLAYS),
             learn="apart",
             apart=Apart(skill_steps=300, selector_steps=300),
@@ -262,5 +266,5 @@ KINDS: dict[str, Kind] = {
         lambda: alone(IN_PYTHON, DQN(**REPLAYS), 300),
         evolve=Evolution(**EVOLVES),
     ),
-}  # fmt: skip
+}
 """Every kind of stage and engine that could lose something."""

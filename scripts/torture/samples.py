@@ -91,10 +91,14 @@ def plays(policy: Policy) -> Play:
     fits = policy.observation_space.shape == known.shape
     space = known if fits else policy.observation_space
     space.seed(0)
-    obs = pack(space, gym.vector.utils.concatenate(
-        space, [space.sample() for _ in range(ROWS)],
-        gym.vector.utils.create_empty_array(space, ROWS),
-    ))  # fmt: skip
+    obs = pack(
+        space,
+        gym.vector.utils.concatenate(
+            space,
+            [space.sample() for _ in range(ROWS)],
+            gym.vector.utils.create_empty_array(space, ROWS),
+        ),
+    )
     return {
         f"deterministic {greedy}": policy.act(
             policy.start(ROWS), obs, deterministic=greedy, rng=np.random.default_rng(0)
@@ -241,16 +245,31 @@ def agilerl(folder: Path) -> None:
 
     def described(outputs: int, end: str | None) -> dict[str, Any]:
         return {
-            "num_inputs": 4, "num_outputs": outputs, "hidden_size": [6], "mlp_activation": "Tanh",
-            "mlp_output_activation": end, "layer_norm": False, "device": torch.device("cpu"),
-        }  # fmt: skip
+            "num_inputs": 4,
+            "num_outputs": outputs,
+            "hidden_size": [6],
+            "mlp_activation": "Tanh",
+            "mlp_output_activation": end,
+            "layer_norm": False,
+            "device": torch.device("cpu"),
+        }
 
     checkpoint = {
-        "algo": "PPO", "gamma": 0.97, "lr": 3e-4, "batch_size": 32, "one_hot": False, "index": 2,
-        "scores": [np.float64(1.5)], "fitness": [np.float32(2.0)], "steps": [0, np.int64(9)],
-        "actor_init_dict": described(2, "Softmax"), "critic_init_dict": described(1, None),
-        "actor_state_dict": network(2), "critic_state_dict": network(1), "array": np.arange(3.0),
-    }  # fmt: skip
+        "algo": "PPO",
+        "gamma": 0.97,
+        "lr": 3e-4,
+        "batch_size": 32,
+        "one_hot": False,
+        "index": 2,
+        "scores": [np.float64(1.5)],
+        "fitness": [np.float32(2.0)],
+        "steps": [0, np.int64(9)],
+        "actor_init_dict": described(2, "Softmax"),
+        "critic_init_dict": described(1, None),
+        "actor_state_dict": network(2),
+        "critic_state_dict": network(1),
+        "array": np.arange(3.0),
+    }
     torch.save(checkpoint, folder / "old.pt")
 
 
@@ -318,12 +337,11 @@ SAMPLES: dict[str, Sample] = {
     "population": Sample(whole("population"), from_data),
     "unfinished": Sample(unfinished(SHORT, 5), resumed(SHORT), share=0.4),
     "unfinished population": Sample(
-        unfinished(KINDS["population, replay"], 2), resumed(KINDS["population, replay"]),
+        unfinished(KINDS["population, replay"], 2),
+        resumed(KINDS["population, replay"]),
         share=0.1,
     ),
-    "unfinished replay": Sample(
-        unfinished(SHORT_REPLAY, 3), resumed(SHORT_REPLAY), share=0.2
-    ),
+    "unfinished replay": Sample(unfinished(SHORT_REPLAY, 3), resumed(SHORT_REPLAY), share=0.2),
     "unfinished together": Sample(
         unfinished(SHORT_TOGETHER, 2), resumed(SHORT_TOGETHER), share=0.2
     ),
@@ -333,12 +351,8 @@ SAMPLES: dict[str, Sample] = {
     "unfinished start from another run": Sample(
         unfinished(SHORT_START, 1), resumed(SHORT_START), share=0.2
     ),
-    "weights": Sample(
-        weights("skills and selector"), weights_file(KINDS["skills and selector"])
-    ),
-    "flat weights": Sample(
-        weights("replay of continuous actions"), flat_weights
-    ),
+    "weights": Sample(weights("skills and selector"), weights_file(KINDS["skills and selector"])),
+    "flat weights": Sample(weights("replay of continuous actions"), flat_weights),
     "AgileRL": Sample(agilerl, converted),
     "ONNX": Sample(onnx_run, onnx_skill, share=0.3),
-}  # fmt: skip
+}

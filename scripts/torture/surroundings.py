@@ -140,8 +140,9 @@ def drawn(rng: random.Random, env: Any = Walk, workers: int | None = 2) -> Any:
         skills = [type(f"Home{i}", (Home,), {"name": f"home{i}"})() for i in range(12)]
     agents = {"algorithm": PPO(**ON), "selector": PPO(**ON)}
     if kind == "apart":
-        return Hierarchy(spec, skills, learn="apart", apart=Apart(skill_steps=300), **agents,
-                         steps=900), how  # fmt: skip
+        return Hierarchy(
+            spec, skills, learn="apart", apart=Apart(skill_steps=300), **agents, steps=900
+        ), how
     return Hierarchy(spec, skills, steps=600, **agents), how
 
 
@@ -186,8 +187,10 @@ def trainings_in_threads(rng: random.Random, run: Path) -> None:
         except BaseException as error:
             failed.append(error)
 
-    jobs = [threading.Thread(target=job, args=(rng.randrange(100 * i, 100 * i + 100),))
-            for i in range(3)]  # fmt: skip
+    jobs = [
+        threading.Thread(target=job, args=(rng.randrange(100 * i, 100 * i + 100),))
+        for i in range(3)
+    ]
     for one in jobs:
         one.start()
     for one in jobs:

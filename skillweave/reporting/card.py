@@ -90,11 +90,16 @@ def _use(run: RunDirectory, name: str) -> str:
             "",
         ]
     lines += [
-        "```python", "import skillweave as sw", "", f'run = sw.from_hub("{name}"{given})',
-        "print(run.evaluate(episodes=10))", "```", "",
+        "```python",
+        "import skillweave as sw",
+        "",
+        f'run = sw.from_hub("{name}"{given})',
+        "print(run.evaluate(episodes=10))",
+        "```",
+        "",
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
-    ]  # fmt: skip
+    ]
     if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
         names = ", ".join(text(s["name"]) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
@@ -114,8 +119,15 @@ def _measured(saved: SavedEvaluation | None) -> str:
     whole = str(score).partition("; skills:")[0]
     lines = ["## Measured", "", f"Return {text(whole)} ({how}, seed {saved.seed})."]
     if score.skills:
-        head = ("skill", "of all steps", "calls", "steps of a call", *(f"ends {w}" for w in
-                WHY.values()), "success", "own return of a call")  # fmt: skip
+        head = (
+            "skill",
+            "of all steps",
+            "calls",
+            "steps of a call",
+            *(f"ends {w}" for w in WHY.values()),
+            "success",
+            "own return of a call",
+        )
         lines += ["", "What each skill did:", "", _row(head), _row(["---"] * len(head))]
         for row in skill_rows(score.skills):
             cells = [row["name"], percent(row["share"]), row["calls"], row["length"], *row["ends"]]

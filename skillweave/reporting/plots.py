@@ -88,16 +88,28 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
             at = born.generation, born.fitness
             what = ", ".join(_change(k, *v) for k, v in born.changes.items()) or "weights"
             axes.annotate(
-                what, at, textcoords="offset points", xytext=(4, -6), rotation=-38, fontsize=7,
-                color=TEXT, va="top",
-            )  # fmt: skip
+                what,
+                at,
+                textcoords="offset points",
+                xytext=(4, -6),
+                rotation=-38,
+                fontsize=7,
+                color=TEXT,
+                va="top",
+            )
     winner = path[-1]
     axes.plot(winner.generation, winner.fitness, "*", color=color, markersize=16, zorder=4)
     label = f"member {winner.member}: {winner.fitness:.1f}"
     axes.annotate(
-        label, (winner.generation, winner.fitness), textcoords="offset points", xytext=(-6, 9),
-        ha="right", fontsize=9, color=color, weight="bold",
-    )  # fmt: skip
+        label,
+        (winner.generation, winner.fitness),
+        textcoords="offset points",
+        xytext=(-6, 9),
+        ha="right",
+        fontsize=9,
+        color=color,
+        weight="bold",
+    )
     fitness = sorted(b.fitness for b in lineage.born.values() if b.fitness is not None)
     # One hopeless member must not squeeze all others into a line.
     low = min(fitness[len(fitness) // 20], *(b.fitness for b in path if b.fitness is not None))

@@ -119,10 +119,14 @@ class _Film:
         self._total += float(played.reward[0])
         if played.over[0]:
             self._show("final return", HOLD)
-            self.episodes.append({
-                "return": self._total, "length": self._elapsed, "cut": bool(played.cut[0]),
-                "skills": dict(self._skills),
-            })  # fmt: skip
+            self.episodes.append(
+                {
+                    "return": self._total,
+                    "length": self._elapsed,
+                    "cut": bool(played.cut[0]),
+                    "skills": dict(self._skills),
+                }
+            )
             self._begin()
 
     def _show(self, word: str, seconds: float | None = None) -> None:

@@ -21,14 +21,31 @@ class PPO(Agent):
     action_std_init = Setting("action_std_init")
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, discrete_actions: bool,
-        index: int = 0, net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4,
-        gamma: float = 0.99, gae_lambda: float = 0.95, mut: str | None = None,
-        action_std_init: float = 0.6, clip_coef: float = 0.2, ent_coef: float = 0.01,
-        vf_coef: float = 0.5, max_grad_norm: float = 0.5, target_kl: float | None = None,
-        update_epochs: int = 4, actor_network: Any = None, critic_network: Any = None,
-        device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        discrete_actions: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        mut: str | None = None,
+        action_std_init: float = 0.6,
+        clip_coef: float = 0.2,
+        ent_coef: float = 0.01,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        target_kl: float | None = None,
+        update_epochs: int = 4,
+        actor_network: Any = None,
+        critic_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
         own = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
@@ -60,11 +77,24 @@ class DQN(Agent):
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
-        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 1e-3, mut: str | None = None, double: bool = False,
-        actor_network: Any = None, device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 1e-3,
+        mut: str | None = None,
+        double: bool = False,
+        actor_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         self._start(locals(), gym.spaces.Discrete(action_dim), loss="mse")
 
     def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
@@ -85,13 +115,29 @@ class RainbowDQN(Agent):
     v_min, v_max = Setting("v_min"), Setting("v_max")
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
-        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 1e-3, beta: float = 0.4, prior_eps: float = 1e-6,
-        num_atoms: int = 51, v_min: float = -10, v_max: float = 10, n_step: int = 3,
-        mut: str | None = None, actor_network: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 1e-3,
+        beta: float = 0.4,
+        prior_eps: float = 1e-6,
+        num_atoms: int = 51,
+        v_min: float = -10,
+        v_max: float = 10,
+        n_step: int = 3,
+        mut: str | None = None,
+        actor_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         self._start(locals(), gym.spaces.Discrete(action_dim), config.DQN.rainbow)
         self.beta, self.prior_eps = beta, prior_eps
 
@@ -124,13 +170,29 @@ class TD3(Agent):
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
-        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
-        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 0.005, mut: str | None = None, policy_freq: int = 2,
-        actor_network: Any = None, critic_networks: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        max_action: float = 1,
+        min_action: float = -1,
+        expl_noise: float = 0.1,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr_actor: float = 1e-4,
+        lr_critic: float = 1e-3,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        mut: str | None = None,
+        policy_freq: int = 2,
+        actor_network: Any = None,
+        critic_networks: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         # In place of what the Setting says of lr_actor alone: a share needs both rates.
         own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin, "n_step": 1, "action_l2": 0.0}
         own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
@@ -157,12 +219,28 @@ class DDPG(TD3):
     algo, twin = "DDPG", False
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
-        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
-        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 0.001, mut: str | None = None, policy_freq: int = 2,
-        actor_network: Any = None, critic_network: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        max_action: float = 1,
+        min_action: float = -1,
+        expl_noise: float = 0.1,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr_actor: float = 1e-4,
+        lr_critic: float = 1e-3,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 0.001,
+        mut: str | None = None,
+        policy_freq: int = 2,
+        actor_network: Any = None,
+        critic_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         given = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(**{k.replace("c_network", "c_networks"): v for k, v in given.items()})

@@ -63,11 +63,16 @@ def _episode(
     totals = [rounded(total) for total in sums]
     calls = [
         [
-            c.skill, c.start, c.steps, c.why, rounded(c.reward),
-            None if c.own is None else rounded(c.own), c.succeeded,
+            c.skill,
+            c.start,
+            c.steps,
+            c.why,
+            rounded(c.reward),
+            None if c.own is None else rounded(c.own),
+            c.succeeded,
         ]
         for c in episode.calls[:MOST_CALLS_OF_ONE]
-    ]  # fmt: skip
+    ]
     entry: dict[str, Any] = {
         "number": number + 1,
         "seed": episode.seed,

@@ -44,14 +44,25 @@ def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
 
 def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]:
     """Return layers that show the nearest point under the pointer, with a box of its values."""
-    near = {"name": "near", "select": {"type": "point", "on": "pointerover", "nearest": True,
-            "encodings": ["x"], "clear": "pointerout"}}  # fmt: skip
+    near = {
+        "name": "near",
+        "select": {
+            "type": "point",
+            "on": "pointerover",
+            "nearest": True,
+            "encodings": ["x"],
+            "clear": "pointerout",
+        },
+    }
     opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
     mark = {"type": "point", "filled": True, "size": 60, "aria": False}
     return [
-        {"params": [near], "mark": mark,
-         "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)}}
-    ]  # fmt: skip
+        {
+            "params": [near],
+            "mark": mark,
+            "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)},
+        }
+    ]
 
 
 def curve(label: str, color: str) -> Spec:
@@ -74,12 +85,16 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
     legend = {"orient": "top", "title": None, "symbolOpacity": 1}
     encoding = {
-        "x": number_axis("x", "", axis={"tickCount": 8}), "y": number_axis("y", ""),
+        "x": number_axis("x", "", axis={"tickCount": 8}),
+        "y": number_axis("y", ""),
         "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
         "shape": {"field": "what", "type": "nominal", "scale": shape},
-        "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ",.4~r"},
-                    {"field": "y", "format": ",.4~r"}],
-    }  # fmt: skip
+        "tooltip": [
+            {"field": "what", "title": "chosen"},
+            {"field": "x", "format": ",.4~r"},
+            {"field": "y", "format": ",.4~r"},
+        ],
+    }
     mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
     return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
@@ -119,12 +134,17 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     thick = {"condition": {"test": "datum.won", "value": 2.5}, "value": 1}
     big = {"condition": {"test": "datum.won", "value": 70}, "value": 25}
     layer: list[Spec] = [
-        {"data": {"values": lines}, "mark": {"type": "rule", "aria": False},
-         "encoding": joined | {"strokeWidth": thick}},
-        {"data": {"values": dots},
-         "mark": {"type": "circle", "opacity": 1, "aria": False},
-         "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip}},
-    ]  # fmt: skip
+        {
+            "data": {"values": lines},
+            "mark": {"type": "rule", "aria": False},
+            "encoding": joined | {"strokeWidth": thick},
+        },
+        {
+            "data": {"values": dots},
+            "mark": {"type": "circle", "opacity": 1, "aria": False},
+            "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip},
+        },
+    ]
     return chart("Fitness by generation, and the line of the winner", 320, layer=layer)
 
 

@@ -13,9 +13,20 @@ from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
-    "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
-    "succeeded", "compared", "greedy_judged", "stopped", "best", "continued",
-}  # fmt: skip
+    "steps",
+    "seconds",
+    "steps_per_second",
+    "evaluation_steps",
+    "reached",
+    "kept",
+    "workers",
+    "succeeded",
+    "compared",
+    "greedy_judged",
+    "stopped",
+    "best",
+    "continued",
+}
 """Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
 
 
@@ -74,15 +85,21 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
             notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
         done = entry["status"] == "done"
         far = f"{steps.get(entry['name'], 0):,} of {entry['budget']:,}"
-        rows.append({
-            "name": entry["name"], "kind": entry["kind"],
-            "algorithm": entry["algorithm"].get("algorithm", "?"), "status": entry["status"],
-            "steps": f"{entry['steps']:,}" if done else far,
-            "seconds": f"{entry['seconds']:,.1f}" if done else "–",
-            "speed": f"{entry['steps_per_second']:,.0f}" if "steps_per_second" in entry else "–",
-            "return": number(final),
-            "notes": "; ".join(notes),
-        })  # fmt: skip
+        rows.append(
+            {
+                "name": entry["name"],
+                "kind": entry["kind"],
+                "algorithm": entry["algorithm"].get("algorithm", "?"),
+                "status": entry["status"],
+                "steps": f"{entry['steps']:,}" if done else far,
+                "seconds": f"{entry['seconds']:,.1f}" if done else "–",
+                "speed": f"{entry['steps_per_second']:,.0f}"
+                if "steps_per_second" in entry
+                else "–",
+                "return": number(final),
+                "notes": "; ".join(notes),
+            }
+        )
     return rows
 
 

@@ -23,8 +23,13 @@ def scores(
         binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
     """
     what, form = ("episodes solved", ".0%") if binary else ("mean return", ",.4~r")
-    y = {"field": "group", "type": "nominal", "title": None, "sort": list(names),
-         "axis": {"labelFontSize": 14, "labelFontWeight": "bold"}}  # fmt: skip
+    y = {
+        "field": "group",
+        "type": "nominal",
+        "title": None,
+        "sort": list(names),
+        "axis": {"labelFontSize": 14, "labelFontWeight": "bold"},
+    }
     color = _color("group", names, colors)
     axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
     x = number_axis("x", f"{what} of a run", axis=axis)
@@ -41,17 +46,23 @@ def scores(
     ]
     between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
     layer: list[Spec] = [
-        {"data": {"values": rows["bars"]},
-         "transform": [{"filter": "isValid(datum.low)"}],
-         "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
-         "encoding": {**between, "y": y, "color": color, "tooltip": tooltip}},
-        {"data": {"values": rows["dots"]},
-         "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
-         "encoding": {"x": x, "y": y, "color": color, "tooltip": run}},
-        {"data": {"values": rows["bars"]},
-         "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
-         "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip}},
-    ]  # fmt: skip
+        {
+            "data": {"values": rows["bars"]},
+            "transform": [{"filter": "isValid(datum.low)"}],
+            "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
+            "encoding": {**between, "y": y, "color": color, "tooltip": tooltip},
+        },
+        {
+            "data": {"values": rows["dots"]},
+            "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
+            "encoding": {"x": x, "y": y, "color": color, "tooltip": run},
+        },
+        {
+            "data": {"values": rows["bars"]},
+            "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
+            "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip},
+        },
+    ]
     if not any("low" in bar for bar in rows["bars"]):
         del layer[0]  # an axis over nothing is warned of
     return chart("Scores by group", 50 + 40 * len(names), layer=layer)

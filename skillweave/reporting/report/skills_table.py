@@ -27,16 +27,18 @@ def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
     for name, report in reports.items():
         calls = report.calls
         known = bool(report.ended and calls)
-        rows.append({
-            "name": name,
-            "share": report.steps / total if total else 0.0,
-            "percent": percent(report.steps / total if total else 0.0),
-            "calls": f"{calls:,}",
-            "length": number(report.length_mean, longest),
-            "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
-            "success": percent(report.success_rate),
-            "return": number(report.return_mean),
-        })  # fmt: skip
+        rows.append(
+            {
+                "name": name,
+                "share": report.steps / total if total else 0.0,
+                "percent": percent(report.steps / total if total else 0.0),
+                "calls": f"{calls:,}",
+                "length": number(report.length_mean, longest),
+                "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
+                "success": percent(report.success_rate),
+                "return": number(report.return_mean),
+            }
+        )
     return rows
 
 

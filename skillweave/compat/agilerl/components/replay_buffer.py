@@ -14,9 +14,16 @@ class MultiStepReplayBuffer:
     """Transitions whose rewards are summed over ``n_step`` steps, sampled evenly."""
 
     def __init__(
-        self, action_dim: int, memory_size: int, field_names: list[str], num_envs: int,
-        n_step: int = 3, gamma: float = 0.99, device: Any = None, **how: Any,
-    ) -> None:  # fmt: skip
+        self,
+        action_dim: int,
+        memory_size: int,
+        field_names: list[str],
+        num_envs: int,
+        n_step: int = 3,
+        gamma: float = 0.99,
+        device: Any = None,
+        **how: Any,
+    ) -> None:
         self.memory_size, self.counter = memory_size, 0
         self.native = TransitionBuffer(memory_size, random_seed(), gamma, n_step=n_step, **how)
 
@@ -58,9 +65,16 @@ class PrioritizedReplayBuffer(MultiStepReplayBuffer):
     """Transitions sampled by the size of their last error."""
 
     def __init__(
-        self, action_dim: int, memory_size: int, field_names: list[str], num_envs: int,
-        alpha: float = 0.6, n_step: int = 1, gamma: float = 0.99, device: Any = None,
-    ) -> None:  # fmt: skip
+        self,
+        action_dim: int,
+        memory_size: int,
+        field_names: list[str],
+        num_envs: int,
+        alpha: float = 0.6,
+        n_step: int = 1,
+        gamma: float = 0.99,
+        device: Any = None,
+    ) -> None:
         how: dict[str, Any] = {"prioritized": True, "alpha": alpha}
         super().__init__(action_dim, memory_size, field_names, num_envs, n_step, gamma, **how)
 

@@ -8,15 +8,37 @@ from skillweave.compat.agilerl.training.epochs import Epochs, Result
 
 
 def train_off_policy(
-    env: Any, env_name: str, algo: str, pop: list[Any], memory: Any, INIT_HP: Any = None,
-    MUT_P: Any = None, swap_channels: bool = False, n_episodes: int = 2000, max_steps: int = 500,
-    evo_epochs: int = 5, evo_loop: int = 1, eps_start: float = 1.0, eps_end: float = 0.1,
-    eps_decay: float = 0.995, target: float | None = 200.0, n_step: bool = False, per: bool = False,
-    noisy: bool = False, n_step_memory: Any = None, tournament: Any = None, mutation: Any = None,
-    checkpoint: int | None = None, checkpoint_path: str | None = None, save_elite: bool = False,
-    elite_path: str | None = None, wb: bool = False, verbose: bool = True, accelerator: Any = None,
+    env: Any,
+    env_name: str,
+    algo: str,
+    pop: list[Any],
+    memory: Any,
+    INIT_HP: Any = None,
+    MUT_P: Any = None,
+    swap_channels: bool = False,
+    n_episodes: int = 2000,
+    max_steps: int = 500,
+    evo_epochs: int = 5,
+    evo_loop: int = 1,
+    eps_start: float = 1.0,
+    eps_end: float = 0.1,
+    eps_decay: float = 0.995,
+    target: float | None = 200.0,
+    n_step: bool = False,
+    per: bool = False,
+    noisy: bool = False,
+    n_step_memory: Any = None,
+    tournament: Any = None,
+    mutation: Any = None,
+    checkpoint: int | None = None,
+    checkpoint_path: str | None = None,
+    save_elite: bool = False,
+    elite_path: str | None = None,
+    wb: bool = False,
+    verbose: bool = True,
+    accelerator: Any = None,
     wandb_api_key: str | None = None,
-) -> Result:  # fmt: skip
+) -> Result:
     """Train agents that share one buffer; returns agents and their fitnesses by evaluation."""
     epochs = Epochs(**locals())
     if mutation is not None:

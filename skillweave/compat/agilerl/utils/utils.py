@@ -28,10 +28,18 @@ def _vector(spec: EnvSpec, num_envs: int) -> SyncVectorEnv:
 
 
 def initialPopulation(
-    algo: str, state_dim: Any, action_dim: int, one_hot: bool, net_config: dict[str, Any],
-    INIT_HP: dict[str, Any], actor_network: Any = None, critic_network: Any = None,
-    population_size: int = 1, device: Any = "cpu", accelerator: Any = None,
-) -> list[Any]:  # fmt: skip
+    algo: str,
+    state_dim: Any,
+    action_dim: int,
+    one_hot: bool,
+    net_config: dict[str, Any],
+    INIT_HP: dict[str, Any],
+    actor_network: Any = None,
+    critic_network: Any = None,
+    population_size: int = 1,
+    device: Any = "cpu",
+    accelerator: Any = None,
+) -> list[Any]:
     """Make agents of one kind; settings by their names in capitals from ``INIT_HP``.
 
     Raises:
