@@ -23,7 +23,6 @@ from skillweave.api.adoption import (
     spec_of,
 )
 from skillweave.api.hub import push_run
-from skillweave.api.labels import labels_of
 from skillweave.api.notebook_tables import (
     agent_html,
     agent_line,
@@ -44,15 +43,15 @@ from skillweave.evolution.plan import Evolve
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import below, copied
+from skillweave.hierarchy.nesting import below, copied, every_skill
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.hierarchy.weights import open_weights, read_agent, read_weights, write_weights
 from skillweave.messages import as_path, shown_path, whole_number
-from skillweave.reporting.film import Film
+from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
-from skillweave.reporting.video import render_policy
+from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
@@ -64,8 +63,8 @@ from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
-from skillweave.training.plain_agent import PlainAgent
-from skillweave.types import Policy
+from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.types import Memory, Policy
 
 
 class Agent(PlainAgent):
@@ -533,7 +532,7 @@ class Run:
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
-            label=labels_of(policy, skills, skill),
+            label=_labels_of(policy, skills, skill),
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
             quiet=quiet,
@@ -760,6 +759,31 @@ def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
     """Return what training or loading made as a ``Run``."""
     declared, run, policy = trained
     return Run(declaration_of(declared, run), run.path, policy)
+
+
+def _labels_of(
+    policy: Policy, skills: Sequence[Skill], alone: str | None
+) -> Callable[[Memory], tuple[str, RGB]]:
+    """Return a function from a policy's memory to the acting skill's name and colour.
+
+    Args:
+        skills: of the hierarchy that acts; none: a plain agent.
+        alone: the skill that acts alone.
+    """
+    colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(every_skill(skills))}
+
+    def label(memory: Memory) -> tuple[str, RGB]:
+        if not skills:
+            return AGENT, color_of(len(colors), None)
+        acting = policy.policy if isinstance(policy, SkillAlone) else policy
+        below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
+        name = "/".join(filter(None, (alone, below)))
+        known = name
+        while known not in colors:  # a run that is a ready skill has skills of its own
+            known = known.rpartition("/")[0]
+        return name, colors[known]
+
+    return label
 
 
 @checked_names

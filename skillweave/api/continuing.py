@@ -1,4 +1,4 @@
-"""``train(..., resume=True)``: continue what is in a directory, perhaps for more steps."""
+"""Continue the run in a directory, perhaps for more steps: apart, as a new run needs none of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skillweave demo``: two tasks, one where a flat agent is enough and one where skills pay.
+"""``skillweave demo``, a script apart: a task for a flat agent, and one where skills pay.
 
 The flat agents with all steps would take five minutes. ``python -m benchmarks.demo_flat`` trains
 them and writes their scores to ``demo_flat.json``, which is quoted here.

@@ -1,4 +1,4 @@
-"""``--evolve`` settings: ``population=8``, ``selector.mutations.units=16,64``."""
+"""``--evolve`` settings as ``population=8``: a parser of its own, apart from training."""
 
 from __future__ import annotations
 

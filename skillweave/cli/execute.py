@@ -1,20 +1,23 @@
-"""Carries out each command of the command line."""
+"""Carry out each command of the command line: apart from parsing, as it imports torch."""
 
 from __future__ import annotations
 
 import ast
+import importlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.cli import commands, share
+from skillweave.api.hub import pull_run, push_run
+from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.overrides import list_settings
-from skillweave.cli.run_lines import run_lines
 from skillweave.cli.sweep import sweep
-from skillweave.cli.targets import load_run, target
-from skillweave.cli.telling import save_score, tell
+from skillweave.cli.targets import free, load_run, target
+from skillweave.cli.telling import run_words, save_score, tell
 from skillweave.cli.training import resume, train
+from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.reporting.curves_figure import plot_curves
@@ -22,9 +25,11 @@ from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import check_name, hub
+from skillweave.runs.kept import best_words, kept_words
 from skillweave.runs.several import open_runs
 from skillweave.terminal import one_line
-from skillweave.training.evaluation_file import load_evaluation
+from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
 def run(command: commands.Command) -> int:
@@ -57,9 +62,9 @@ def run(command: commands.Command) -> int:
         case commands.Export():
             _export(command)
         case commands.Push():
-            tell(command, *share.push(command))
+            tell(command, *_push(command))
         case commands.Pull():
-            tell(command, *share.pull(command))
+            tell(command, *_pull(command))
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -239,3 +244,78 @@ def _run_line(path: Path) -> dict[str, Any]:
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+
+
+def run_lines(
+    m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
+) -> list[str]:
+    """Return a run's manifest and its saved evaluations, as lines."""
+    env, created = one_line(m["env"]), one_line(m["created"])
+    lines = [f"{m['kind']} on {env}, seed {m['seed']}, made {created}"]
+    calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
+    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
+    calls += f", guide: {m['guide']['kind']}" if "guide" in m else ""
+    lines += [f"  recipe: {one_line(m.get('recipe') or '(declared in Python)')}{calls}"]
+    lines += [
+        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
+    ]
+    for p in m["stages"]:
+        final = p.get("final", {}).get("return")
+        lines.append(
+            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
+            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
+            f"{'' if final is None else f'{final:.1f}':>8}"
+        )
+        for name, start in p.get("starts", {}).items():
+            run = "" if start["run"] is None else f" {start['run']}"
+            lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
+        if continued := p.get("continued"):
+            lines.append(f"    continued after {', '.join(f'{k:,}' for k in continued)} steps")
+        if reached := p.get("reached"):
+            lines.append(
+                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
+                f"{p['target']['of']} {reached['value']:g}"
+            )
+        if stopped := p.get("stopped"):
+            lines.append(
+                f"    a callback ended it after {stopped['steps']:,} of {p['budget']:,} steps"
+            )
+        if best := p.get("best"):
+            lines.append(f"    {best_words(best)}")
+        if winner := p.get("winner"):
+            lines.append(
+                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
+                f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
+            )
+        if kept := p.get("kept"):
+            lines.append(f"    {kept_words(kept)}")
+    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in m["versions"].items())]
+    for score in saved:
+        if score is not None:
+            how = "greedy" if score.deterministic else "sampled"
+            lines.append(f"  evaluated {one_line(score.made)}, seed {score.seed}, {how}:")
+            lines += [f"    {line}" for line in score.evaluation.for_people().splitlines()]
+    return lines
+
+
+def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
+    """Put a run on the hub; return the result as JSON and for people."""
+    _no_bars()
+    pushed = push_run(command.run, command.name, command.private)
+    lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
+    lines.append(f"load it: skillweave.from_hub({command.name!r})")
+    return pushed, "\n".join(lines)
+
+
+def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
+    """Copy a run from the hub; return its new place as JSON and for people."""
+    _no_bars()
+    name = check_name(command.name).partition("/")[2]
+    path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
+    return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
+
+
+def _no_bars() -> None:
+    """Keep the hub's library from drawing a bar for each file."""
+    hub()  # a missing extra is reported
+    importlib.import_module("huggingface_hub.utils").disable_progress_bars()

@@ -1,4 +1,4 @@
-"""Train a recipe and the flat agent that it is compared with; finish a stopped run."""
+"""Commands that train: a recipe, its flat agent, and the end of a stopped run."""
 
 from __future__ import annotations
 

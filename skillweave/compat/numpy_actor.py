@@ -1,22 +1,68 @@
-"""Networks that act on few observations at a time, where torch's overhead is most of the cost.
+"""Networks that act on few observations at a time: apart, as they replace torch's by NumPy's.
 
 MLPs are copied into NumPy. Every other network acts in torch, by the same interface.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams, Algorithm
-from skillweave.compat.numpy_mlp import NumpyMLP
+from skillweave.networks.config import Network
 from skillweave.networks.net import Net
+from skillweave.networks.stacked import Views
 from skillweave.spaces import to_tensor
 from skillweave.types import Array
 
 Sampled = tuple[Array, Array, Array, Array]
+
+
+_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": lambda x: np.tanh(x, out=x),
+    "relu": lambda x: np.maximum(x, 0.0, out=x),
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "silu": lambda x: x / (1.0 + np.exp(-x)),
+}
+
+
+class NumpyMLP:
+    """An MLP made of copies of the layers whose names begin with ``prefix``; views of P = 1."""
+
+    def __init__(self, views: Views, prefix: str, network: Network) -> None:
+        def copy(name: str) -> Array | None:
+            weights: Tensor | None = views.get(f"{prefix}.{name}")
+            return None if weights is None else weights[0].detach().numpy().copy()
+
+        kinds = ("weight", "bias", "norm_weight", "norm_bias")
+        layers = ([copy(f"{i}.{kind}") for kind in kinds] for i in itertools.count())
+        self._layers = list(itertools.takewhile(lambda layer: layer[0] is not None, layers))
+        self._activation = _ACTIVATIONS[network.activation]
+
+    @staticmethod
+    def fits(network: Network) -> bool:
+        """Return whether this class has the network's activation."""
+        return network.activation in _ACTIVATIONS
+
+    def __call__(self, x: Array) -> Array:
+        """Map (B, in) float32 to (B, out)."""
+        for weight, bias, norm_weight, norm_bias in self._layers[:-1]:
+            x = x @ weight
+            x += bias
+            if norm_weight is not None:
+                x = x - x.mean(-1, keepdims=True)
+                x = x / np.sqrt(np.square(x).mean(-1, keepdims=True) + 1e-5)
+                x = x * norm_weight + norm_bias
+            x = self._activation(x)
+        weight, bias, *_ = self._layers[-1]
+        found: Array = x @ weight
+        found += bias
+        return found
 
 
 class NumpyActor:

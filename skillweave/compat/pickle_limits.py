@@ -1,4 +1,4 @@
-"""Limits of a checkpoint of ``torch.save``, checked before any of it is read."""
+"""Limits of a checkpoint of ``torch.save``: apart, as they are checked before it is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read checkpoints of ``torch.save`` without running code from them.
+"""Read checkpoints of ``torch.save`` without running code from them: apart from their meaning.
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that

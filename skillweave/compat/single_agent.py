@@ -1,4 +1,4 @@
-"""One agent for a training loop that the user writes: it acts, learns and can be saved."""
+"""One agent for a user's training loop, part of the public API: it acts, learns and is saved."""
 
 from __future__ import annotations
 

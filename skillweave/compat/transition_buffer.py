@@ -1,4 +1,4 @@
-"""A replay buffer for a training loop that the user writes."""
+"""A replay buffer for a user's training loop, part of the public API."""
 
 from __future__ import annotations
 

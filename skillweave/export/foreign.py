@@ -1,4 +1,4 @@
-"""Networks that were made elsewhere, as graphs like those of trained agents."""
+"""Graphs of foreign networks, like those of trained agents: apart, as they are no agents."""
 
 from __future__ import annotations
 

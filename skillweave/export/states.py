@@ -1,4 +1,4 @@
-"""A policy as data: its networks as files, and its state machine as JSON for the runner."""
+"""A policy as data, apart from its folder: networks as files, and a state machine as JSON."""
 
 from __future__ import annotations
 

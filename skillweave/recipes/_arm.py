@@ -1,4 +1,4 @@
-"""The robot's arm of the recipe ``pick-and-place``: its task, and its disturbances."""
+"""The robot's arm of ``pick-and-place``, apart from its skills: its task and disturbances."""
 
 from __future__ import annotations
 

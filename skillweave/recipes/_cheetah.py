@@ -1,4 +1,4 @@
-"""The half-cheetah of the recipe ``shuttle``: its task, alone and in EnvPool."""
+"""The half-cheetah of ``shuttle``, apart from its skills: its task, alone and in EnvPool."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scripted policy that explores MiniGrid's rooms until it sees something to do."""
+"""A scripted policy, apart from learnt skills: it explores rooms until it sees a task."""
 
 from __future__ import annotations
 

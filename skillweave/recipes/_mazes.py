@@ -1,4 +1,4 @@
-"""The mazes of the recipe ``mazes``: PointMaze, alone and in EnvPool, seen as six numbers."""
+"""The mazes of the recipe ``mazes``, apart from its skills: PointMaze, alone and in EnvPool."""
 
 from __future__ import annotations
 

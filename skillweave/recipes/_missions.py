@@ -1,4 +1,4 @@
-"""The lander of the recipe ``lander-missions``: missions of up to three legs, and gusts.
+"""The lander of ``lander-missions``, apart from its skills: up to three legs, and gusts.
 
 What a mission is stands in one place, ``Progress``, for one environment (``Mission``) as for many
 side by side in EnvPool (``MissionPool``).

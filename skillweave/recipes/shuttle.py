@@ -111,8 +111,8 @@ RUNNER = PPO(
     ent_coef=0.0,
     network=replace(RELU, sees=tuple(range(LEG.start))),
 )
-"""The learner of a skill. It does not see the leg, so that it serves patrols with other legs: with the
-leg, ``backward`` would learn only those legs in which the source task runs backwards."""
+"""The learner of a skill. It does not see the leg, so that it serves patrols with other legs: with
+the leg, ``backward`` would learn only those legs in which the source task runs backwards."""
 SELECTOR = PPO(
     min_advantage_std=0.0,  # the figures were measured with it
     num_envs=64,

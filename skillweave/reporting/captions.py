@@ -1,4 +1,4 @@
-"""Captions: a band under a frame that says who acts."""
+"""Captions, apart from videos: a band under a frame with the acting skill."""
 
 from __future__ import annotations
 

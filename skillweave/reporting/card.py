@@ -1,4 +1,4 @@
-"""The page of a run on the hub: a model card, written from what the run's files say."""
+"""The page of a run on the hub, a text apart from its upload: a model card of the run's files."""
 
 from __future__ import annotations
 

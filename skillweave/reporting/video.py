@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -15,16 +16,18 @@ from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
 from skillweave.messages import error_text, whole_number
+from skillweave.notebooks import Markup, joined, paragraph
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds, global_generators
+from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy
 
-__all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
+__all__ = ["PALETTE", "Film", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
 HOLD = 1.0  # seconds that the last frame of an episode stands
@@ -147,3 +150,32 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
         raise EnvError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
     factor = -(-frame.shape[1] // MAX_WIDTH)
     return frame if factor == 1 else np.asarray(extra("PIL.Image").fromarray(frame).reduce(factor))
+
+
+LARGEST = 50_000_000
+"""Bytes of a film that a notebook shows: it keeps a copy inside."""
+
+
+class Film(dict[str, Any]):
+    """A film's ``path``, ``frames`` and ``episodes``. A notebook shows the film."""
+
+    def __repr__(self) -> str:
+        returns = ", ".join(f"{episode['return']:.1f}" for episode in self["episodes"])
+        return printable(f"<Film {self['path']}: {self['frames']:,} frames, return {returns}>")
+
+    def _repr_html_(self) -> str:
+        """Return the film as a part of the page."""
+        path, caption = Path(self["path"]), paragraph(repr(self).strip("<>"))
+        try:
+            data = path.read_bytes() if path.stat().st_size <= LARGEST else None
+        except OSError as error:
+            return joined([caption, paragraph(f"The film cannot be read: {error.strerror}.")])
+        if data is None:
+            return joined([caption, paragraph("It is too large to be shown here.")])
+        text = base64.b64encode(data).decode()
+        if path.suffix.lower() == ".gif":
+            shown = f'<img src="data:image/gif;base64,{text}" style="max-width: 100%">'
+        else:
+            source = f"data:video/mp4;base64,{text}"
+            shown = f'<video src="{source}" controls loop muted style="max-width: 100%"></video>'
+        return joined([Markup(shown), caption])

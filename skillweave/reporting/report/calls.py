@@ -1,4 +1,4 @@
-"""The calls of a report's episodes as plain data: timelines, transitions, choices."""
+"""The calls of a report's episodes as plain data, apart from words: timelines, choices."""
 
 from __future__ import annotations
 

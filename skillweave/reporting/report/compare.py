@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.reporting.palette import color_of
-from skillweave.reporting.report import charts, facts, group_charts
+from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.groups import Group, differences, grouped
 from skillweave.reporting.report.numbers import NOTHING, number, percent, scale_of
@@ -55,7 +55,7 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     if any(scores):
         rows = _score_rows(groups, saved, scores)
         binary = say is percent
-        data["charts"] = {"scores-chart": group_charts.scores(keys, colors, rows, binary)}
+        data["charts"] = {"scores-chart": charts.scores(keys, colors, rows, binary)}
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
@@ -248,7 +248,7 @@ def _curves(
             for metric in dict.fromkeys(k for c in curves for k in c.points):
                 points_of = [c.points[metric] for c in curves if metric in c.points]
                 points.setdefault(metric, []).extend(_line(group.key, points_of))
-        spec = group_charts.group_curves(label, keys, colors)
+        spec = charts.group_curves(label, keys, colors)
         charts_.append({"label": label, "spec": spec, "points": points})
     return charts_
 
