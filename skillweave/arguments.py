@@ -1,7 +1,7 @@
 """Errors for wrong arguments and attributes: they name the one that was probably meant.
 
-``@checked_names`` stands above public functions and classes. Where an argument is misspelt, missing
-or one too many, it raises a ``DeclarationError`` that says what to write, in place of Python's
+``@checked_names`` decorates public functions and classes. Where an argument is misspelt, missing
+or one too many, it raises a ``DeclarationError`` with the right spelling, in place of Python's
 TypeError; and it refuses to set an attribute that does not exist.
 """
 
@@ -72,7 +72,7 @@ STARTS_BY = (
 def checked_names(target: T) -> T:
     """Let a function, or a class, raise a DeclarationError where its arguments are wrong.
 
-    Of a dataclass, attributes are checked as well: those of a frozen one cannot be set, those of
+    Of a dataclass, attributes are checked as well: a frozen one's cannot be set, those of
     another only if they exist.
 
     Args:
@@ -180,7 +180,7 @@ def meant(name: str, places: Sequence[_Place | str], otherwise: str, least: floa
     known = [_Place(p, "", "") if isinstance(p, str) else p for p in places]
     wanted = name.lower().replace("-", "_")
     for spelling in (wanted, ELSEWHERE.get(wanted, "")):
-        # Names that stand right here come first.
+        # Names of this place come first.
         exact = [p for p in known if p.name == spelling]
         if exact and (exact[0].where or exact[0].name != name):
             return _where(exact[0], exact=spelling == name)
@@ -237,7 +237,7 @@ def _groups(owner: Any, example: str) -> Iterator[_Place]:
 
 
 def _group(owner: Any, field: Any) -> Any:
-    """Return the dataclass whose instance a field holds; None: it holds something else."""
+    """Return the dataclass of a field's instance; None: it holds something else."""
     if isinstance(made := field.default_factory, type) and is_dataclass(made):
         return made
     if made is not MISSING and is_dataclass(value := made()):

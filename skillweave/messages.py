@@ -1,4 +1,4 @@
-"""Parts of sentences for people: values, errors and numbers as messages tell them."""
+"""Parts of sentences for people: values, errors and numbers in messages."""
 
 from __future__ import annotations
 

@@ -249,7 +249,7 @@ class Hierarchy(Declaration):
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
             eval_every: environment steps between evaluations while training, by the learner's own
-                reward; None: as ``train_defaults`` says, by default none.
+                reward; None: that of ``train_defaults``, by default none.
             eval_episodes: episodes of each of these evaluations; None: 20.
             checkpoint_every: environment steps between checkpoints; None: 100,000.
             quiet: no progress.
@@ -273,7 +273,7 @@ class Hierarchy(Declaration):
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
                 the mean return or by what its target is of; the last weights are evaluated, too.
                 It needs ``eval_every``. A population ends with its best member in any case. None:
-                as ``train_defaults`` says, by default "last".
+                that of ``train_defaults``, by default "last".
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
                 last step counts (in a skill's own stage: of its call). None, NaN and infinity are
@@ -338,9 +338,9 @@ class Hierarchy(Declaration):
         """
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        own = apply_manifest(self, run)
+        declared = apply_manifest(self, run)
         note = describe_differences(self, run, self.recipe)
-        return run_of(go_on(own, run, quiet, evolve, cluster, note, callback))
+        return run_of(go_on(declared, run, quiet, evolve, cluster, note, callback))
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
@@ -598,7 +598,7 @@ class Run:
             The folder, its files, and what is code.
 
         Raises:
-            PolicyError: a part cannot be exported; the message says which, and what to do.
+            PolicyError: a part cannot be exported; the message names it, and what to do.
         """
         path = as_path(path, "path")
         must_be_own(path)
@@ -816,20 +816,20 @@ def train_agent(
         algorithm: its settings, ``SAC()`` for example.
         steps: training budget in environment steps.
         target_return: stop early at this mean return of the periodic evaluation.
-        target_success: stop early at this share of episodes whose ``info["success"]`` is true.
+        target_success: stop early at this share of episodes with a true ``info["success"]``.
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
         checkpoint_every: environment steps between checkpoints.
         run_dir: a new directory; None: the next number of ``runs/<environment>-<n>``.
         resume: continue the run in ``run_dir`` if it has learnt something, for more ``steps`` if
-            they have grown, else begin; see ``Hierarchy.train``.
+            they have grown, else start; see ``Hierarchy.train``.
         seed: the root of every random stream.
         quiet: no progress.
         track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
-        start_from: another plain agent's run, or its directory: it begins with that policy; see
+        start_from: another plain agent's run, or its directory: it starts with that policy; see
             ``Hierarchy.train``.
         callback: is called with a ``TrainEvent`` for each report and each checkpoint; returning
             False ends the training; see ``Hierarchy.train``.
@@ -840,7 +840,7 @@ def train_agent(
         The finished run.
 
     Raises:
-        DeclarationError: the algorithm cannot act in the environment; the message says which can.
+        DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
     agent = Agent(
         env,

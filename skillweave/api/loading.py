@@ -119,7 +119,7 @@ def declared_by(
 
     Args:
         recipe: a shipped recipe, or a file that is trusted; None: the one that the run names.
-        needs: the field of the manifest that says if code is needed.
+        needs: the field of the manifest that is true where code is needed.
         ask: a sentence for the error: how to give the code.
 
     Raises:

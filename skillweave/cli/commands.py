@@ -31,7 +31,7 @@ class OnRay(Output):
     """A command that can run on Ray."""
 
     ray: str | None = None
-    """Use Ray: --ray alone on this machine (or where RAY_ADDRESS says), or --ray HOST:PORT, or
+    """Use Ray: --ray alone on this machine (or at RAY_ADDRESS), or --ray HOST:PORT, or
     --ray auto for the cluster that this machine is a part of."""
 
 
@@ -44,14 +44,14 @@ class Train(OnRay):
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
     resume: bool = False
-    """Continue the run in --out if it has learnt something, else begin. Steps that have grown
+    """Continue the run in --out if it has learnt something, else start one. Steps that have grown
     (--set steps=N, --scale) train a finished run for longer."""
     seed: int = 0
     """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
-    """Afterwards train the baseline too, on the same number of steps, and say which is better."""
+    """Afterwards train the baseline too, on the same number of steps, and print which is better."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     start_from: UseAppendAction[tuple[str, ...]] = ()

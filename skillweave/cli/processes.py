@@ -110,7 +110,7 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
         problem = reworded(error, str(error))
     except KeyboardInterrupt:
         os._exit(128 + signal.SIGTERM)  # its run has saved; the parent has the reason
-    except Exception:  # any, as it comes from what a user wrote; not all errors can be sent
+    except Exception:  # any error of a user's code; not all of them can be sent
         problem = RuntimeError(traceback.format_exc())
     try:
         sender.send((result, problem))

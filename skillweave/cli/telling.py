@@ -17,7 +17,7 @@ from skillweave.training.evaluation_file import save_evaluation
 
 
 def tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
-    """Print JSON where it is asked for, else the text."""
+    """Print JSON if ``--json`` is given, else the text."""
     put(as_json(data) if command.json else text)
 
 

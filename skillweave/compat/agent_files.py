@@ -1,4 +1,4 @@
-"""One agent as a file: a policy, and all that learning needs to go on."""
+"""One agent as a file: a policy, and all that further learning needs."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def convert(path: Path, out: Path) -> str:
 
     Raises:
         RunError: the file is missing, names what is refused, is no checkpoint of
-            AgileRL's, or holds what no native policy computes; the message says what.
+            AgileRL's, or holds what no native policy computes; the message names it.
     """
     data = read_torch_pickle(path)
     algo: Any = data.get("algo") if isinstance(data, dict) else None
@@ -115,8 +115,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     kind, actor = _KINDS[algo], data["actor_init_dict"]
     critics = [data[k] for k in ("critic_state_dict", "critic_1_state_dict") if k in data]
     critics += [data[k] for k in ("critic_2_state_dict",) if k in data]
-    own = {f.name for f in fields(kind)}
-    known = {k: v for k, v in data.items() if k in own and type(v) in (int, float, bool)}
+    names = {f.name for f in fields(kind)}
+    known = {k: v for k, v in data.items() if k in names and type(v) in (int, float, bool)}
     rate = data.get("lr", data.get("lr_critic", 1e-3))
     config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _mlp(actor)}
     if kind is PPO:

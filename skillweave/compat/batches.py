@@ -46,7 +46,7 @@ def rollout_of(
 ) -> Rollout:
     """Return T steps of N environments as a rollout; each argument has T entries (N, ...).
 
-    The successor of a step is the next entry of ``obs``; ``next_obs`` is that of the last step.
+    The successor of a step is the next entry of ``obs``; ``next_obs`` belongs to the last step.
     Actions are in policy units, and count as drawn with the log-probabilities given.
     """
     rewards = _tensor(reward, np.float32)

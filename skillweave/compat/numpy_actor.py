@@ -60,9 +60,9 @@ class NumpyMLP:
                 x = x * norm_weight + norm_bias
             x = self._activation(x)
         weight, bias, *_ = self._layers[-1]
-        found: Array = x @ weight
-        found += bias
-        return found
+        output: Array = x @ weight
+        output += bias
+        return output
 
 
 class NumpyActor:

@@ -31,9 +31,11 @@ def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
             f"refused: it declares {total:,} bytes in a file of {size:,}; what torch.save writes "
             "is not compressed"
         )
-    own = file.getinfo(program).file_size
-    if own > LARGEST_PROGRAM:
-        raise RunError(f"its pickle declares {own:,} bytes; at most {LARGEST_PROGRAM:,} are read")
+    size_of_program = file.getinfo(program).file_size
+    if size_of_program > LARGEST_PROGRAM:
+        raise RunError(
+            f"its pickle declares {size_of_program:,} bytes; at most {LARGEST_PROGRAM:,} are read"
+        )
 
 
 def check_program(program: bytes) -> None:

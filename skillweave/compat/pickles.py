@@ -2,7 +2,7 @@
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
-is known to do nothing else; everything else stops the reading.
+has no other effect; everything else stops the reading.
 """
 
 from __future__ import annotations
@@ -125,11 +125,11 @@ class _Plain:
             inner = [part for item in data.items() for part in item]
         elif isinstance(data, list | tuple | set | frozenset):
             inner = list(data)
-        found = [self(part, depth + 1) for part in inner]
-        size = 1 + sum(n for _, n in found)
+        parts = [self(part, depth + 1) for part in inner]
+        size = 1 + sum(n for _, n in parts)
         if size > MOST_STEPS:
             raise RunError(f"its pickle holds more than {MOST_STEPS:,} objects")
-        self._results[id(data)] = _rebuilt(data, [value for value, _ in found]), size
+        self._results[id(data)] = _rebuilt(data, [value for value, _ in parts]), size
         return self._results[id(data)]
 
 
@@ -157,13 +157,13 @@ class _Reader(pickle.Unpickler):
         module = module.replace("numpy._core", "numpy.core")
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
-        found = _ALLOWED.get((module, name))
-        if found is None:
+        allowed = _ALLOWED.get((module, name))
+        if allowed is None:
             raise RunError(
                 f"refused: the pickle names {module[:60]}.{name[:60]}, which is neither a tensor, "
                 "a number, an array, a device nor a plain container"
             )
-        return self._inert if found is Inert else _Maker(found)
+        return self._inert if allowed is Inert else _Maker(allowed)
 
     def persistent_load(self, pid: Any) -> _Held:
         kind, dtype, key, _, size = pid
@@ -173,10 +173,10 @@ class _Reader(pickle.Unpickler):
             data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
             empty = torch.empty(0, dtype=dtype, device="cpu")
             self._storages[key, dtype] = torch.frombuffer(data, dtype=dtype) if data else empty
-        found = self._storages[key, dtype]
-        if len(found) != size:
+        storage = self._storages[key, dtype]
+        if len(storage) != size:
             raise RunError(f"is damaged: storage {shown(key)} does not hold {shown(size)}")
-        return _Held(found)
+        return _Held(storage)
 
 
 def _tensor(storage: _Held, offset: int, size: Any, stride: Any, *_: Any) -> _Held:
@@ -218,9 +218,9 @@ class _Array(np.ndarray[Any, Any]):
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
     if not isinstance(make, _Maker) or make._function is not _Array:  # dill writes arrays so
         raise RunError(f"refused: the pickle makes an array by {shown(make)}")
-    found = _Array(*arguments)
-    found.__setstate__(state)
-    return found
+    array = _Array(*arguments)
+    array.__setstate__(state)
+    return array
 
 
 def _encode(text: str, encoding: str) -> bytes:
@@ -229,7 +229,7 @@ def _encode(text: str, encoding: str) -> bytes:
 
 def _load_type(name: str) -> type:
     kinds: dict[str, type] = {k.__name__: k for k in (set, frozenset, dict, list, tuple)}
-    if name not in kinds:  # dill's function knows all types, that of code too
+    if name not in kinds:  # dill's function has all types, that of code too
         raise RunError(f"refused: the pickle names the type {shown(name)}")
     return kinds[name]
 

@@ -24,7 +24,7 @@ class SingleAgent:
     """A member of P = 1 with its spaces and its own random streams.
 
     Args:
-        member: if its ``state`` is None, it begins with fresh weights.
+        member: if its ``state`` is None, it starts with fresh weights.
         spaces: the observation space and the action space.
         seed: the root of its random streams.
     """
@@ -85,7 +85,7 @@ class SingleAgent:
                 action = learner.random_actions([self.generator], len(rows), allowed)
             else:
                 actor = learner.acting_params(self.member.state)
-                if "epsilon" in actor.extra:  # said here at each call instead
+                if "epsilon" in actor.extra:  # the warning comes here, at each call, instead
                     actor.extra["epsilon"].zero_()
                 noise = learner.noise([self.generator], 1, len(rows))[0] if explore else None
                 obs = torch.from_numpy(rows)[None]

@@ -34,7 +34,7 @@ def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None
 def stay_offline() -> None:
     """Without a login, set wandb to offline, so that it does not ask for one.
 
-    A line on stderr says so, once, when wandb is imported.
+    A line on stderr reports it, once, when wandb is imported.
     """
     if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
         os.environ["WANDB_MODE"] = "offline"

@@ -157,7 +157,7 @@ class States:
                 return self._network(agent_graph(selector, sampled, name), name)
         raise PolicyError(
             f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
-            "does not know: select by an Automaton, by a function, or train the selector"
+            "cannot run: select by an Automaton, by a function, or train the selector"
         )
 
     def _automaton(self, selector: Automaton, name: str) -> dict[str, Any]:

@@ -114,8 +114,8 @@ def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
 
 
 def _action_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
+    entry: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
     if not isinstance(space, gym.spaces.Box):
-        return found | {"low": None, "high": None}
+        return entry | {"low": None, "high": None}
     bounds = {"low": space.low, "high": space.high}  # infinities are no JSON
-    return found | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}
+    return entry | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}

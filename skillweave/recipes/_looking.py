@@ -11,7 +11,7 @@ from skillweave.recipes._rooms import ACTIONS, FORWARD, LEFT, RIGHT, SPACE, ahea
 
 Memory = dict[str, Array]
 TURNS = 4
-"""It sees all four sides and goes on as it came; with one turn less it would walk in squares."""
+"""It sees all four sides and keeps its direction; with one turn less it would walk in squares."""
 PACES = 5
 """Steps after which it looks around again."""
 ENTERING = 3

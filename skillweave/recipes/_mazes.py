@@ -20,7 +20,7 @@ MAZES = {
 }
 """Mazes by name, and what Gymnasium-Robotics and EnvPool call them."""
 PLACE, SPEED, GOAL = slice(0, 2), slice(2, 4), slice(4, 6)
-"""Where these stand in an observation: metres east and north, metres a second, metres."""
+"""Places in an observation: metres east and north, metres a second, metres."""
 REACH, BALL = 0.45, 0.1
 """Metres from the goal at which it is reached; the ball's radius."""
 PIXELS = 32
@@ -28,11 +28,11 @@ PIXELS = 32
 WALL, FLOOR, GREEN, ORANGE = (60, 66, 80), (235, 235, 230), (120, 190, 130), (230, 110, 40)
 SPACE = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ENDS: Any = {"continuing_task": False}
-"""The episode ends at the goal; else PointMaze goes on until its time is up."""
+"""The episode ends at the goal; else PointMaze continues until its time is up."""
 
 
 def flat(obs: Any) -> Array:
-    """Place, speed and goal, (..., 6) float32, of what PointMaze tells."""
+    """Place, speed and goal, (..., 6) float32, of PointMaze's observation."""
     return np.concatenate([obs["observation"], obs["desired_goal"]], axis=-1, dtype=np.float32)
 
 
@@ -136,7 +136,7 @@ NEAR = 0.9
 
 
 class ShortestPath:
-    """The selector of one who knows the maze: the skill that leads to the next cell.
+    """A selector with a map of the maze: it calls the skill that leads to the next cell.
 
     Args:
         maze: its name.

@@ -1,6 +1,6 @@
 """The lander of ``lander-missions``, apart from its skills: up to three legs, and gusts.
 
-What a mission is stands in one place, ``Progress``, for one environment (``Mission``) as for many
+A mission is defined in one place, ``Progress``, for one environment (``Mission``) as for many
 side by side in EnvPool (``MissionPool``).
 """
 

@@ -46,7 +46,7 @@ FAR = 14
 """More than to any of them."""
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
 HIGHEST = np.broadcast_to(np.array([10, 5, 2], np.uint8), (7, 7, 3))
-"""Kind, colour and state of a cell are never higher. MiniGrid's own space says 255."""
+"""Kind, colour and state of a cell are never higher. MiniGrid's own space has 255."""
 SPACE, ACTIONS = gym.spaces.Box(0, HIGHEST, dtype=np.uint8), gym.spaces.Discrete(7)
 
 
@@ -125,7 +125,7 @@ def between_walls(obs: Array) -> Array:
 
 
 class Rooms(gym.Env[Any, Any]):
-    """One agent that begins each episode in one of several rooms, drawn evenly.
+    """One agent that starts each episode in one of several rooms, drawn evenly.
 
     Args:
         rooms: MiniGrid's names, without ``MiniGrid-`` and ``-v0``.
@@ -172,7 +172,7 @@ class Rooms(gym.Env[Any, Any]):
 
 
 class RoomPool:
-    """Many agents, in EnvPool's rooms; each begins every episode in one that is drawn evenly.
+    """Many agents, in EnvPool's rooms; each starts every episode in one that is drawn evenly.
 
     Args:
         rooms: MiniGrid's names, without ``MiniGrid-`` and ``-v0``.

@@ -276,7 +276,7 @@ def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
 
 
 def going_on(rooms: str, **how: Any) -> Hierarchy:
-    """Return the hierarchy in these rooms, where skills and selector go on learning, together.
+    """Return the hierarchy in these rooms, where skills and selector continue to learn, together.
 
     To be trained from the run in the small rooms: ``train(..., start_from=run)``.
     """

@@ -1,8 +1,8 @@
-"""Lander missions: visit points, hover, land, in the order that a mission says.
+"""Lander missions: visit points, hover, land, in a mission's order.
 
 LunarLander-v3 with a mission of up to three legs: visit a box on the left, one on the right, hover
 in a box for two seconds, land on the pad. A leg pays its share of 1 when it is done, and nothing
-else pays. Four skills are learnt once, each by a reward of its own that knows nothing of missions;
+else pays. Four skills are learnt once, each by a reward of its own that is independent of missions;
 a selector learns for each mission when to call which.
 
 Observations: LunarLander's (0 to 7); what is still to be done, leg by leg, each one-hot of left,
@@ -122,7 +122,7 @@ class Hover(Flight):
 
     def reward(self, step: Step) -> Array:
         """Return 1 less the deviation, 1 for a step in the box, −20 for an episode's end."""
-        # The leg asks for a place. Where only its speed was paid, a skill stayed just beside it.
+        # The leg requires a place. Where only its speed was paid, a skill stayed just beside it.
         in_box = self.in_box(step.next_obs) & ~step.terminated
         found: Array = super().reward(step) + in_box
         return found
@@ -243,7 +243,7 @@ def with_skills(
 def by_leg(obs: Array) -> Array:
     """Return the skill of the current leg, (N,) by name: a selector written by hand.
 
-    Where that skill may not start, as the lander is there already, it is that of the next leg; and
+    Where that skill may not start, as the lander is there already, it is the next leg's skill; and
     where all is done, the lander hovers.
     """
     n, skills = len(obs), [GoLeft(), GoRight(), Hover(), Land()]

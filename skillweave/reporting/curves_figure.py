@@ -33,7 +33,7 @@ FONT = 8.0
 """Points, at that width."""
 DPI = 300
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe & Ito (2008): colours that people with a colour deficiency tell apart."""
+"""Okabe & Ito (2008): colours that people with a colour deficiency can separate."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1.5, 1.5)))
 """Styles of lines, for prints without colours."""
 BANDS = {"iqr": "interquartile range", "range": "lowest to highest", "none": ""}
@@ -56,13 +56,13 @@ class Line:
     steps: Array
     middle: Array
     low: Array | None
-    """None: there is no band."""
+    """None: no band."""
     high: Array | None
 
 
 @dataclass(frozen=True)
 class CurvesFigure:
-    """The files of a figure, and what stands in it."""
+    """The files of a figure, and its content."""
 
     paths: tuple[Path, ...]
     lines: tuple[Line, ...]
@@ -85,7 +85,7 @@ def plot_curves(
 ) -> CurvesFigure:
     """Draw the learning curves of several seeds: their median, and a band around it.
 
-    The curve is that of the whole policy. Its steps count from the start of the run, those in
+    The curve belongs to the whole policy. Its steps count from the start of the run, those in
     which skills learnt before included, so hierarchies and flat agents can be compared.
 
     Args:
@@ -182,7 +182,7 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     for entry in run.manifest["stages"]:
         if entry["name"] in wanted:
             parts.append((before, wanted[entry["name"]]))
-        # An agent's steps are those of the stages in which it learns.
+        # An agent's steps are the steps of the stages in which it learns.
         if agent is None or entry["name"] in wanted:
             before += int(entry.get("steps", entry["budget"]))
     names = dict.fromkeys(name for _, points in parts for name in points)

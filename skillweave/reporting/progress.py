@@ -26,7 +26,7 @@ RECENT = 10.0
 PATIENCE = 1.0
 """Seconds that an evaluation may take before its progress is shown."""
 PLAIN_PATIENCE = 30.0
-"""The same of lines, where there is no terminal; and the least seconds between two of them."""
+"""Distance of lines without a terminal, and the least seconds between two of them."""
 IN_ALL = "in all"
 LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
@@ -39,7 +39,7 @@ class Progress:
     Of several stages it shows which one this is, and the time left in all.
 
     A context manager and a listener of the training loops. Without a terminal or a notebook, in CI,
-    and with NO_COLOR or TERM=dumb, it writes a line when a stage begins, some while it goes on, and
+    and with NO_COLOR or TERM=dumb, it writes a line when a stage starts, some while it trains, and
     one when it ends. With ``quiet`` it writes nothing. Messages go to the logger "skillweave", too.
     """
 
@@ -99,7 +99,7 @@ class Progress:
         if self._quiet or now - self._shown < pause:
             return
         if self._display is None and steps >= self._plan[name]:
-            return  # ``done`` says so next
+            return  # ``done`` reports it next
         self._shown = now
         left = _clock(self._left(name))
         self._show(name, steps, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
@@ -190,7 +190,7 @@ class Progress:
     def _left_in_all(self, name: str) -> float | None:
         """Return the seconds that all stages still take; None: unknown, or there is one stage.
 
-        Stages that have not begun are taken to be as fast as all steps so far.
+        The speed of stages that have not started is taken from all steps so far.
         """
         if not self._several:
             return None
@@ -273,7 +273,7 @@ class EpisodeProgress:
 
 
 def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str, str]]:
-    """Yield who learns side by side: name, share of the steps in which it acts, both in words."""
+    """Yield the learners of a stage: name, share of the steps in which it acts, both in words."""
     for key, value in metrics.items():
         name, _, what = key.rpartition(".")
         if key.startswith(INFO):  # a key may have a dot of its own

@@ -1,4 +1,4 @@
-"""Videos of a policy at work: who acts is written under every frame."""
+"""Videos of a policy at work, with the acting skill's name under every frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from skillweave.types import Array, Memory, Policy
 __all__ = ["PALETTE", "Film", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
-HOLD = 1.0  # seconds that the last frame of an episode stands
+HOLD = 1.0  # seconds for which the last frame of an episode stays
 Label = Callable[[Memory], tuple[str, RGB]] | None
 
 
@@ -55,8 +55,8 @@ def render_policy(
     Args:
         seed: episode i starts from ``reset(seed=seed + i)``.
         max_steps: of an episode; None: the environment's own limit, at most ``LONG_EPISODE``.
-        label: from the policy's memory after ``act`` to who acted, and its colour.
-        fps: steps shown per second; None: as many as the environment says, so in real time.
+        label: from the policy's memory after ``act`` to the acting skill's name and colour.
+        fps: steps shown per second; None: the environment's own, in real time.
         every: steps for each frame; each episode's end has a frame of its own.
         rng: for ``act``; None: derived from ``seed``.
         quiet: no progress.
@@ -75,7 +75,7 @@ def render_policy(
     rng = rng or (Seeds(seed) / "render").numpy()
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")
-        # Observations, infos and masks are those of an evaluation.
+        # Observations, infos and masks are as in an evaluation.
         engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
         try:
             rate = (fps or env.metadata.get("render_fps") or 30) / every

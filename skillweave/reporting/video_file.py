@@ -50,7 +50,7 @@ class VideoWriter:
         self._sink = kind(self._part, fps)
 
     def add(self, frame: Array, seconds: float | None = None) -> None:
-        """Append a frame (H, W, 3) uint8 that stands for ``seconds``, by default 1 / fps."""
+        """Append a frame (H, W, 3) uint8 that stays for ``seconds``, by default 1 / fps."""
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise EnvError(f"a frame is (H, W, 3) uint8, not {frame.shape} {frame.dtype}")
         if frame.shape != (self._shape or frame.shape):

@@ -20,7 +20,7 @@ _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")
 
 
 class Setting:
-    """An attribute that stands for a field of the native config.
+    """An attribute in place of a field of the native config.
 
     ``inverse``: its value is 1 / field; ``share``: field times the field of this name.
     """
@@ -40,7 +40,7 @@ class Setting:
         agent.native.set(**self.native(value / whole if whole else value))
 
     def native(self, value: Any) -> dict[str, Any]:
-        """Return the native field, with the value that ``value`` stands for."""
+        """Return the native field for AgileRL's ``value``."""
         return {self.field: 1.0 / float(value) if self.inverse else plain(value)}
 
 
@@ -57,7 +57,9 @@ class Agent:
     def __init_subclass__(cls) -> None:
         cls.get_action = cls.getAction
 
-    def _start(self, given: Any, actions: gym.Space[Any], make: Any = None, **own: Any) -> None:
+    def _start(
+        self, given: Any, actions: gym.Space[Any], make: Any = None, **settings: Any
+    ) -> None:
         """Start with fresh weights; ``given`` are the constructor's arguments."""
         for name, value in given.items():
             if (name == "accelerator" or "_network" in name) and value is not None:
@@ -66,13 +68,15 @@ class Agent:
                     "see register_encoder of the native API"
                 )
             if isinstance(setting := getattr(type(self), name, None), Setting):
-                own = setting.native(value) | own
+                settings = setting.native(value) | settings
         network = given["net_config"]
-        own["normalize_obs"] = False  # AgileRL does not
-        own["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
+        settings["normalize_obs"] = False  # AgileRL does not
+        settings["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
         seen = observations_of(given["state_dim"], given["one_hot"], network)
         self._wrap(
-            SingleAgent(Member(0, (make or self.kind)(**own), None), (seen, actions), random_seed())
+            SingleAgent(
+                Member(0, (make or self.kind)(**settings), None), (seen, actions), random_seed()
+            )
         )
         self.index, self.mut, self.device = given["index"], given["mut"], given["device"]
 

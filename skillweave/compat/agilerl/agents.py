@@ -48,9 +48,9 @@ class PPO(Agent):
     ) -> None:
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
-        own = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
-        own["min_advantage_std"] = 0.0  # AgileRL has no such limit
-        self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **own)
+        settings = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
+        settings["min_advantage_std"] = 0.0  # AgileRL has no such limit
+        self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **settings)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
         """Sample actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
@@ -193,11 +193,16 @@ class TD3(Agent):
         accelerator: Any = None,
         wrap: bool = True,
     ) -> None:
-        # In place of what the Setting says of lr_actor alone: a share needs both rates.
-        own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin, "n_step": 1, "action_l2": 0.0}
-        own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
+        # In place of the Setting of lr_actor alone: a share needs both rates.
+        settings = {
+            "actor_rate": lr_actor / lr_critic,
+            "twin": self.twin,
+            "n_step": 1,
+            "action_l2": 0.0,
+        }
+        settings |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
-        self._start(locals(), actions, **own)
+        self._start(locals(), actions, **settings)
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
         """Return actions (B, A) float32: random with probability ``epsilon``, or noisy."""

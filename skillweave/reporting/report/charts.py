@@ -1,6 +1,6 @@
 """The charts of reports, as specifications in Vega-Lite; the page gives them its colours.
 
-A specification is plain data, and the data that it shows stand in it. ``vega`` in a browser draws
+A specification is plain data, and holds its data. ``vega`` in a browser draws
 it (https://vega.github.io/vega-lite/docs/).
 """
 
@@ -30,7 +30,7 @@ def chart(description: str, height: int, **rest: Any) -> Spec:
 
 
 def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
-    """Return the encoding of a number that need not begin at zero."""
+    """Return the encoding of a number whose axis need not include zero."""
     scale = {"zero": False, "nice": True} | rest.pop("scale", {})
     return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
 

@@ -1,4 +1,4 @@
-"""Learning curves: what ``metrics.jsonl`` tells of each agent."""
+"""Learning curves: the metrics of each agent in ``metrics.jsonl``."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ MADE = {
 
 
 def name_of(run: RunDirectory) -> str:
-    """Return the name of a run: that of its directory."""
+    """Return the name of a run's directory."""
     return run.path.resolve().name
 
 

@@ -71,7 +71,7 @@ class Played:
     colors: list[RGB]
     """Of each of the log's labels."""
     docs: list[str]
-    """What the docstrings of the log's skills say."""
+    """The docstrings of the log's skills."""
     named: ObsNames | None
     """Names of the numbers in an observation."""
 
@@ -138,7 +138,7 @@ def write_report(
 
     Args:
         policy, spec: what was trained, and on what; None: no episodes are played.
-        why_not: a sentence on why there is no policy, where the run itself is finished.
+        why_not: the reason why there is no policy, where the run itself is finished.
         episodes: to play, with seeds that training never used.
         filmed: number of these in the film, from the worst to the best.
         seed: picks the episodes, as in ``evaluate``.
@@ -156,7 +156,7 @@ def write_report(
     began = time.perf_counter()
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     filmed = whole_number(filmed, "films", 0)
-    library()  # a missing extra is said before anything is played
+    library()  # a missing extra is reported before anything is played
     must_be_own(path.parent)
     all_curves = read_curves(run)
     reached = reached_steps(all_curves)

@@ -10,7 +10,7 @@ from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
 
 FEW = 5
-"""With fewer episodes than these a mean says little."""
+"""With fewer episodes than these a mean has little meaning."""
 ALONE, SELDOM, WEAK = 0.95, 0.01, 0.5
 """Shares: of steps of a skill that does nearly all, of one that does nearly nothing; of calls."""
 
@@ -18,7 +18,7 @@ ALONE, SELDOM, WEAK = 0.95, 0.01, 0.5
 def solved(score: Evaluation) -> int | None:
     """Return how many episodes were solved; None: the task is not of this kind.
 
-    An episode is solved where the environment says so (``info["success"]``), or, where every
+    An episode is solved where ``info["success"]`` is true, or, where every
     return is 0 or 1, if its return is 1.
     """
     if score.succeeded is not None:
@@ -34,7 +34,7 @@ def is_binary(returns: Sequence[float]) -> bool:
 
 
 def verdict(score: Evaluation, deterministic: bool) -> str:
-    """Return one sentence; names in it stand between backticks."""
+    """Return one sentence with names between backticks."""
     parts = [_outcome(score), *_skills(_leaves(score.skills), all_steps(score.skills))]
     if score.cut:
         parts.append(f"{score.cut} {'episode' if score.cut == 1 else 'episodes'} never ended")
@@ -43,7 +43,7 @@ def verdict(score: Evaluation, deterministic: bool) -> str:
 
 
 def no_verdict(stages: Sequence[Mapping[str, Any]]) -> str:
-    """Return the sentence that stands for a verdict where no episode was played."""
+    """Return the sentence in place of a verdict where no episode was played."""
     done = sum(entry["status"] == "done" for entry in stages)
     if done < len(stages):
         return f"Training is not finished: {done} of {len(stages)} stages are done."

@@ -62,8 +62,8 @@ def train_off_policy(
 def _learn(agent: Any, memory: Any, n_step_memory: Any, n_step: bool, per: bool) -> float:
     """Make one gradient step; return its loss, or the critics' loss where there is an actor."""
     if not per and n_step_memory is None:
-        found = agent.learn(memory.sample(agent.batch_size))
-        losses = [x for x in (found if isinstance(found, tuple) else (found,)) if x is not None]
+        result = agent.learn(memory.sample(agent.batch_size))
+        losses = [x for x in (result if isinstance(result, tuple) else (result,)) if x is not None]
         return float(losses[-1])
     batch = memory.sample(agent.batch_size, agent.beta if per else True)
     if n_step_memory is not None:
