@@ -47,8 +47,13 @@ AFTER = np.array(
     [[CELL.get((r + dr, c + dc), CELL[r, c]) for dr, dc in MOVES.values()] for r, c in PLACES]
 )
 """Where each move leads from each cell, (104, 4); a wall stops it."""
-NORTH, WEST, EAST, SOUTH = CELL[3, 6], CELL[6, 2], CELL[7, 9], CELL[10, 6]
-CORNER, G1, G2 = CELL[1, 1], EAST, CELL[9, 9]
+NORTH = CELL[3, 6]
+WEST = CELL[6, 2]
+EAST = CELL[7, 9]
+SOUTH = CELL[10, 6]
+CORNER = CELL[1, 1]
+G1 = EAST
+G2 = CELL[9, 9]
 """The upper left corner, and the paper's two kinds of goal: a hallway, and a cell inside a room."""
 
 

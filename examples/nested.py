@@ -37,7 +37,9 @@ class Errands(gym.Env[Any, Any]):
         super().reset(seed=seed)
         cells = self.np_random.permutation(SIZE * SIZE)[:5]
         self.agent, *places = (np.array(divmod(int(cell), SIZE)) for cell in cells)
-        self.places, self.state, self.left = np.array(places), np.full(2, WAITING), 80
+        self.places = np.array(places)
+        self.state = np.full(2, WAITING)
+        self.left = 80
         return self._seen(), {}
 
     def step(self, action: int) -> Any:

@@ -73,7 +73,8 @@ class A2CAlgorithm(Algorithm):
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Return a state with one member for each seed."""
         params = torch.zeros(len(seeds), self.layout.size)
-        views, generators = self.layout.views(params), self.member_generators(seeds)
+        views = self.layout.views(params)
+        generators = self.member_generators(seeds)
         self.actor.init_(views, 0.01, generators)
         self.critic.init_(views, 1.0, generators)
         return State(**self.fresh_fields(params))
@@ -106,7 +107,8 @@ class A2CAlgorithm(Algorithm):
     ) -> tuple[State, Report]:
         """Make one gradient step on all rows of the rollout that are this learner's own."""
         lead, valid = rollout.reward.shape[1:], rollout.valid
-        obs, next_obs = rollout.obs.flatten(1, 2), rollout.next_obs.flatten(1, 2)
+        obs = rollout.obs.flatten(1, 2)
+        next_obs = rollout.next_obs.flatten(1, 2)
         flat_valid = None if valid is None else valid.flatten(1, 2)
         self.update_obs_stats(state, obs, flat_valid)
         leaves = self.layout.leaves(state.params)

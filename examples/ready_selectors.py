@@ -31,7 +31,10 @@ class Corridor(gym.Env[Array, np.int64]):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        self.place, self.key, self.door, self.steps = int(self.np_random.integers(1, 6)), 0, 0, 0
+        self.place = int(self.np_random.integers(1, 6))
+        self.key = 0
+        self.door = 0
+        self.steps = 0
         return self._obs(), {}
 
     def step(self, action: np.int64) -> Any:

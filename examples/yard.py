@@ -16,7 +16,9 @@ import numpy as np
 
 import skillweave as sw
 
-BUTTON, FLAG, NEAR = np.array([-0.8, 0.8]), np.array([0.8, -0.8]), 0.12
+BUTTON = np.array([-0.8, 0.8])
+FLAG = np.array([0.8, -0.8])
+NEAR = 0.12
 GATE = 0.15
 """Half the gate's width; it is in the middle of the wall, at x = 0."""
 OPEN, BEHIND = 4, 5

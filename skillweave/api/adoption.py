@@ -144,7 +144,8 @@ def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
                     "this declaration, not in both; declare it as it was trained"
                 )
             if inner is not None:
-                where, ready = f"{run.path}: {entry['name']}", inner.ready_selector is not None
+                where = f"{run.path}: {entry['name']}"
+                ready = inner.ready_selector is not None
                 check_selector(ready, "selector" in entry["hierarchy"], where)
                 _check_reflexes(inner, entry["hierarchy"], where)
         _check_reflexes(declared, run.manifest, str(run.path))

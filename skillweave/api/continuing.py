@@ -141,7 +141,9 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     """
     stages: list[dict[str, Any]] = run.manifest["stages"]
     more = _more(stages, budgets)
-    finished, grown, sentences = run.finished, list[dict[str, Any]](), list[str]()
+    finished = run.finished
+    grown = list[dict[str, Any]]()
+    sentences = list[str]()
     for entry in stages:
         name, budget = entry["name"], entry["budget"]
         wanted = budget + more.get(name, 0)
@@ -207,7 +209,8 @@ def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None
             f"{run.path} cannot be given more steps: it does not hold the final state of stage "
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
         )
-    tensors, left = run.final_tensors(name), entry["budget"] + more - entry["steps"]
+    tensors = run.final_tensors(name)
+    left = entry["budget"] + more - entry["steps"]
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
         place = "extra.learner." + (f"{learner}." if "together" in entry else "") + "store."

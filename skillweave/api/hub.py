@@ -25,7 +25,8 @@ def push_run(path: Path, name: str, private: bool = False) -> dict[str, Any]:
     hub.check_whole(run)
     files: dict[str, Path | bytes] = {}
     run_files, stays = hub.run_files(run)
-    films, missing = hub.run_films(run), [f"{f} is no safetensors file: it stays" for f in stays]
+    films = hub.run_films(run)
+    missing = [f"{f} is no safetensors file: it stays" for f in stays]
     if not films:
         missing.append(f"no film: skillweave render {path} --out {path / 'film.gif'}")
     if load_evaluation(run) is None:

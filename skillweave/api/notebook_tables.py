@@ -44,7 +44,8 @@ def run_html(path: Path, declared: Declaration | PlainAgent) -> str:
     if isinstance(declared, PlainAgent):
         rows, skills = list(_agent_facts(declared)), []
     else:
-        rows, skills = list(_hierarchy_facts(declared)), [_skills(declared)]
+        rows = list(_hierarchy_facts(declared))
+        skills = [_skills(declared)]
     kind = "run" if path.is_dir() else "weights"
     shown = [facts([(kind, path), *rows]), *skills]
     try:

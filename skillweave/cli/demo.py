@@ -119,7 +119,8 @@ class Demo:
         self, hierarchy: Hierarchy, task: str, name: str, flat: bool = False
     ) -> tuple[Run, Evaluation, float]:
         """Train and score; return the run, its score and the seconds of training."""
-        started, quiet = time.perf_counter(), self.command.quiet or self.command.json
+        started = time.perf_counter()
+        quiet = self.command.quiet or self.command.json
         run = hierarchy.train(
             self.command.out / name, seed=self.command.seed, flat=flat, quiet=quiet
         )

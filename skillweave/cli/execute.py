@@ -134,7 +134,9 @@ def _plot(command: commands.Plot) -> None:
 
 
 def _report(command: commands.Report) -> None:
-    run, why_not, trained = RunDirectory.open(command.run), None, None
+    run = RunDirectory.open(command.run)
+    why_not = None
+    trained = None
     named = run.manifest.get("recipe")
     # A shipped recipe's code is trusted: with it, the skills' rewards and successes are known.
     recipe = command.recipe or (named if named in recipes.names() else None)

@@ -134,7 +134,8 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
 
     ``changes``: by path, the full name and the text of the value.
     """
-    known, hints = [f.name for f in fields(config)], annotations_of(type(config))
+    known = [f.name for f in fields(config)]
+    hints = annotations_of(type(config))
     values: dict[str, Any] = {}
     deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
     for (field, *rest), (name, text) in changes.items():

@@ -31,7 +31,8 @@ class Processes:
     """A pool that runs a number of jobs at once; see ``processes``."""
 
     def __init__(self, count: int) -> None:
-        self._threads, self._lock = ThreadPoolExecutor(count), threading.Lock()
+        self._threads = ThreadPoolExecutor(count)
+        self._lock = threading.Lock()
         self._running: list[Any] = []
         self._over = False
 

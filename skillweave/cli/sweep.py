@@ -99,7 +99,8 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     whole_number(command.evaluate, "evaluate", 1)
     if command.jobs is not None:
         whole_number(command.jobs, "jobs", 1)
-    seeds, choices = parse_seeds(command.seeds), parse_choices(command.set_each)
+    seeds = parse_seeds(command.seeds)
+    choices = parse_choices(command.set_each)
     if len(seeds) * len(choices) > MOST:
         raise DeclarationError(
             f"{len(seeds)} seeds of {len(choices)} settings are {len(seeds) * len(choices):,} "
@@ -217,7 +218,8 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
         kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_task())
         good = [(metadata.version("skillweave"), platform.python_version())]
         codes = {code: ray.put(code) for code in {code for code, _ in tasks}}
-        waiting, due = list(reversed(tasks)), dict[Any, tuple[bytes, Job]]()
+        waiting = list(reversed(tasks))
+        due = dict[Any, tuple[bytes, Job]]()
         while waiting or due:
             while waiting and len(due) < (command.jobs or MOST):
                 code, job = waiting.pop()
@@ -266,7 +268,9 @@ Result = tuple[str, int, Path, float | str]
 
 def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
     """Return a sweep as JSON, and as a table with a line for each choice of settings."""
-    groups, failed, runs = list[dict[str, Any]](), list[dict[str, str]](), list[dict[str, Any]]()
+    groups = list[dict[str, Any]]()
+    failed = list[dict[str, str]]()
+    runs = list[dict[str, Any]]()
     for settings, rows in itertools.groupby(results, lambda result: result[0]):
         returns = []
         for _, seed, path, score in rows:

@@ -46,7 +46,8 @@ def must_be_same_code(out: Path, recipe: str) -> None:
         RunError: the runs there are trained by other code; or the directory cannot be
             written.
     """
-    file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
+    file = out / MARK
+    code = _checksum(code_files(recipes.file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
     if not learnt or not file.exists():
         write_json(file, Mark(recipe=recipe, code=code), make_directories=False)

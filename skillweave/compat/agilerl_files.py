@@ -132,7 +132,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     if kind is not DQN:
         config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
-    acting, shapes = "q" if kind is DQN else "actor", algorithm.layout.shapes
+    acting = "q" if kind is DQN else "actor"
+    shapes = algorithm.layout.shapes
     weights = _named(shapes, acting, data["actor_state_dict"])
     if kind is PPO:
         weights |= _named(shapes, "critic", critics[0])
@@ -168,7 +169,8 @@ def observations_of(
     size: Any, one_hot: bool | None, net_config: Mapping[str, Any] | None = None
 ) -> gym.Space[Any]:
     """Return the observation space of states of this size, for a network of this description."""
-    shape, described = [int(n) for n in np.atleast_1d(size)], net_config or {}
+    shape = [int(n) for n in np.atleast_1d(size)]
+    described = net_config or {}
     if one_hot:
         return gym.spaces.Discrete(shape[0])
     if described.get("arch") != "cnn":
@@ -192,8 +194,10 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
             f"arch be 'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
         )
     sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
-    cnn, hidden = CNN("plain", *sizes) if sizes[0] else None, described["hidden_size"]
-    layer_norm, activation = bool(described.get("layer_norm")), ACTIVATIONS[str(name)]
+    cnn = CNN("plain", *sizes) if sizes[0] else None
+    hidden = described["hidden_size"]
+    layer_norm = bool(described.get("layer_norm"))
+    activation = ACTIVATIONS[str(name)]
     planes: Any = None if cnn is None else "first"  # AgileRL reads all images so
     widths = tuple(int(n) for n in hidden)
     return Network(widths, activation, layer_norm, cnn, planes=planes)  # type: ignore[arg-type]

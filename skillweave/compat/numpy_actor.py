@@ -118,7 +118,8 @@ class NumpyPPOActor(NumpyActor):
 
     def sample(self, rows: Array, rng: np.random.Generator) -> Sampled:
         """Return actions (B, …) in policy units; log-probabilities, entropies, values (B,)."""
-        head, value = self.output(rows), self.output(rows, "critic")[:, 0]
+        head = self.output(rows)
+        value = self.output(rows, "critic")[:, 0]
         value = value * self._scale + self._mean
         if not self._choices:
             return *self._drawn(head, rng), value

@@ -30,7 +30,9 @@ class SingleAgent:
     """
 
     def __init__(self, member: Member, spaces: tuple[Any, Any], seed: int) -> None:
-        self.spaces, self.seeds, self.updates = spaces, Seeds(seed), 0
+        self.spaces = spaces
+        self.seeds = Seeds(seed)
+        self.updates = 0
         self.rng, self.generator = (self.seeds / "act").numpy(), (self.seeds / "learn").torch()
         if member.state is None:
             member.state = make_algorithm(member.config, *spaces).init([self.seeds])

@@ -49,7 +49,8 @@ def _decoded(
     output: Tensor, space: gym.Space[Any], mask: Tensor | None, noise: Tensor | None
 ) -> Tensor:
     """Convert a network's output (1, …) to an action, as ``skills.outputs.decoded`` does."""
-    shape, dtype = (1, *(space.shape or ())), torch.from_numpy(np.empty(0, space.dtype)).dtype
+    shape = (1, *(space.shape or ()))
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if isinstance(space, Box):
         low, high = (torch.from_numpy(x) for x in (space.low, space.high))
         return output.reshape(shape).to(dtype).clamp(low, high)
@@ -72,7 +73,9 @@ def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    space, choices, noise = policy.observation_space, _choices(policy), _noise(policy, sampled)
+    space = policy.observation_space
+    choices = _choices(policy)
+    noise = _noise(policy, sampled)
     given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
@@ -147,7 +150,8 @@ class _Nodes:
 
     def action(self, x: str, space: Any, real: bool, masked: bool, noisy: bool) -> str:
         """Add the conversion of an output ``x`` to an action; return the action's name."""
-        shape, dtype = np.array([1, *(space.shape or ())]), _onnx_type(space.dtype)
+        shape = np.array([1, *(space.shape or ())])
+        dtype = _onnx_type(space.dtype)
         if isinstance(space, Box):
             x = self.then("Reshape", self.then("Cast", x, to=dtype), shape)
             x = self.then("Max", x, space.low[None])

@@ -112,7 +112,8 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    algorithm, leaves = policy.algorithm, leaves_of(policy.observation_space)
+    algorithm = policy.algorithm
+    leaves = leaves_of(policy.observation_space)
     choices = algorithm.codec.size if algorithm.codec.discrete else 0
     noise = _noise_of(algorithm) if sampled else ()
     graph = Graph(b"", choices, algorithm.memory_size, noise)
@@ -140,7 +141,8 @@ def worth_graph(critic: AgentPolicy, where: str) -> Graph:
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
     """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``."""
     codec, space = algorithm.codec, algorithm.action_space
-    shape, dtype = (1, *(space.shape or ())), torch.from_numpy(np.empty(0, space.dtype)).dtype
+    shape = (1, *(space.shape or ()))
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if getattr(getattr(algorithm, "head", None), "squash", False):
         action = action.tanh()
     if codec.discrete:

@@ -24,7 +24,9 @@ class Runner:
     """The policy of one environment; ``code`` has the functions that ``policy.json`` lists."""
 
     def __init__(self, path: Any, code: Any = None, seed: Any = None):
-        self.path, self.code, self.rng = Path(path), code or {}, np.random.default_rng(seed)
+        self.path = Path(path)
+        self.code = code or {}
+        self.rng = np.random.default_rng(seed)
         self.entry = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
         if needs := {k: v for k, v in self.entry["code"].items() if k not in self.code}:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
@@ -38,7 +40,8 @@ class Runner:
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
         """Return the action for an observation; ``mask`` marks the actions that are allowed."""
-        self.obs, self.feeds = np.zeros((1, *self.entry["shape"]), self.dtype), {}
+        self.obs = np.zeros((1, *self.entry["shape"]), self.dtype)
+        self.feeds = {}
         for name, fields, keys in self.entry["inputs"]:
             self.feeds[name] = reduce(getitem, fields, self.obs)
             self.feeds[name][0] = reduce(getitem, keys, obs)
@@ -100,7 +103,8 @@ class _Code:  # a skill that is a function of observations; and what all parts h
 class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory and noise
     def __init__(self, runner: Runner, entry: Any) -> None:
         super().__init__(runner, entry)
-        options, where = ort.SessionOptions(), {"providers": ["CPUExecutionProvider"]}
+        options = ort.SessionOptions()
+        where = {"providers": ["CPUExecutionProvider"]}
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self.session = ort.InferenceSession(str(runner.path / entry["file"]), options, **where)
         self.reset()
@@ -122,7 +126,8 @@ class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory
 class _Hierarchy(_Code):  # a selector and its skills; it decides where a call ends
     def __init__(self, runner: Runner, entry: Any) -> None:
         super().__init__(runner, entry)
-        self.selector, self.skills = runner.made(entry["selector"]), entry["skills"]
+        self.selector = runner.made(entry["selector"])
+        self.skills = entry["skills"]
         self.guide = runner.made(entry["guide"] or {"kind": "Code"})  # or nothing: all is allowed
         self.policies = [runner.made(skill["policy"]) for skill in self.skills]
         self.critic = entry["critic"] and runner.made(entry["critic"])
@@ -133,7 +138,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.guide.reset()
 
     def may_start(self) -> Any:
-        asks, obs, code = self.runner.asks, self.runner.obs, [s["initiation"] for s in self.skills]
+        asks = self.runner.asks
+        obs = self.runner.obs
+        code = [s["initiation"] for s in self.skills]
         may = [name is None or asks(name, obs) for name in code]
         return may & np.array([policy.may_start().any() for policy in self.policies])
 
@@ -155,7 +162,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         return action
 
     def observe(self, elapsed: int, timed_out: bool) -> None:
-        runner, entry, self.elapsed = self.runner, self.skills[self.skill], self.elapsed + 1
+        runner = self.runner
+        entry = self.skills[self.skill]
+        self.elapsed = self.elapsed + 1
         when = self.elapsed, self.elapsed >= (entry["max_steps"] or np.inf)
         (below := self.policies[self.skill]).observe(*when)
         stuck = below.why != RUNNING and not below.may_start().any()
@@ -163,7 +172,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
-            worth, may, margin = self.critic.act(None), self.may_start(), self.entry["margin"]
+            worth = self.critic.act(None)
+            may = self.may_start()
+            margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]
             self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
         judge, self.succeeded = entry["success"], self.why == OWN

@@ -16,7 +16,9 @@ ROUND = 1000.0
 LEGS = 3
 """The most points that a patrol has."""
 WITH_X: Any = {"exclude_current_positions_from_observation": False}
-X, SPEED, LEG = 0, 9, slice(18, 21)
+X = 0
+SPEED = 9
+LEG = slice(18, 21)
 
 
 class Route:
@@ -118,7 +120,8 @@ class Patrols(PoolWrapper):
     """A pool of half-cheetahs on a route, as ``Patrol`` has one."""
 
     def __init__(self, pool: Any, num_envs: int, points: tuple[float, ...]) -> None:
-        self.route, self.leg = Route(points), np.zeros(num_envs, np.int64)
+        self.route = Route(points)
+        self.leg = np.zeros(num_envs, np.int64)
         super().__init__(pool, self.route.space(pool.observation_space))
         self.action_space = gym.spaces.Box(-1.0, 1.0, pool.action_space.shape, np.float32)
 

@@ -19,13 +19,18 @@ MAZES = {
     "umaze": "PointMaze_UMaze-v3",
 }
 """Mazes by name, and what Gymnasium-Robotics and EnvPool call them."""
-PLACE, SPEED, GOAL = slice(0, 2), slice(2, 4), slice(4, 6)
+PLACE = slice(0, 2)
+SPEED = slice(2, 4)
+GOAL = slice(4, 6)
 """Places in an observation: metres east and north, metres a second, metres."""
 REACH, BALL = 0.45, 0.1
 """Metres from the goal at which it is reached; the ball's radius."""
 PIXELS = 32
 """Of a metre in a picture."""
-WALL, FLOOR, GREEN, ORANGE = (60, 66, 80), (235, 235, 230), (120, 190, 130), (230, 110, 40)
+WALL = (60, 66, 80)
+FLOOR = (235, 235, 230)
+GREEN = (120, 190, 130)
+ORANGE = (230, 110, 40)
 SPACE = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ENDS: Any = {"continuing_task": False}
 """The episode ends at the goal; else PointMaze continues until its time is up."""
@@ -47,7 +52,8 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], render_mode: str | None = None) -> None:
         super().__init__(env)
         self.observation_space = SPACE
-        self._render_mode, self._seen = render_mode, np.zeros(SPACE.shape, np.float32)
+        self._render_mode = render_mode
+        self._seen = np.zeros(SPACE.shape, np.float32)
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]  # Gymnasium has it so, too

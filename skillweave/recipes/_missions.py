@@ -129,7 +129,8 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
         self, env: gym.Env[Any, Any], missions: Sequence[Sequence[str]], gusts: bool = False
     ) -> None:
         super().__init__(env)
-        self.progress, self._me = Progress(1, missions, gusts), np.zeros(1, np.int64)
+        self.progress = Progress(1, missions, gusts)
+        self._me = np.zeros(1, np.int64)
         self._rng = np.random.default_rng()
         self.observation_space = SPACE
 

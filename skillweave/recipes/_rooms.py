@@ -47,7 +47,8 @@ FAR = 14
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
 HIGHEST = np.broadcast_to(np.array([10, 5, 2], np.uint8), (7, 7, 3))
 """Kind, colour and state of a cell are never higher. MiniGrid's own space has 255."""
-SPACE, ACTIONS = gym.spaces.Box(0, HIGHEST, dtype=np.uint8), gym.spaces.Discrete(7)
+SPACE = gym.spaces.Box(0, HIGHEST, dtype=np.uint8)
+ACTIONS = gym.spaces.Discrete(7)
 
 
 def ahead(obs: Array) -> Array:

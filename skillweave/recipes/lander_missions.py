@@ -35,7 +35,13 @@ from skillweave import (
 )
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
-X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
+X = 0
+Y = 1
+VX = 2
+VY = 3
+ANGLE = 4
+SPIN = 5
+LEGS = slice(6, 8)
 TO_DO = slice(8, 20)
 """The legs that are still to be done, in their order, each one-hot."""
 MISSIONS: dict[str, tuple[tuple[str, ...], ...]] = {

@@ -153,7 +153,8 @@ class Map:
         import torch
 
         seen = inputs["vector"]
-        speed, way = seen[..., SPEED], seen[..., GOAL] - seen[..., PLACE]
+        speed = seen[..., SPEED]
+        way = seen[..., GOAL] - seen[..., PLACE]
         points = self._points(torch.stack([seen[..., PLACE], seen[..., GOAL]], -2))
         return torch.cat([points, 0.2 * speed, 0.2 * way], -1)
 

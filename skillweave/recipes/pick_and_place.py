@@ -30,7 +30,9 @@ from skillweave import PPO, Apart, Array, Guide, Hierarchy, Network, Skill, Step
 from skillweave.recipes._arm import CALM, Disturbances, spec
 from skillweave.recipes._arm import is_held as is_grasped
 
-GRIPPER, BLOCK, OFFSET = slice(0, 3), slice(3, 6), slice(6, 9)
+GRIPPER = slice(0, 3)
+BLOCK = slice(3, 6)
+OFFSET = slice(6, 9)
 FINGERS, GOAL = slice(9, 11), slice(25, 28)
 
 

@@ -182,7 +182,8 @@ def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any
 
 def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierarchy:
     """Return the skills under the task's own automaton: each leg is run in its direction."""
-    ways, legs = np.sign(np.subtract(points, np.roll(points, 1))), range(len(points))
+    ways = np.sign(np.subtract(points, np.roll(points, 1)))
+    legs = range(len(points))
     states = {f"leg {i}": "forward" if ways[i] > 0 else "backward" for i in legs}
     transitions = {
         (f"leg {i}", f"leg {j}"): partial(on_leg, j)

@@ -58,7 +58,8 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
 
 def draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
     """Draw fitness by generation, and below it the path of each setting that differs."""
-    path, everyone = lineage.path(lineage.winner), list(lineage.born.values())
+    path = lineage.path(lineage.winner)
+    everyone = list(lineage.born.values())
     shown = [k for k in lineage.winner.settings if _varies(everyone, k)]
     rows = -(-len(shown) // 2)
     figure = make(figsize=(10, 4.2 + 1.9 * rows), layout="constrained")

@@ -251,7 +251,8 @@ class EpisodeProgress:
             return
         self._shown = now
         if not self._tried:
-            self._tried, self._display = True, open_display(transient=True)
+            self._tried = True
+            self._display = open_display(transient=True)
             if self._display is None:
                 self._pause = PLAIN_PATIENCE
                 return

@@ -106,7 +106,9 @@ class _Film:
 
     def _begin(self) -> None:
         self._elapsed, self._total = 0, 0.0
-        self._who, self._color, self._skills = "", BLACK, Counter[str]()
+        self._who = ""
+        self._color = BLACK
+        self._skills = Counter[str]()
 
     def before_step(self, memory: Memory) -> None:
         """Show what the policy is about to do."""
@@ -165,7 +167,8 @@ class Film(dict[str, Any]):
 
     def _repr_html_(self) -> str:
         """Return the film as a part of the page."""
-        path, caption = Path(self["path"]), paragraph(repr(self).strip("<>"))
+        path = Path(self["path"])
+        caption = paragraph(repr(self).strip("<>"))
         try:
             data = path.read_bytes() if path.stat().st_size <= LARGEST else None
         except OSError as error:

@@ -78,13 +78,18 @@ class Agent:
                 Member(0, (make or self.kind)(**settings), None), (seen, actions), random_seed()
             )
         )
-        self.index, self.mut, self.device = given["index"], given["mut"], given["device"]
+        self.index = given["index"]
+        self.mut = given["mut"]
+        self.device = given["device"]
 
     def _wrap(self, native: SingleAgent) -> None:
         self.native, (seen, action_space) = native, native.spaces
         self.scores: list[float] = []
         self.fitness: list[float] = []
-        self.index, self.mut, self.steps, self.device = 0, None, [0], "cpu"
+        self.index = 0
+        self.mut = None
+        self.steps = [0]
+        self.device = "cpu"
         self.one_hot, self.discrete_actions = not seen.shape, not action_space.shape
         self.state_dim = seen.shape or (int(seen.n),)
         self.action_dim = int(action_space.shape[0] if action_space.shape else action_space.n)

@@ -110,7 +110,9 @@ class RainbowDQN(Agent):
     """A DQN agent with every extension of Rainbow."""
 
     algo, kind, beta, prior_eps = "Rainbow DQN", config.DQN, 0.4, 1e-6
-    lr, num_atoms, n_step = Setting("learning_rate"), Setting("n_atoms"), Setting("n_step")
+    lr = Setting("learning_rate")
+    num_atoms = Setting("n_atoms")
+    n_step = Setting("n_step")
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
     v_min, v_max = Setting("v_min"), Setting("v_max")
 

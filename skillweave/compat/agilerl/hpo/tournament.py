@@ -21,9 +21,11 @@ class TournamentSelection:
     def select(self, population: list[Any]) -> tuple[Any, list[Any]]:
         """Return the best agent by its last ``evo_step`` fitnesses, and the next population."""
         fitness = np.array([np.mean(a.fitness[-self.evo_step :]) for a in population])
-        rng, size = np.random.default_rng(random_seed()), self.tournament_size
+        rng = np.random.default_rng(random_seed())
+        size = self.tournament_size
         by = Evolution(max(2, size), selection=Tournament(size, elitism=False))
-        elite, number = population[int(fitness.argmax())], max(a.index for a in population)
+        elite = population[int(fitness.argmax())]
+        number = max(a.index for a in population)
         heirs = [Heir(population.index(elite), False)] if self.elitism else []
         while len(heirs) < self.population_size:
             heirs += select(by, fitness, rng)

@@ -30,7 +30,8 @@ class Epochs(SimpleNamespace):
         if self.env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise DeclarationError("env must reset in the same step: make it with makeVectEnvs")
         name, scores = f"{self.env_name}-EvoHPO-{self.algo}", []
-        settings, key = {**(self.INIT_HP or {}), **(self.MUT_P or {})}, self.wandb_api_key
+        settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
+        key = self.wandb_api_key
         self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
         for number in range(1, self.n_episodes + 1):
             losses = [self._scored(agent, episode(agent, number - 1)) for agent in self.pop]

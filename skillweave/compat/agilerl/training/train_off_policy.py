@@ -45,7 +45,8 @@ def train_off_policy(
         epochs.pop = mutation.mutation(pop, pre_training_mut=True)
 
     def episode(agent: Any, past: int) -> float:
-        losses, how = [], () if noisy else (max(eps_end, eps_start * eps_decay**past),)
+        losses = []
+        how = () if noisy else (max(eps_end, eps_start * eps_decay**past),)
         for transition in epochs.steps(lambda state: agent.getAction(state, *how)):
             for buffer in (memory, n_step_memory):
                 if buffer is not None:
