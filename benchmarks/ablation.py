@@ -1,8 +1,8 @@
-"""What bounds the hierarchy with the tutorial's three skills.
+"""Ablation: the limits of the hierarchy with the tutorial's three skills.
 
     python -m benchmarks.ablation [--seeds 0 1 2]
 
-The skills are trained once a seed, as the recipe says; then only the selector is trained anew,
+The skills are trained once a seed, as the recipe says; then only the selector is trained again,
 with one thing changed at a time. The last rows train the landing skill with other settings and
 score it alone, since the selector cannot be better than what it selects from.
 """
@@ -54,7 +54,7 @@ LANDINGS: dict[str, dict[str, float]] = {
 
 
 def trained_skills(seed: int, only: str | None = None, **settings: float) -> dict[str, Policy]:
-    """The recipe's skills after training, without a selector to speak of."""
+    """Return the recipe's skills after training, without a selector to speak of."""
     h = recipes.load("lunar-lander")
     regroup(h, selector_steps=1)
     if only is not None:
@@ -101,10 +101,14 @@ def main() -> None:
             policy = trained_skills(seed, "landing", **settings)["landing"]
             found.setdefault(name, []).append(alone(policy, seed))
         rows = [
-            [k, *(f"{m:.1f}" for m, _ in v), f"{median(m for m, _ in v):.1f}",
-             f"{median(s for _, s in v):.0%}"]
+            [
+                k,
+                *(f"{m:.1f}" for m, _ in v),
+                f"{median(m for m, _ in v):.1f}",
+                f"{median(s for _, s in v):.0%}",
+            ]
             for k, v in found.items()
-        ]  # fmt: skip
+        ]
         done = [f"seed {s}" for s in given.seeds[: len(rows[0]) - 3]]
         print(table(["variant", *done, "median", "solved"], rows), flush=True)
     report("ablation", {"seeds": given.seeds, "scores": found})

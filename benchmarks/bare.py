@@ -24,7 +24,7 @@ def train_bare(
     steps: int,
     on_tick: Callable[[Tick, Stack], None],
 ) -> Stack:
-    """Train an agent; ``on_tick`` is told of every report."""
+    """Train an agent; ``on_tick`` is called with every report."""
     scene = skill_scene(spec)
     algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
     stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))
@@ -33,9 +33,13 @@ def train_bare(
     collectors = Collectors([scene.collector(config.num_envs, acting)])
     try:
         train(
-            learner, collectors, Episodes(), seeds, steps,
+            learner,
+            collectors,
+            Episodes(),
+            seeds,
+            steps,
             on_tick=lambda tick: on_tick(tick, stack),
-        )  # fmt: skip
+        )
     finally:
         collectors.close()
     return stack

@@ -37,7 +37,7 @@ class Task:
     def score(
         self, run: Run, greedy: bool | None = None, **how: Any
     ) -> tuple[float, dict[str, float]]:
-        """Of 100 episodes, and how much each skill acted in them.
+        """Return the score of 100 episodes, and each skill's share of their steps.
 
         Args:
             greedy: whether who decides is greedy, or samples; None: as the task is scored.
@@ -49,7 +49,7 @@ class Task:
         return won, found.to_json()["skill_usage"]
 
     def shown(self, score: float) -> str:
-        """A score in words."""
+        """Return a score in words."""
         return f"{score:.1f}" if self.by_return else f"{score:.0%}"
 
 
@@ -110,12 +110,12 @@ LANDER_TOTAL = (
 
 
 def lander_budgets(steps: int = LANDER_TOTAL) -> list[str]:
-    """Settings that share out ``steps`` as ``LANDER_STEPS`` does."""
+    """Return settings that share out ``steps`` as ``LANDER_STEPS`` does."""
     return [f"{name}={steps * own // LANDER_TOTAL}" for name, own in LANDER_STEPS.items()]
 
 
 def _lander(steps: int, workers: int, engine: Any = "auto", **how: Any) -> Hierarchy:
-    """The recipe ``lunar-lander`` for another number of steps, or with its skills apart alone.
+    """Return the recipe ``lunar-lander`` with other steps, or with its skills apart alone.
 
     Args:
         steps: in all.

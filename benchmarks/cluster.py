@@ -11,7 +11,7 @@ random moments, and of a whole node (Ray's ``Cluster``), against those of proces
 microseconds and bytes of a step, here and there. ``saturation``: a simulation of more collectors
 than there are, by these. ``population``: 16 members in three parts on three nodes (Ray's
 ``Cluster``), one of which is killed at a random moment, against three processes here. ``sweep``: 20
-seeds, the driver killed (``kill -9``) at two moments, against a sweep that nobody disturbed; with
+seeds, the driver killed (``kill -9``) at two moments, against an undisturbed sweep; with
 ``--ray`` its runs are tasks of Ray, else processes.
 """
 
@@ -71,13 +71,17 @@ class Sleeping(gym.Env[Array, Any]):
 
 def small(collectors: int, each: int = EACH, rows: int = ROWS) -> PPO:
     return PPO(
-        num_envs=each * collectors, n_steps=rows, batch_size=256, update_epochs=EPOCHS,
-        network=NETWORK, normalize_obs=False,
-    )  # fmt: skip
+        num_envs=each * collectors,
+        n_steps=rows,
+        batch_size=256,
+        update_epochs=EPOCHS,
+        network=NETWORK,
+        normalize_obs=False,
+    )
 
 
 def trained(env: Any, config: PPO, steps: int, workers: int, cluster: Ray | None) -> dict[str, Any]:
-    """Steps per second, and the checksum of the weights."""
+    """Return steps per second, and the checksum of the weights."""
     with tempfile.TemporaryDirectory() as folder:
         spec, path = EnvSpec(env, engine="sync", workers=workers), Path(folder) / "run"
         run = train_agent(spec, config, steps, path, quiet=True, cluster=cluster)
@@ -95,10 +99,12 @@ def scale(given: argparse.Namespace) -> dict[str, Any]:
                 speed = trained(Sleeping, small(count), steps, count, Ray(count))["speed"]
                 found[count] = max(found.get(count, 0.0), speed)
     share = {count: speed / (count * found[1]) for count, speed in found.items()}
-    print(table(
-        ("collectors", "steps/s", "of linear"),
-        [(n, f"{s:,.0f}", f"{share[n]:.2f}") for n, s in found.items()],
-    ))  # fmt: skip
+    print(
+        table(
+            ("collectors", "steps/s", "of linear"),
+            [(n, f"{s:,.0f}", f"{share[n]:.2f}") for n, s in found.items()],
+        )
+    )
     return {"steps_per_second": found, "of_linear": share}
 
 
@@ -115,14 +121,14 @@ def overhead(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def below(parent: int, name: str) -> list[int]:
-    """The processes that a process began, and whose command holds ``name``."""
+    """Return the processes that a process began, and whose command holds ``name``."""
     asked = ["pgrep", "-P", str(parent), "-f", name]
     found = subprocess.run(asked, capture_output=True, text=True)
     return [int(pid) for pid in found.stdout.split()]
 
 
 def actors() -> list[int]:
-    """The processes of all actors in nodes that this process began."""
+    """Return the processes of all actors in nodes that this process began."""
     raylets = below(os.getpid(), "raylet")
     return [pid for raylet in raylets for pid in actors_of(raylet)]
 
@@ -261,18 +267,18 @@ def sweep(given: argparse.Namespace) -> dict[str, Any]:
         found += ["--out", str(out), "--evaluate", "2", "--jobs", "2", "--json", "--quiet"]
         return [*found, "--ray"] if given.ray else found
 
-    def told(out: Path) -> dict[str, Any]:
+    def summary(out: Path) -> dict[str, Any]:
         found = subprocess.run(words(out), stdout=subprocess.PIPE, text=True, check=True).stdout
         answer: dict[str, Any] = json.loads(found)
         return answer
 
     def finished(out: Path) -> dict[str, int]:
-        """By name, the runs of which nothing is left to be done, and when that was."""
+        """Return by name the finished runs, and the times of their ends."""
         saved = {p.parent.name: p.stat().st_mtime_ns for p in out.glob("s*/evaluation.json")}
         return {k: v for k, v in saved.items() if not (out / k / "checkpoint.safetensors").exists()}
 
     def result(out: Path, seed: int) -> str:
-        """A checksum of weights and metrics, times left out."""
+        """Return a checksum of weights and metrics, times left out."""
         path = out / f"s{seed}"
         lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
         kept = json.dumps([line | {"seconds": 0} for line in lines]).encode()
@@ -282,7 +288,7 @@ def sweep(given: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         recipe, out, whole = (Path(folder) / name for name in ("swept.py", "killed", "whole"))
         recipe.write_text(SWEPT)
-        undisturbed = told(whole)
+        undisturbed = summary(whole)
         before, kills, again = dict[str, int](), list[int](), 0
         for least in (rng.randrange(3, 9), rng.randrange(10, 17)):
             driver = subprocess.Popen(words(out), stdout=subprocess.DEVNULL)
@@ -295,19 +301,22 @@ def sweep(given: argparse.Namespace) -> dict[str, Any]:
             again += sum(finished(out).get(name) != when for name, when in before.items())
             before = finished(out)
             print(f"killed when {kills[-1]} runs were finished", flush=True)
-        answer = told(out)
+        answer = summary(out)
         again += sum(finished(out).get(name) != when for name, when in before.items())
         same = sum(result(out, seed) == result(whole, seed) for seed in range(seeds))
         values = [[run["return"] for run in found["runs"]] for found in (answer, undisturbed)]
     return {
-        "finished_when_killed": kills, "trained_again": again, "equal": same,
-        "runs_in_table": len(answer["runs"]), "failed": len(answer["failed"]),
+        "finished_when_killed": kills,
+        "trained_again": again,
+        "equal": same,
+        "runs_in_table": len(answer["runs"]),
+        "failed": len(answer["failed"]),
         "same_table": values[0] == values[1],
-    }  # fmt: skip
+    }
 
 
 def costs(given: argparse.Namespace) -> dict[str, Any]:
-    """Of a step, in microseconds of one processor: collecting, coming back, learning; its bytes."""
+    """Return a step's costs in microseconds of one processor, and its bytes."""
     import ray
 
     from skillweave.algorithms.policy import make_algorithm
@@ -364,14 +373,14 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def saturation(given: argparse.Namespace) -> dict[str, Any]:
-    """Steps per second of one learner and W collectors, simulated round by round.
+    """Simulate steps per second of one learner and W collectors, round by round.
 
     A round is over when the slowest collector has answered, its rows are joined, and the learner
     has learnt from the round before. What a step costs is measured (``costs``); that collectors
     differ by 10 % from round to round, and that a call takes 2 ms, is assumed.
     """
-    told = json.loads(Path("runs/benchmarks/cluster-costs.json").read_text())
-    cost = {k: v / 1e6 for k, v in told["costs"]["MiniGrid"].items()}
+    saved = json.loads(Path("runs/benchmarks/cluster-costs.json").read_text())
+    cost = {k: v / 1e6 for k, v in saved["costs"]["MiniGrid"].items()}
     rng, each, rows, rounds = np.random.default_rng(0), 16, 128, 200
     lines, found = list[tuple[Any, ...]](), {}
     for name, wait in (("MiniGrid in Python", 0.0), ("5 ms a step", 5e-3)):
@@ -390,9 +399,14 @@ def saturation(given: argparse.Namespace) -> dict[str, Any]:
 
 
 PARTS: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
-    "scale": scale, "overhead": overhead, "equal": equal, "costs": costs, "saturation": saturation,
-    "population": population, "sweep": sweep,
-}  # fmt: skip
+    "scale": scale,
+    "overhead": overhead,
+    "equal": equal,
+    "costs": costs,
+    "saturation": saturation,
+    "population": population,
+    "sweep": sweep,
+}
 
 
 def main() -> None:

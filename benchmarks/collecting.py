@@ -1,4 +1,4 @@
-"""How fast experience is collected: in one process and in several, and with calls of any length.
+"""Speed of collecting: in one process and in several, and with calls of any length.
 
     python -m benchmarks.collecting [workers] [calls] [together] [--rounds 3] [--steps 40000]
 
@@ -48,7 +48,7 @@ NETWORK = Network((64, 64), "tanh")
 
 
 class Flat(gym.ObservationWrapper[Any, Any, Any]):
-    """What is in each of the 7 × 7 cells that MiniGrid shows, and whether a door there is shut."""
+    """MiniGrid's 7 × 7 cells in view as numbers: kinds, and shut doors."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -68,9 +68,13 @@ def grid(render_mode: str | None = None) -> gym.Env[Any, Any]:
 
 def ours(workers: int, steps: int, cluster: Ray | None = None, env: Any = grid) -> float:
     config = PPO(
-        num_envs=ENVS, n_steps=ROWS, batch_size=BATCH, update_epochs=EPOCHS, network=NETWORK,
+        num_envs=ENVS,
+        n_steps=ROWS,
+        batch_size=BATCH,
+        update_epochs=EPOCHS,
+        network=NETWORK,
         normalize_obs=False,
-    )  # fmt: skip
+    )
     with tempfile.TemporaryDirectory() as folder:
         spec = EnvSpec(env, engine="sync", workers=workers)
         run = train_agent(spec, config, steps, Path(folder) / "run", quiet=True, cluster=cluster)
@@ -86,9 +90,14 @@ def stable_baselines(steps: int) -> float:
     torch.set_num_threads(1)
     env = make_vec_env(grid, ENVS, vec_env_cls=SubprocVecEnv)
     model = Theirs(
-        "MlpPolicy", env, n_steps=ROWS, batch_size=BATCH, n_epochs=EPOCHS, device="cpu",
+        "MlpPolicy",
+        env,
+        n_steps=ROWS,
+        batch_size=BATCH,
+        n_epochs=EPOCHS,
+        device="cpu",
         policy_kwargs={"net_arch": [64, 64]},
-    )  # fmt: skip
+    )
     began = time.perf_counter()
     model.learn(steps)
     found = model.num_timesteps / (time.perf_counter() - began)
@@ -110,7 +119,7 @@ def _step_alone(steps: int, ready: Any) -> None:
 
 
 def alone(steps: int) -> float:
-    """The environments of two workers, stepped by two processes that do nothing else."""
+    """Return the environments of two workers, stepped by two processes that do nothing else."""
     context = multiprocessing.get_context("fork")
     ready = context.Barrier(3)
     processes = [context.Process(target=_step_alone, args=(steps, ready)) for _ in range(2)]
@@ -166,7 +175,7 @@ TOGETHER: dict[str, list[str]] = {
 
 
 def together(changed: list[str], steps: int) -> tuple[float, float]:
-    """Of the selector over frozen skills, then of all who learn together."""
+    """Measure the selector over frozen skills, then all learners together."""
     hierarchy = recipes.load("lunar-lander")
     budgets = ["apart.skill_steps=5000", "skills.landing.steps=5000"]
     budgets += [f"apart.selector_steps={steps}"]
@@ -181,7 +190,7 @@ def together(changed: list[str], steps: int) -> tuple[float, float]:
 def compared(
     measure: Callable[[], dict[str, float]], ratios: dict[str, tuple[str, str]], rounds: int
 ) -> dict[str, Any]:
-    """Steps per second by name, measured once a round, and the median of ratios within rounds."""
+    """Return steps per second by name, measured once a round, and the median of ratios."""
     found: list[dict[str, float]] = []
     for _ in range(rounds):
         found.append(measure())
@@ -220,9 +229,11 @@ def main() -> None:
         "workers": (of_workers, 1, {f"two workers / {k}": ("two workers", k) for k in others}),
         "calls": (of_calls, 10, {"calls of 1 to 64 / calls of 32": ("1 to 64", "32")}),
         "together": (
-            of_together, 10, {f"{k} / selector alone": (k, f"selector, {k}") for k in TOGETHER}
+            of_together,
+            10,
+            {f"{k} / selector alone": (k, f"selector, {k}") for k in TOGETHER},
         ),
-    }  # fmt: skip
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

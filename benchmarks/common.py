@@ -1,4 +1,4 @@
-"""What the benchmarks share: the machine, processes, tables, recording and replaying."""
+"""Shared parts of the benchmarks: the machine, processes, tables, recording and replaying."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def machine() -> str:
 def cases_asked(
     parser: argparse.ArgumentParser, cases: Iterable[str], steps: int
 ) -> argparse.Namespace:
-    """What the command line says of a benchmark whose cases are trained for so many steps."""
+    """Parse the command line of a benchmark whose cases are trained for ``steps``."""
     parser.add_argument("cases", nargs="*", default=["together", "flat"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int, default=steps)
@@ -49,7 +49,7 @@ def cases_asked(
 def run_command(
     command: Sequence[str], *, capture: bool = False, check: bool = True, **how: Any
 ) -> subprocess.CompletedProcess[str]:
-    """``subprocess.run``, but a SIGTERM to this process also ends the command's with SIGTERM."""
+    """Run a command as ``subprocess.run`` does; a SIGTERM to this process also ends the command."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     pipe = subprocess.PIPE if capture else None
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, **how) as child:
@@ -113,7 +113,7 @@ class RecordedPool:
 
 @contextmanager
 def recorded() -> Iterator[list[RecordedPool]]:
-    """The pools that are made in it."""
+    """Yield the pools that are made in this block."""
     made: list[RecordedPool] = []
     real = EnvPoolEngine.make_pool
 

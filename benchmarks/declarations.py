@@ -29,7 +29,7 @@ WAYS = ("new", "apart", "flat")
 
 
 def gained(step: Step, place: Any, columns: slice = slice(0, 2)) -> Array:
-    """How much nearer a step came to a place, (N,)."""
+    """Return how much nearer a step came to a place, (N,)."""
     before = np.linalg.norm(step.obs[:, columns] - place, axis=1)
     found: Array = before - np.linalg.norm(step.next_obs[:, columns] - place, axis=1)
     return found
@@ -146,7 +146,7 @@ class Bring(Skill):
 
 
 def passenger(obs: Array) -> Array:
-    """Where the passenger is: 0 to 3 a stop, 4 in the taxi."""
+    """Return where the passenger is: 0 to 3 a stop, 4 in the taxi."""
     return (obs // 4) % 5
 
 

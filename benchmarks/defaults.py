@@ -60,7 +60,7 @@ CASES = (
 
 
 def at_random(name: str) -> float:
-    """The mean return of a random policy."""
+    """Return the mean return of a random policy."""
     env = gym.make(name)
     env.action_space.seed(0)
     returns = []
@@ -76,16 +76,22 @@ def at_random(name: str) -> float:
 
 
 def learn(case: Case, seed: int, compile: bool) -> dict[str, Any]:
-    """One run, scored on Gymnasium's environment with seeds that training never saw."""
+    """Train once; return the score on Gymnasium's environment with seeds new to training."""
     algorithm = ALGORITHMS[case.algorithm]
     found, seconds = scored(EnvSpec(case.env), algorithm, case.steps, seed, EPISODES, compile)
     score, chance = found.mean, at_random(case.env)
     share = (score - chance) / (case.reference - chance)
     return {
-        "algorithm": case.algorithm, "env": case.env, "steps": case.steps, "seed": seed,
-        "score": round(score, 1), "random": round(chance, 1), "reference": case.reference,
-        "share": round(share, 2), "seconds": round(seconds),
-    }  # fmt: skip
+        "algorithm": case.algorithm,
+        "env": case.env,
+        "steps": case.steps,
+        "seed": seed,
+        "score": round(score, 1),
+        "random": round(chance, 1),
+        "reference": case.reference,
+        "share": round(share, 2),
+        "seconds": round(seconds),
+    }
 
 
 def main() -> None:

@@ -52,7 +52,7 @@ def agreement(run: Run, runner: Any, episodes: int) -> dict[str, Any]:
 
 
 def gap(run: Run, player: Player, obs: Array) -> float:
-    """By how little the best action beats the next: of the selector, and of the skill that acts."""
+    """Return the least lead of the best action over the next: of selector and acting skill."""
     policy = run.policy
     assert isinstance(policy, HierarchyPolicy)
     acting = policy.skills.policies[int(player.memory["skill"][0])]
@@ -64,7 +64,7 @@ def gap(run: Run, player: Player, obs: Array) -> float:
 
 
 def seconds(act: Callable[[Any], Any], reset: Callable[[], None], seen: list[Array]) -> float:
-    """Of one call, over all observations."""
+    """Return the seconds of one call, over all observations."""
     reset()
     started = time.perf_counter()
     for obs in seen:
@@ -73,7 +73,7 @@ def seconds(act: Callable[[Any], Any], reset: Callable[[], None], seen: list[Arr
 
 
 def observations(run: Run, steps: int) -> list[Array]:
-    """What the policy sees in its own episodes."""
+    """Return what the policy sees in its own episodes."""
     env: gym.Env[Any, Any] = run.declaration.spec.make()
     seen: list[Array] = []
     while len(seen) < steps:
@@ -118,9 +118,12 @@ def main() -> None:
         found = agreement(run, runner, given.episodes)
     here, there, ratio = (median(t[i] for t in times) for i in range(3))
     result = found | {
-        "export_s": exporting, "here_us": 1e6 * here, "runner_us": 1e6 * there, "ratio": ratio,
+        "export_s": exporting,
+        "here_us": 1e6 * here,
+        "runner_us": 1e6 * there,
+        "ratio": ratio,
         "runner_us_best": 1e6 * min(t[1] for t in times),
-    }  # fmt: skip
+    }
     row = ("episodes", "alike", "ties", "steps", "here_us", "runner_us", "ratio")
     print(table(row, [[f"{result[k]:.4g}" for k in row]]))
     report("export", result)

@@ -6,7 +6,7 @@
 After Sutton, Precup & Singh 1999, sec. 2 and 3: skills are the eight hallway skills (H), the four
 moves (A), or both (A+H). Errors are shares of the range of the exact values. Exact values come
 from ``semi_mdp``, and those of counts from the same equations, with a model counted from the
-decisions of the library's collector: they say what so many decisions can tell at all.
+decisions of the library's collector: they show what this number of decisions can reveal.
 """
 
 from __future__ import annotations
@@ -78,19 +78,42 @@ SETS: dict[str, Callable[[], list[Skill]]] = {
 # for its end to average over many samples: with 0.01 the largest error was 1.6 times that of the
 # counts (H, 6M steps, seed 0), with 5e-4 it is nearly theirs. More steps mend what is left.
 VALUES = DQN(
-    num_envs=512, gamma=GAMMA, network=Network(()), exploration_final_eps=1.0, loss="mse",
-    learning_rate=5e-4, learning_rate_schedule="linear", batch_size=1024, update_ratio=1 / 64,
-    tau=0.02, buffer_size=4_000_000,
-)  # fmt: skip
+    num_envs=512,
+    gamma=GAMMA,
+    network=Network(()),
+    exploration_final_eps=1.0,
+    loss="mse",
+    learning_rate=5e-4,
+    learning_rate_schedule="linear",
+    batch_size=1024,
+    update_ratio=1 / 64,
+    tau=0.02,
+    buffer_size=4_000_000,
+)
 JUDGED = PPO(
-    num_envs=512, n_steps=16, gamma=GAMMA, network=Network(()), normalize_obs=False,
-    learning_rate=3e-3, batch_size=256, update_epochs=4, gae_lambda=0.98,
-)  # fmt: skip
+    num_envs=512,
+    n_steps=16,
+    gamma=GAMMA,
+    network=Network(()),
+    normalize_obs=False,
+    learning_rate=3e-3,
+    batch_size=256,
+    update_epochs=4,
+    gae_lambda=0.98,
+)
 CURVE: dict[str, Any] = {
-    "num_envs": 1, "gamma": GAMMA, "network": Network(()), "learning_rate": 0.01, "loss": "mse",
-    "learning_starts": 500, "exploration_fraction": 0.02, "exploration_final_eps": 0.1,
-    "batch_size": 128, "update_ratio": 0.25, "buffer_size": 100_000,
-}  # fmt: skip
+    "num_envs": 1,
+    "gamma": GAMMA,
+    "network": Network(()),
+    "learning_rate": 0.01,
+    "loss": "mse",
+    "learning_starts": 500,
+    "exploration_fraction": 0.02,
+    "exploration_final_eps": 0.1,
+    "batch_size": 128,
+    "update_ratio": 0.25,
+    "buffer_size": 100_000,
+}
 HALLWAYS = (NORTH, WEST, EAST, SOUTH)
 SHOWN = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1_000)
 
@@ -99,7 +122,7 @@ SHOWN = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1_000)
 
 
 def process_of(goal: int) -> Process:
-    """The moves of the environment, from its plan alone; nothing follows the goal."""
+    """Return the moves of the environment, from its plan alone; nothing follows the goal."""
     states = np.arange(len(PLACES))
     chance = np.zeros((len(PLACES), 4, len(PLACES)))
     for action, move in itertools.product(range(4), range(4)):
@@ -117,7 +140,7 @@ def option_of(skill: Any) -> Option:
 
 
 def exact(goal: int, skills: list[Skill], gamma: float = GAMMA) -> Model:
-    """The exact model of skills."""
+    """Return the exact model of skills."""
     return model_of(process_of(goal), [option_of(s) for s in skills], gamma)
 
 
@@ -172,7 +195,7 @@ class ManyRooms:
 def collector_of(
     skills: list[Skill], config: AlgorithmConfig, goal: int, state: Any = None
 ) -> tuple[DecisionCollector, Stack]:
-    """A selector over skills in environments that begin anywhere, and its fresh learner."""
+    """Return a selector over skills in environments that begin anywhere, and its fresh learner."""
     policies: Any = tuple(ready_policy(s) for s in skills)
     space = FourRooms.observation_space
     choices: Any = type(space)(len(skills))
@@ -217,7 +240,7 @@ class Counting(Collectors):
 
 
 def learnt(skills: list[Skill], config: Any, goal: int, steps: int, seed: int) -> Any:
-    """A selector that was trained for ``steps``: its algorithm and state, and what was counted."""
+    """Train a selector for ``steps``; return its algorithm, its state and the counts."""
     seeds = Seeds(seed)
     collector, stack = collector_of(skills, config, goal)
     stack.state = stack.algorithm.init([seeds / "member"])
@@ -240,8 +263,8 @@ def errors(found: Array, right: Array) -> dict[str, float]:
     return {"largest": float(wrong.max()), "mean": float(wrong.mean())}
 
 
-def told(algorithm: Any, state: Any, model: Model) -> tuple[Array, Array]:
-    """What a learner says of all cells: values or logits (S, O), and V (S,), in float64."""
+def outputs(algorithm: Any, state: Any, model: Model) -> tuple[Array, Array]:
+    """Return a learner's outputs for all cells: values or logits (S, O), and V (S,), in float64."""
     obs = torch.arange(len(PLACES))[None]
     mask = torch.from_numpy(model.allowed)[None]
     with torch.inference_mode():
@@ -251,12 +274,12 @@ def told(algorithm: Any, state: Any, model: Model) -> tuple[Array, Array]:
 
 
 def values(kind: str, goal: str, which: str, steps: int, seed: int) -> list[dict[str, Any]]:
-    """Errors of a DQN's Q* and of the counted model's, or of PPO's value of its own policy."""
+    """Return the errors of a DQN's Q* and of the counted model's, or of PPO's value."""
     started, skills = time.perf_counter(), SETS[which]()
     config: Any = VALUES if kind == "DQN" else JUDGED
     model = exact(GOALS[goal], skills)
     algorithm, state, counted = learnt(skills, config, GOALS[goal], steps, seed)
-    head, value = told(algorithm, state, model)
+    head, value = outputs(algorithm, state, model)
     here = np.arange(len(PLACES)) != GOALS[goal]
     known = model.allowed & here[:, None]
     about = {"goal": goal, "skills": which, "steps": steps, "seed": seed}
@@ -298,7 +321,7 @@ class Noted(FourRooms):
 
 
 def curve(which: str, goal: str, steps: int, seed: int) -> list[int]:
-    """Steps of each episode while the library's DQN learns; "flat" is without skills."""
+    """Return the steps of each episode while the library's DQN learns; "flat" is without skills."""
     lengths: list[int] = []
     env = EnvSpec(partial(Noted, lengths, GOALS[goal]), engine="sync", workers=1)
     declared: Any
@@ -320,7 +343,7 @@ def curve(which: str, goal: str, steps: int, seed: int) -> list[int]:
 
 
 def tabular(which: str, goal: str, episodes: int, seed: int, rate: float = 0.25) -> list[int]:
-    """The paper's own semi-MDP Q-learning on a table (eq. 11), ε = 0.1; with A it is flat."""
+    """Run the paper's semi-MDP Q-learning on a table (eq. 11), ε = 0.1; with A it is flat."""
     rng = np.random.default_rng(seed)
     options = [option_of(s) for s in SETS[which]()]
     q = np.where(np.stack([o.starts for o in options], 1), 0.0, -np.inf)

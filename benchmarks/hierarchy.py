@@ -24,7 +24,7 @@ from benchmarks.common import median, report, run_command, table
 
 
 def declared(recipe: str, settings: list[str]) -> Any:
-    """A recipe's hierarchy with other settings."""
+    """Return a recipe's hierarchy with other settings."""
     from skillweave import recipes
     from skillweave.cli.overrides import apply_overrides
 

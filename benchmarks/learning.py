@@ -1,4 +1,4 @@
-"""What each algorithm learns, with settings that are the same for all seeds.
+"""Results of each algorithm, with the same settings for all seeds.
 
     python -m benchmarks.learning [dqn sac td3 ppo default-ppo …] [--seeds 0 1 2 3 4] [--compile]
 
@@ -65,9 +65,13 @@ BLIND = EnvSpec("CartPole-v1", wrappers=(NoVelocities,))
 FREEWAY = EnvSpec(functools.partial(minatar, "freeway"))
 
 REPLAY: dict[str, Any] = {
-    "num_envs": 8, "learning_rate": 1e-3, "learning_rate_schedule": "linear", "gamma": 0.99,
-    "tau": 0.01, "compile": True,
-}  # fmt: skip
+    "num_envs": 8,
+    "learning_rate": 1e-3,
+    "learning_rate_schedule": "linear",
+    "gamma": 0.99,
+    "tau": 0.01,
+    "compile": True,
+}
 RECURRENT = PPO(
     gamma=0.99,
     gae_lambda=0.95,

@@ -31,26 +31,26 @@ EPISODES = 100
 
 
 def settings(calls: str) -> dict[str, Any]:
-    """Of the hierarchy, for calls of so many steps, or of chosen lengths."""
+    """Return the hierarchy's settings, for calls of a number of steps or of chosen lengths."""
     if calls == CHOSEN:
         return {"call_steps": LENGTHS, "interrupt": True}
     return {"call_steps": int(calls)}
 
 
 def skills_of(seed: int, out: Path) -> dict[str, Any]:
-    """The skills that are learnt from a seed, or were before."""
+    """Return the skills that are learnt from a seed, or were before."""
 
-    def nobody(obs: Array) -> Array:
+    def no_selector(obs: Array) -> Array:
         return np.zeros(len(obs), np.int64)
 
-    hierarchy, path = mazes.declare(selector=nobody), out / f"skills-{seed}"
+    hierarchy, path = mazes.declare(selector=no_selector), out / f"skills-{seed}"
     run = hierarchy.load(path) if path.exists() else hierarchy.train(path, seed=seed, quiet=True)
     policy: Any = run.policy
     return dict(zip(policy.labels, policy.skills.policies, strict=True))
 
 
 def score(calls: str, seed: int, steps: int, out: Path) -> float:
-    """The share of episodes that reach the goal."""
+    """Return the share of episodes that reach the goal."""
     file = out / f"{calls}-{steps}-{seed}.json"
     if file.exists():
         return float(json.loads(file.read_text())["score"])

@@ -31,7 +31,7 @@ SELECTOR = DQN(
 )
 # Near the ground a landing is worth +100 and a crash -100, and whether to land at all is decided by
 # how likely each is. Huber learns the median of such returns and lands half of the time (106), mse
-# their mean (239), but hovers for ever with other seeds; a distribution of returns (C51) does not.
+# their mean (239), but hovers forever with other seeds; a distribution of returns (C51) does not.
 # A network of 64-64, which is enough for PPO, scored 193.6 at worst (five seeds).
 SKILL = DQN(
     num_envs=64,
@@ -56,7 +56,7 @@ SKILL = DQN(
 
 
 def selected(folder: Path, seed: int, dqn: bool) -> float:
-    """The score of a selector over the shipped skills."""
+    """Return the score of a selector over the shipped skills."""
     shipped: Any = Hierarchy.pretrained("lunar-lander")
     hierarchy = recipes.load("lunar-lander")
     for skill, policy in zip(hierarchy.skills, shipped.policy.skills.policies, strict=True):
@@ -68,7 +68,7 @@ def selected(folder: Path, seed: int, dqn: bool) -> float:
 
 
 def learn(seed: int, dqn_skills: bool) -> dict[str, Any]:
-    """Scores of all for one seed."""
+    """Return the scores of all for one seed."""
     scores: dict[str, Any] = {"seed": seed}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -28,7 +28,7 @@ CASES = ("together", "apart", "apart, then together", "flat")
 
 
 def declare(case: str, steps: int) -> Hierarchy:
-    """The hierarchy, with so many steps in all: seven stages apart, if there are any."""
+    """Return the hierarchy with ``steps`` in all: seven stages apart, if there are any."""
     if case in ("together", "flat"):
         return nested.declare(steps, train_defaults=TrainDefaults(checkpoint_every=10_000))
     apart = steps if case == "apart" else steps // 2
@@ -47,7 +47,7 @@ def train(case: str, steps: int, seed: int, path: Path) -> None:
 
 
 def killed(case: str, steps: int, seed: int, path: Path) -> RunDirectory:
-    """A run whose process was killed in the middle of its last stage, and that was resumed."""
+    """Train a run, kill its process in the middle of its last stage, and resume it."""
     process = multiprocessing.get_context("spawn").Process(
         target=train, args=(case, steps, seed, path), daemon=True
     )
@@ -72,14 +72,12 @@ def _half_done(path: Path) -> bool:
 
 
 def weights(run: RunDirectory) -> dict[str, dict[str, bytes]]:
-    """All that every stage has learnt."""
+    """Return all that every stage has learnt."""
     return {
-        f"{stage['name']}.{name}": {
-            k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()
-        }
+        f"{stage['name']}.{name}": {k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()}
         for stage in run.manifest["stages"]
         for name, policy in run.load_policies(stage["name"]).items()
-    }  # fmt: skip
+    }
 
 
 def one(case: str, steps: int, seed: int) -> dict[str, Any]:
@@ -99,9 +97,14 @@ def one(case: str, steps: int, seed: int) -> dict[str, Any]:
     solved = float(np.mean(np.array(found.returns) > 1))
     usage = found.to_json()["skill_usage"]
     return {
-        "seed": seed, "solved": solved, "length": float(np.mean(found.lengths)), "steps": spent,
-        "seconds": seconds, "usage": usage, "same": same,
-    }  # fmt: skip
+        "seed": seed,
+        "solved": solved,
+        "length": float(np.mean(found.lengths)),
+        "steps": spent,
+        "seconds": seconds,
+        "usage": usage,
+        "same": same,
+    }
 
 
 def main() -> None:
@@ -115,13 +118,13 @@ def main() -> None:
             found[case] = runs = [future.result() for future in pending]
             solved = [r["solved"] for r in runs]
             same = [r["same"] for r in runs]
-            told = "–" if None in same else f"same {sum(same)}/{len(same)}"
+            repeats = "–" if None in same else f"same {sum(same)}/{len(same)}"
             length = f"{median(r['length'] for r in runs):.1f}"
             steps = f"{median(r['steps'] for r in runs):,.0f}"
             seconds = f"{median(r['seconds'] for r in runs):.0f}"
             each = " ".join(f"{x:.0%}" for x in solved)
             score = f"{median(solved):.0%}", f"{min(solved):.0%}"
-            rows.append((case, *score, length, steps, seconds, told, each))
+            rows.append((case, *score, length, steps, seconds, repeats, each))
             print(table(head, rows), flush=True)
     report("nested", {"seeds": asked.seeds, "steps": asked.steps, "cases": found})
 

@@ -40,14 +40,20 @@ THREADS = {"small": 1, "zoo": 2}  # for both: one is faster where the matrices a
 
 
 def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float:
-    """Steps/s after the warm-up: one gradient step for each environment step."""
+    """Return steps/s after the warm-up: one gradient step for each environment step."""
     kind: Any = {"dqn": DQN, "sac": SAC, "td3": TD3}[name]
     extra = {"double": False} if name == "dqn" else {}
     config = kind(
-        num_envs=ENVIRONMENTS, update_ratio=1.0, learning_starts=WARM_UP, batch_size=BATCH[name],
-        buffer_size=50_000, network=Network(SIZES[name][size], "relu"), threads=THREADS[size],
-        compile=compile, **extra,
-    )  # fmt: skip
+        num_envs=ENVIRONMENTS,
+        update_ratio=1.0,
+        learning_starts=WARM_UP,
+        batch_size=BATCH[name],
+        buffer_size=50_000,
+        network=Network(SIZES[name][size], "relu"),
+        threads=THREADS[size],
+        compile=compile,
+        **extra,
+    )
     # The same engine as theirs.
     ticks: list[Tick] = []
     spec = EnvSpec(ENVS[name], engine="sync")
@@ -57,7 +63,7 @@ def ours(name: str, size: str, steps: int, seed: int, *, compile: bool) -> float
 
 
 def theirs(name: str, size: str, steps: int, seed: int) -> float:
-    """The same with Stable-Baselines3."""
+    """Return the steps/s of Stable-Baselines3."""
     import stable_baselines3 as sb3
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
@@ -69,9 +75,13 @@ def theirs(name: str, size: str, steps: int, seed: int) -> float:
             return True
 
     common: dict[str, Any] = {
-        "batch_size": BATCH[name], "buffer_size": 50_000, "learning_starts": WARM_UP,
-        "policy_kwargs": {"net_arch": list(SIZES[name][size])}, "device": "cpu", "seed": seed,
-    }  # fmt: skip
+        "batch_size": BATCH[name],
+        "buffer_size": 50_000,
+        "learning_starts": WARM_UP,
+        "policy_kwargs": {"net_arch": list(SIZES[name][size])},
+        "device": "cpu",
+        "seed": seed,
+    }
     env = make_vec_env(ENVS[name], n_envs=ENVIRONMENTS, seed=seed)
     kind: Any = {"dqn": sb3.DQN, "sac": sb3.SAC, "td3": sb3.TD3}[name]
     model = kind("MlpPolicy", env, train_freq=1, gradient_steps=-1, **common)
@@ -82,7 +92,7 @@ def theirs(name: str, size: str, steps: int, seed: int) -> float:
 
 
 def floor(name: str, size: str) -> float:
-    """Updates/s if an update were nothing but the matrix products of its hidden layers."""
+    """Return updates/s if an update were only the matrix products of its hidden layers."""
     torch.set_num_threads(THREADS[size])
     n_in, n_out = SIZES[name][size]
     x, w = torch.randn(BATCH[name], n_in), torch.randn(n_in, n_out)

@@ -34,10 +34,10 @@ EPISODES = 50
 
 
 class Task(Skill):
-    """What the environment pays."""
+    """A skill with the environment's own reward."""
 
     def reward(self, step: Step) -> Array:
-        """The same."""
+        """Return the environment's reward."""
         return step.reward
 
 

@@ -1,4 +1,4 @@
-"""What a population costs, and that its members learn what they would learn alone.
+"""Costs of a population, and a check that its members learn as they would alone.
 
     python -m benchmarks.population [--seeds 0 1 2] [--agilerl PYTHON]
 
@@ -41,7 +41,7 @@ AGILERL = Path(__file__).with_name("agilerl_population.py")
 
 
 def speed(members: int, config: PPO, steps: int, seed: int) -> float:
-    """Steps/s of a population's training, all members' steps counted."""
+    """Return steps/s of a population's training, all members' steps counted."""
     population = Population.fresh(config, Evolution(), skill_scene(LANDER), Seeds(seed))
     population.members = population.members[:members]
     started = time.perf_counter()

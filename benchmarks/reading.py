@@ -1,4 +1,4 @@
-"""What must be read to follow one gradient from the environment to the weights.
+"""Length of the code to read in order to follow one gradient from environment to weights.
 
     python -m benchmarks.reading
 
@@ -40,7 +40,7 @@ ROUNDS: dict[str, tuple[str, Any]] = {
 
 
 def one_round(env: str, config: Any, steps: int) -> Callable[[], None]:
-    """A function that collects and learns, everything made before."""
+    """Return a function that collects and learns, everything made before."""
     scene = skill_scene(EnvSpec(env, engine="sync"))
     algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
     stack = Stack(algorithm, algorithm.init([Seeds(0)]))
@@ -55,7 +55,7 @@ def void(_: Any) -> None:
 
 
 def watched(run: Callable[[], None]) -> set[CodeType]:
-    """The library's functions that ran."""
+    """Return the library's functions that ran."""
     found: set[CodeType] = set()
 
     def note(frame: FrameType, event: str, _: Any) -> None:
@@ -73,7 +73,7 @@ def watched(run: Callable[[], None]) -> set[CodeType]:
 
 
 def walk(algorithm: str) -> dict[str, list[str]]:
-    """By file, the functions that the page names for this algorithm."""
+    """Return by file the functions that the page names for this algorithm."""
     section = PAGE.read_text().split(f"## {algorithm}")[1].split("\n## ")[0]
     found: dict[str, list[str]] = {}
     for line in section.splitlines():
@@ -84,7 +84,7 @@ def walk(algorithm: str) -> dict[str, list[str]]:
 
 
 def lines_of(codes: set[CodeType]) -> int:
-    """The lines of functions, docstrings included; of one inside another, once."""
+    """Return the lines of functions, docstrings included; of one inside another, once."""
     return sum(len(inspect.getsourcelines(c)[0]) for c in codes if "<" not in c.co_qualname)
 
 
@@ -108,7 +108,7 @@ def on_the_walk(algorithm: str, codes: set[CodeType]) -> set[CodeType]:
 
 
 def counted(codes: set[CodeType], sizes: dict[str, int]) -> dict[str, int]:
-    """How many files and lines these functions are; ``sizes`` are the lines of whole files."""
+    """Return the number of files and lines of functions; ``sizes``: the lines of whole files."""
     files = {file_of(c) for c in codes}
     whole = sum(sizes[file] for file in files)
     return {"files": len(files), "lines": lines_of(codes), "of whole files": whole}

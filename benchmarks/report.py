@@ -23,7 +23,7 @@ SKILLWEAVE = (sys.executable, "-m", "skillweave")
 
 
 def in_browser(path: Path) -> dict[str, Any]:
-    """What the console said, what was asked of a network, and serious findings of axe-core."""
+    """Return the console's messages, network requests, and serious findings of axe-core."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         return {"browser": None}
@@ -67,10 +67,10 @@ def main() -> None:
         page = Path(folder) / "report.html"
         began = time.perf_counter()
         words = ["report", str(run), "-o", str(page), "--json"]
-        told = json.loads(run_command([*SKILLWEAVE, *words], capture=True).stdout)
+        page_result = json.loads(run_command([*SKILLWEAVE, *words], capture=True).stdout)
         seconds = time.perf_counter() - began
-        size = {"megabytes": round(told["bytes"] / 1e6, 2), "seconds": round(seconds, 2)}
-        report("report", size | {"missing": told["missing"]} | in_browser(page))
+        size = {"megabytes": round(page_result["bytes"] / 1e6, 2), "seconds": round(seconds, 2)}
+        report("report", size | {"missing": page_result["missing"]} | in_browser(page))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ COLLECTORS = 2
 
 
 def rllib(steps: int, make: Callable[[], Any]) -> float:
-    """Steps per second of RLlib's PPO."""
+    """Return steps per second of RLlib's PPO."""
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
     from ray.tune.registry import register_env

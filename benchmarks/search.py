@@ -39,15 +39,21 @@ PRIOR = {
     "clip_coef": Range(0.05, 0.5),
 }
 MUTATIONS = Mutations(
-    none=0.2, hyperparameters=0.6, parameters=0.0, architecture=0.2, activation=0.0,
-    ranges=PRIOR, units=(16, 256), layers=(1, 3),
-)  # fmt: skip
-# A generation is short, and while nobody can land its best member is so by chance. By truncation
+    none=0.2,
+    hyperparameters=0.6,
+    parameters=0.0,
+    architecture=0.2,
+    activation=0.0,
+    ranges=PRIOR,
+    units=(16, 256),
+    layers=(1, 3),
+)
+# A generation is short, and while no member can land, the best one is so by chance. By truncation
 # that member replaces the worst one only; by tournaments all others may be replaced at once.
 EVOLVED = Evolution(
     4, GENERATIONS, episodes=20, start="random", selection=Truncation(), mutations=MUTATIONS
 )
-# One generation: whoever is best at the end of training.
+# One generation: the member that is best at the end of training.
 RANDOM = {draws: replace(EVOLVED, population=draws, generations=1) for draws in (4, 8)}
 MEMBER = PPO(
     num_envs=16,
@@ -70,9 +76,14 @@ def search(way: str, seed: int) -> dict[str, Any]:
     config, steps, evolve = WAYS[way]
     with tempfile.TemporaryDirectory() as folder:
         run = train_agent(
-            "LunarLander-v3", config, steps, Path(folder) / "run", seed=seed, quiet=True,
+            "LunarLander-v3",
+            config,
+            steps,
+            Path(folder) / "run",
+            seed=seed,
+            quiet=True,
             evolve=evolve,
-        )  # fmt: skip
+        )
         score = run.evaluate(100)
         (stage,) = run.info()["stages"]
     return {

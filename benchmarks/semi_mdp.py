@@ -37,7 +37,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Model:
-    """What calls of O skills bring."""
+    """The outcomes of calls of O skills."""
 
     reward: Array
     """(S, O), the expected Σ γᵏ rₖ of a call."""
@@ -48,7 +48,7 @@ class Model:
 
 
 def model_of(process: Process, options: list[Option], gamma: float) -> Model:
-    """The multi-time models (eq. 5 and 6), solved for the states where a call goes on."""
+    """Return the multi-time models (eq. 5 and 6), solved for the states where a call goes on."""
     states = np.arange(len(process.reward))
     reward, after = [], []
     for option in options:

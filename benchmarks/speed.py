@@ -20,16 +20,24 @@ from skillweave import Hierarchy, HierarchyPolicy, recipes
 
 
 def stable_baselines3(steps: int, seed: int) -> float:
-    """Steps/s of SB3's PPO with rl-zoo3's settings, 16 environments in one process."""
+    """Return steps/s of SB3's PPO with rl-zoo3's settings, 16 environments in one process."""
     import stable_baselines3 as sb3
     import torch
     from stable_baselines3.common.env_util import make_vec_env
 
     env = make_vec_env("LunarLander-v3", n_envs=16, seed=seed)
     model = sb3.PPO(
-        "MlpPolicy", env, n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4,
-        ent_coef=0.01, device="cpu", seed=seed,
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        n_steps=1024,
+        batch_size=64,
+        gae_lambda=0.98,
+        gamma=0.999,
+        n_epochs=4,
+        ent_coef=0.01,
+        device="cpu",
+        seed=seed,
+    )
     threads = torch.get_num_threads()
     started = time.perf_counter()
     model.learn(steps)
@@ -39,17 +47,17 @@ def stable_baselines3(steps: int, seed: int) -> float:
 
 
 def flat(seed: int, steps: int) -> tuple[float, float]:
-    """Steps/s of the flat agent, and of EnvPool alone fed with its calls."""
+    """Return steps/s of the flat agent, and of EnvPool alone fed with its calls."""
     hierarchy = recipes.load("lunar-lander")
     hierarchy.scale(steps / hierarchy.total_steps)
     return trained(hierarchy, seed, True)
 
 
 def selector(seed: int) -> tuple[float, float]:
-    """Steps/s of the selector over the shipped skills, and of EnvPool alone fed with its calls."""
+    """Return steps/s of the selector over shipped skills, and of EnvPool fed with its calls."""
     run = Hierarchy.pretrained("lunar-lander")
-    hierarchy, woven = run.hierarchy, cast(HierarchyPolicy, run.policy)
-    for skill, policy in zip(hierarchy.skills, woven.skills.policies, strict=True):
+    hierarchy, policy_of_run = run.hierarchy, cast(HierarchyPolicy, run.policy)
+    for skill, policy in zip(hierarchy.skills, policy_of_run.skills.policies, strict=True):
         act_by(skill, policy)
     return trained(hierarchy, seed, False)
 

@@ -1,4 +1,4 @@
-"""What learning together is worth on chains of skills, against flat agents.
+"""The benefit of learning together on chains of skills, against flat agents.
 
     python -m benchmarks.together [CASE …] [--task 8x8] [--seeds 0 1 2 3 4] [--steps 500000]
 
@@ -13,7 +13,7 @@ training steps EnvPool's, or with ``--engine sync`` Gymnasium's. Two runs go sid
 (``--processes``), so the seconds are those of a busy machine.
 
 Flat agents: ``flat`` (F0), ``"skill rewards x 0.1"`` and other weights (F1), ``bonus`` (F2). With
-``--f4`` the skills of each hierarchy are also scored without its selector: chosen by lot, and each
+``--f4`` the skills of each hierarchy are also scored without its selector: random choices, and each
 alone. F2 trains in MiniGrid's own environment. (F3, fine-tuned from another task, does not exist
 here: there is one task.)
 """
@@ -44,7 +44,7 @@ EPSILONS = {"epsilon": 0.1, "epsilon_final": 0.0}
 
 
 def together(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Skills and selector from the same steps, from nothing."""
+    """Train skills and selector from the same steps, from nothing."""
     single = {name: how.pop(name) for name in PLACES.keys() & how.keys()}
     found = task.declare(steps, workers=1, **how)  # runs go side by side
     regroup(found, **single)
@@ -52,13 +52,13 @@ def together(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """The same with other settings of learning together (fields of ``Together``)."""
+    """Train together with other settings (fields of ``Together``)."""
     own = together(task, steps).together
     return together(task, steps, together=replace(own, **changed), **how)
 
 
 def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """Skills apart, each after calls of those before, then the selector."""
+    """Train skills apart, each after calls of those before, then the selector."""
     *each, last = [steps * part // sum(task.parts) for part in task.parts]
     asked: dict[str, Any] = {
         "learn": "apart",
@@ -75,18 +75,18 @@ def apart(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def then(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """The first half of the steps apart, the second together."""
+    """Train the first half of the steps apart, the second together."""
     return apart(task, steps // 2, learn="apart, then together", together_steps=steps // 2, **how)
 
 
 def then_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """``then`` with other settings of learning together (fields of ``Together``)."""
+    """Train as ``then`` with other settings of learning together (fields of ``Together``)."""
     own = then(task, steps).together
     return then(task, steps, together=replace(own, **changed), **how)
 
 
 def limit_ends(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """A skill's value ends where its call reaches the limit, as if nothing came after it."""
+    """Let a skill's value end where its call reaches the limit, as if nothing came after it."""
     usual = together(task, steps, **how)
     if usual.learn != "together":
         raise SkillweaveError("limit ends: skills that learn apart have no calls that end it")
@@ -98,7 +98,7 @@ def limit_ends(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def _ended_after(limit: int, kind: type[Skill]) -> type[Skill]:
-    """The same skill, but that it stops by itself after so many steps; success is what it was."""
+    """Return the skill with an end of its own after ``steps``; its success stays."""
     usual = kind()
 
     class Ended(kind):  # type: ignore[misc, valid-type]
@@ -115,7 +115,7 @@ def _ended_after(limit: int, kind: type[Skill]) -> type[Skill]:
 
 
 def learnt_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """Skills and selector with other settings of their algorithms."""
+    """Train skills and selector with other settings of their algorithms."""
     found = together(task, steps, **how)
     skills: list[tuple[Any, str]] = [(skill, "algorithm") for skill in found.skills]
     for who, name in [*skills, (found, "algorithm"), (found, "selector")]:
@@ -125,7 +125,7 @@ def learnt_otherwise(task: Task, steps: int, changed: Mapping[str, Any], **how: 
 
 
 def one_advantage_scale(task: Task, steps: int, **how: Any) -> Hierarchy:
-    """All advantages stay in units of reward: nobody divides them by their own deviation.
+    """Keep all advantages in units of reward, not divided by their own deviation.
 
     Raises:
         SkillweaveError: skills learn from the task's advantage, too, which is always divided.
@@ -146,7 +146,7 @@ def no_imitation(task: Task, steps: int, who: tuple[str, ...], **how: Any) -> Hi
 
 
 def _alike(hierarchy: Hierarchy) -> Hierarchy:
-    """The same, whose skills all learn by one algorithm, so that a case changes that of all."""
+    """Return the hierarchy with one algorithm for all skills, so that a case changes all."""
     for skill in hierarchy.skills:
         if skill.algorithm is not None:
             raise SkillweaveError(f"skill {skill.name!r} has an algorithm of its own: no such case")
@@ -162,7 +162,7 @@ def less_entropy(task: Task, steps: int, **how: Any) -> Hierarchy:
 
 
 def flat(task: Task, steps: int, weight: float = 0.0, bonus: float = 0.0, **how: Any) -> Flat:
-    """One plain agent that learns as the skills do, or as the recipe says that one learns.
+    """Train one plain agent with the skills' settings, or the recipe's for a plain agent.
 
     Args:
         weight: of the skills' rewards, which it has beside the task's (F1).
@@ -207,7 +207,7 @@ CASES: dict[str, Callable[..., Hierarchy | Flat]] = {
     **{f"skill rewards x {w}": functools.partial(flat, weight=w) for w in (1.0, 0.3, 0.1, 0.03)},
     "bonus": functools.partial(flat, bonus=0.1),
 }
-"""By name, who learns a task in so many steps."""
+"""By name, the function that makes the learner of a task with a number of steps."""
 BASES = ("together", "apart", "then")
 """Of these the others are variants."""
 
@@ -217,12 +217,12 @@ def check_case(case: str, task: str) -> None:
     made = CASES[case](TASKS[task], 1_000)
     for other in BASES:
         base = CASES[other](TASKS[task], 1_000)
-        if other != case and _told(made) == _told(base):
+        if other != case and _settings(made) == _settings(base):
             raise SkillweaveError(f"{case!r} is the same as {other!r} on {task}: leave it out")
 
 
-def _told(learner: Hierarchy | Flat) -> Any:
-    """All that a case says."""
+def _settings(learner: Hierarchy | Flat) -> Any:
+    """Return all settings of a case."""
     if isinstance(learner, Flat):
         return learner
     # Of a skill that was changed, the class is another one.
@@ -244,18 +244,18 @@ def one(case: str, task: str, steps: int, engine: str, f4: bool, seed: int) -> d
         seconds = time.perf_counter() - started
         score, usage = TASKS[task].score(run)
         stages = run.info()["stages"]
-        told = {"seed": seed, "score": score, "usage": usage, "seconds": seconds}
+        result = {"seed": seed, "score": score, "usage": usage, "seconds": seconds}
         if f4 and isinstance(same := declare(), Hierarchy):
-            told["f4"] = without_selector(run, same, TASKS[task], Path(folder) / "lot", seed)
-    told["steps"] = sum(s["steps"] + s["evaluation_steps"] for s in stages)
+            result["f4"] = without_selector(run, same, TASKS[task], Path(folder) / "lot", seed)
+    result["steps"] = sum(s["steps"] + s["evaluation_steps"] for s in stages)
     kept = stages[-1].get("kept")
-    return told | ({} if kept is None else {"kept": kept})
+    return result | ({} if kept is None else {"kept": kept})
 
 
 def without_selector(
     run: Run, same: Hierarchy, task: Task, path: Path, seed: int
 ) -> dict[str, float]:
-    """F4: the score of skills that were learnt when chosen by lot, and of each called alone."""
+    """Return F4: the score of the learnt skills chosen at random, and of each called alone."""
     policy: Any = run.policy
     for skill, learnt in zip(same.skills, policy.skills.policies, strict=True):
         act_by(skill, learnt)
@@ -263,7 +263,7 @@ def without_selector(
     regroup(same, greedy_skills=greedy)  # as in the run itself
     chosen = by_lot(same, seed).train(path, seed=seed, quiet=True)
     alone = {s.name: task.score(run, greedy, skill=s.name)[0] for s in same.skills}
-    return {"by lot": task.score(chosen)[0]} | alone
+    return {"at random": task.score(chosen)[0]} | alone
 
 
 def main() -> None:
@@ -289,10 +289,13 @@ def main() -> None:
             found[case] = runs = []
             for future in pending:
                 runs.append(future.result())
-                told = runs[-1]
-                said = f"{case}, seed {told['seed']}: {shown(told['score'])}"
+                result = runs[-1]
+                said = f"{case}, seed {result['seed']}: {shown(result['score'])}"
                 print(
-                    said, told["usage"], *(told[k] for k in ("kept", "f4") if k in told), flush=True
+                    said,
+                    result["usage"],
+                    *(result[k] for k in ("kept", "f4") if k in result),
+                    flush=True,
                 )
             scores = [r["score"] for r in runs]
             seconds = f"{median(r['seconds'] for r in runs):.0f}"

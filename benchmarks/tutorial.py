@@ -28,14 +28,14 @@ TEXT = ROOT / "tests/compat/tutorial.txt"
 
 
 def script(text: Path, episodes: int, root: str) -> str:
-    """The full training code with so many episodes, on the library under ``root``."""
+    """Return the full training code with ``episodes``, on the library under ``root``."""
     code = text.read_text().split("Full training code\n\nFull code\n")[1]
     code = code.replace('"EPISODES": 1000', f'"EPISODES": {episodes}')
     return re.sub(r"^from agilerl\b", f"from {root}", code, flags=re.M)
 
 
 def seconds(python: str, code: str) -> tuple[float, float]:
-    """By the clock and of the processors, of a script in a process and a folder of its own.
+    """Return wall and processor seconds of a script in a process and a folder of its own.
 
     The interpreter's start is included. On a busy machine the processors' is the one to compare.
     """
@@ -58,7 +58,7 @@ def seconds(python: str, code: str) -> tuple[float, float]:
 
 
 def acting(calls: int = 5_000) -> float:
-    """Microseconds of ``getAction`` on one observation; the median of 5 runs."""
+    """Return microseconds of ``getAction`` on one observation; the median of 5 runs."""
     from skillweave.compat.agilerl.algorithms.ppo import PPO
 
     agent, obs = PPO([8], 4, False, True), np.zeros((1, 8), np.float32)

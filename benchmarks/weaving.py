@@ -1,4 +1,4 @@
-"""How long a selector for a new mission takes to learn, over skills that are there already.
+"""Training time of a selector for a new mission, over ready skills.
 
     python -m benchmarks.weaving RUN [RUN …] [--mission tour] [--seed 0] [--steps N]
 
@@ -29,7 +29,7 @@ EPISODES, FLAT_STEPS = 50, 200_000
 
 
 def flat_seconds() -> float:
-    """How long the baseline takes."""
+    """Return the training time of the baseline."""
     lander = recipes.load("lunar-lander")
     config = lander.train_defaults.flat or lander.algorithm
     started = time.perf_counter()
@@ -37,7 +37,7 @@ def flat_seconds() -> float:
     return time.perf_counter() - started
 
 
-def woven(source: Path, mission: str, seed: int, steps: int | None) -> dict[str, Any]:
+def trained_selector(source: Path, mission: str, seed: int, steps: int | None) -> dict[str, Any]:
     """Train a selector over a run's skills, and score it."""
     policy: Any = missions.declare().load(source).policy
     skills = dict(zip(policy.labels, policy.skills.policies, strict=True))
@@ -70,12 +70,17 @@ def main() -> None:
     warm_up()
     found = []
     for source in asked.runs:
-        found.append(woven(source, asked.mission, asked.seed, asked.steps))
+        found.append(trained_selector(source, asked.mission, asked.seed, asked.steps))
         rows = [
-            (r["run"], f"{r['steps']:,}", f"{r['seconds']:.1f}", f"{r['ratio']:.2f}",
-             f"{r['complete']:.0%}")
+            (
+                r["run"],
+                f"{r['steps']:,}",
+                f"{r['seconds']:.1f}",
+                f"{r['ratio']:.2f}",
+                f"{r['complete']:.0%}",
+            )
             for r in found
-        ]  # fmt: skip
+        ]
         header = ("skills of", "steps", "s", "÷ flat PPO's steps a second", "complete")
         print(table(header, rows), flush=True)
     ratios = [r["ratio"] for r in found]

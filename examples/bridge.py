@@ -2,7 +2,7 @@
 
     python examples/bridge.py
 
-A grid of 13 by 9 cells with a river. Whoever fetches the axe can fell the tree, whoever has the
+A grid of 13 by 9 cells with a river. An agent with the axe can fell the tree, an agent with the
 wood can build a bridge at the river, and the reward is paid on the other side alone. It needs no
 extra.
 """
@@ -71,8 +71,8 @@ class River(gym.Env[np.ndarray, np.int64]):
 
     def _seen(self) -> np.ndarray:
         built = self.bridge is not None
-        told = [*self.me, self.has_axe, self.has_wood, built, *self.axe, *self.tree]
-        return np.array([*told, -1 if self.bridge is None else self.bridge], np.float32)
+        numbers = [*self.me, self.has_axe, self.has_wood, built, *self.axe, *self.tree]
+        return np.array([*numbers, -1 if self.bridge is None else self.bridge], np.float32)
 
 
 class Get(sw.Skill):
@@ -117,7 +117,7 @@ class Build(Get):
 
 
 class Cross(sw.Skill):
-    """Reaches the far bank. It may start anywhere: nobody tells the selector when it is of use."""
+    """Reach the far bank. It may start anywhere: the selector must learn when it is of use."""
 
     max_steps = 20
 
@@ -132,12 +132,12 @@ class Cross(sw.Skill):
 
 
 def algorithm(**how: Any) -> sw.PPO:
-    """Who learns."""
+    """Return the learner's settings."""
     return sw.PPO(num_envs=16, n_steps=64, gamma=0.97, **how)
 
 
 def declare(steps: int = 500_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:
-    """The hierarchy; ``how`` changes any of its settings."""
+    """Return the hierarchy; ``how`` changes any of its settings."""
     settings = {
         "call_steps": None,  # a call lasts until its skill stops
         "steps": steps,

@@ -25,7 +25,7 @@ ROOM = "DoorKey-8x8"
 
 
 def make(render_mode: str | None = None, room: str = ROOM) -> gym.Env[Any, Any]:
-    """A room; observations are the 7×7 cells in view: kind, colour and state of each."""
+    """Return a room; observations are the 7×7 cells in view: kind, colour and state of each."""
     import minigrid  # noqa: F401, it registers the environments
     from minigrid.wrappers import ImgObsWrapper
 
@@ -44,7 +44,7 @@ class Image(sw.PoolWrapper):
 
 
 def many(num_envs: int, threads: int, seed: int, room: str = ROOM) -> Image:
-    """The same room in EnvPool, ten times as fast."""
+    """Make the room in EnvPool, ten times as fast."""
     return Image(sw.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
 
 
@@ -95,11 +95,17 @@ class Goal(sw.Skill):
 
 
 def algorithm(kind: type[sw.PPO] = sw.PPO, **how: Any) -> sw.PPO:
-    """Who learns. A cell's numbers are kinds of things, not brightnesses: ``encoder="cells"``."""
+    """Return the learner's settings; ``encoder="cells"``: a cell's numbers are kinds of things."""
     return kind(
-        num_envs=16, n_steps=128, update_epochs=4, gamma=0.99, gae_lambda=0.95,
-        learning_rate_schedule="constant", network=sw.Network(hidden=(64,), encoder="cells"), **how,
-    )  # fmt: skip
+        num_envs=16,
+        n_steps=128,
+        update_epochs=4,
+        gamma=0.99,
+        gae_lambda=0.95,
+        learning_rate_schedule="constant",
+        network=sw.Network(hidden=(64,), encoder="cells"),
+        **how,
+    )
 
 
 def declare(
@@ -109,7 +115,7 @@ def declare(
     engine: Literal["auto", "sync"] = "auto",
     **how: Any,
 ) -> sw.Hierarchy:
-    """The hierarchy; ``how`` changes any of its settings.
+    """Return the hierarchy; ``how`` changes any of its settings.
 
     Args:
         room: MiniGrid's name of it, without version.

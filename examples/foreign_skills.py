@@ -61,14 +61,14 @@ def skills(folder: Path) -> list[Skill]:
 
 
 def make_zip(folder: Path) -> Path:
-    """Stable-Baselines3's PPO after a moment of training."""
+    """Make a zip of Stable-Baselines3's PPO after a moment of training."""
     model = sb3.PPO("MlpPolicy", ENV, n_steps=256, seed=0, device="cpu")
     model.learn(1_000).save(folder / "ppo.zip")
     return folder / "ppo.zip"
 
 
 def make_onnx(folder: Path) -> Path:
-    """A linear controller: logits = obs · gains; any framework's exporter makes such a file."""
+    """Make a linear controller, logits = obs · gains, as any framework's exporter could."""
     gains = np.outer([0.1, 0.3, 2.0, 1.0], [-1.0, 1.0]).astype(np.float32)
     graph = helper.make_graph(
         [helper.make_node("MatMul", ["obs", "gains"], ["logits"])],
@@ -103,7 +103,7 @@ def main() -> None:
         print(
             "kept in the run:", ", ".join(sorted(p.name for p in (run.path / "policies").iterdir()))
         )
-        print(f"woven by the selector: {run.evaluate(20)}")
+        print(f"skills under the selector: {run.evaluate(20)}")
 
 
 if __name__ == "__main__":

@@ -47,8 +47,13 @@ AFTER = np.array(
     [[CELL.get((r + dr, c + dc), CELL[r, c]) for dr, dc in MOVES.values()] for r, c in PLACES]
 )
 """Where each move leads from each cell, (104, 4); a wall stops it."""
-NORTH, WEST, EAST, SOUTH = CELL[3, 6], CELL[6, 2], CELL[7, 9], CELL[10, 6]
-CORNER, G1, G2 = CELL[1, 1], EAST, CELL[9, 9]
+NORTH = CELL[3, 6]
+WEST = CELL[6, 2]
+EAST = CELL[7, 9]
+SOUTH = CELL[10, 6]
+CORNER = CELL[1, 1]
+G1 = EAST
+G2 = CELL[9, 9]
 """The upper left corner, and the paper's two kinds of goal: a hallway, and a cell inside a room."""
 
 
@@ -90,7 +95,7 @@ class ToHallway(Skill):
     """
 
     def __init__(self, name: str, room: Array, target: int, other: int) -> None:
-        """``room``: which cells are inside, (104,) bool."""
+        """Set ``room``: the cells inside, (104,) bool."""
         self.name, self.room = name, room
         self.starts = room.copy()
         self.starts[other] = True
@@ -140,7 +145,7 @@ def hallway_skills() -> list[Skill]:
 
 
 def moves() -> list[Skill]:
-    """The four moves of the environment as skills."""
+    """Return the four moves of the environment as skills."""
     return [Move(name, action) for action, name in enumerate(MOVES)]
 
 

@@ -37,7 +37,9 @@ class Errands(gym.Env[Any, Any]):
         super().reset(seed=seed)
         cells = self.np_random.permutation(SIZE * SIZE)[:5]
         self.agent, *places = (np.array(divmod(int(cell), SIZE)) for cell in cells)
-        self.places, self.state, self.left = np.array(places), np.full(2, WAITING), 80
+        self.places = np.array(places)
+        self.state = np.full(2, WAITING)
+        self.left = 80
         return self._seen(), {}
 
     def step(self, action: int) -> Any:
@@ -59,7 +61,7 @@ class Errands(gym.Env[Any, Any]):
 
 
 class OfErrand(sw.Skill):
-    """What both skills of an errand know: which one it is."""
+    """A base of both skills of an errand: it holds the errand."""
 
     def __init__(self, errand: str) -> None:
         self.column = 6 + 5 * ERRANDS[errand]
@@ -100,7 +102,7 @@ class Deliver(OfErrand):
 
 
 def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
-    """The hierarchy of both errands; ``how`` changes any setting of the upper one."""
+    """Return the hierarchy of both errands; ``how`` changes any setting of the upper one."""
     env = sw.EnvSpec(Errands, workers=1)
     learner = sw.PPO(
         num_envs=16,

@@ -38,7 +38,7 @@ from skillweave import (
 
 @dataclass(frozen=True)
 class A2C(OnPolicy):
-    """What a user sets: besides what is common to on-policy algorithms, three numbers."""
+    """Settings of the algorithm: three numbers beside the common ones of on-policy algorithms."""
 
     n_steps: int = 16
     overlap: bool = False  # its gradient is right only for rows of the latest policy
@@ -49,7 +49,7 @@ class A2C(OnPolicy):
 
 @dataclass
 class State(AgentState):
-    """What is learnt and counted, and a hyperparameter that each member has its own value of."""
+    """Weights and counts, and a hyperparameter with a value for each member."""
 
     ent_coef: Tensor  # (P,)
 
@@ -71,9 +71,10 @@ class A2CAlgorithm(Algorithm):
         self.layout = Layout(self.actor.shapes | self.critic.shapes)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """One member for each seed."""
+        """Return a state with one member for each seed."""
         params = torch.zeros(len(seeds), self.layout.size)
-        views, generators = self.layout.views(params), self.member_generators(seeds)
+        views = self.layout.views(params)
+        generators = self.member_generators(seeds)
         self.actor.init_(views, 0.01, generators)
         self.critic.init_(views, 1.0, generators)
         return State(**self.fresh_fields(params))
@@ -90,7 +91,7 @@ class A2CAlgorithm(Algorithm):
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """Actions (P, B, …), the head that they come from, and no memory."""
+        """Return actions (P, B, …), the head that they come from, and no memory."""
         head = self.actor(params.views, self.inputs(params, obs))
         if self.head.discrete:
             head = mask_logits(head, mask)
@@ -104,9 +105,10 @@ class A2CAlgorithm(Algorithm):
     def update(
         self, state: State, rollout: Rollout, rng: Sequence[torch.Generator]
     ) -> tuple[State, Report]:
-        """One gradient step on all rows of the rollout that are this learner's own."""
+        """Make one gradient step on all rows of the rollout that are this learner's own."""
         lead, valid = rollout.reward.shape[1:], rollout.valid
-        obs, next_obs = rollout.obs.flatten(1, 2), rollout.next_obs.flatten(1, 2)
+        obs = rollout.obs.flatten(1, 2)
+        next_obs = rollout.next_obs.flatten(1, 2)
         flat_valid = None if valid is None else valid.flatten(1, 2)
         self.update_obs_stats(state, obs, flat_valid)
         leaves = self.layout.leaves(state.params)
@@ -115,9 +117,13 @@ class A2CAlgorithm(Algorithm):
         with torch.no_grad():
             following = self.value(state, next_obs).unflatten(1, lead)
             advantage = gae(
-                rollout.reward, rollout.discount, value, following, rollout.last,
+                rollout.reward,
+                rollout.discount,
+                value,
+                following,
+                rollout.last,
                 torch.full_like(state.gamma, self.config.gae_lambda),
-            )  # fmt: skip
+            )
             returns = advantage + value
         mask = None if rollout.mask is None else rollout.mask.flatten(1, 2)
         head = self.actor(leaves, inputs)

@@ -31,7 +31,10 @@ class Corridor(gym.Env[Array, np.int64]):
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
-        self.place, self.key, self.door, self.steps = int(self.np_random.integers(1, 6)), 0, 0, 0
+        self.place = int(self.np_random.integers(1, 6))
+        self.key = 0
+        self.door = 0
+        self.steps = 0
         return self._obs(), {}
 
     def step(self, action: np.int64) -> Any:
@@ -82,7 +85,7 @@ class Leave(sw.Skill):
 
 
 # 1. A function of observations (n, 3) to skills (n,), by name or by number. One with a second
-#    argument is told of the last call, too: its skill, why it ended, whether it succeeded.
+#    argument receives the last call, too: its skill, how it ended, and its success.
 def rule(obs: Array) -> Array:
     with_key = np.where(obs[:, DOOR] == 1, "leave", "open_door")
     return np.where(obs[:, KEY] == 1, with_key, "get_key")

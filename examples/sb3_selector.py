@@ -36,7 +36,7 @@ CALL_STEPS = 10
 
 
 def leaning(sign: float) -> Policy:
-    """Balances the pole a little aside of upright, so that the cart drifts."""
+    """Balance the pole a little aside of upright, so that the cart drifts."""
 
     def act(obs: Array) -> Array:
         angle, turning = obs[:, 2], obs[:, 3]
@@ -71,7 +71,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> Array:
-        """The first observations."""
+        """Return the first observations."""
         obs, _ = self.env.reset(seed=self.next_seed)
         self.next_seed += 1
         return obs
@@ -81,7 +81,7 @@ class SB3VecEnv(VecEnv):
         self.actions = actions
 
     def step_wait(self) -> Any:
-        """One call in each environment."""
+        """Make one call in each environment."""
         obs, reward, terminated, truncated, info = self.env.step(self.actions)
         infos: list[dict[str, Any]] = [{"steps": int(tau)} for tau in info["steps"]]
         for i in np.flatnonzero(terminated | truncated):
@@ -96,7 +96,7 @@ class SB3VecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector, once for each environment."""
+        """Return an attribute of the vector, once for each environment."""
         return [getattr(self.env, attr_name, None)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -113,7 +113,7 @@ class SB3VecEnv(VecEnv):
 
 
 class StepBudget(BaseCallback):
-    """Stops after so many environment steps; Stable-Baselines3 itself counts decisions."""
+    """A stop after a number of environment steps; Stable-Baselines3 itself counts decisions."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -131,8 +131,8 @@ def score(model: PPO, env: OptionsEnv, episodes: int) -> Evaluation:
         return model.predict(obs, deterministic=True)[0]
 
     spaces = {"observation_space": model.observation_space, "action_space": model.action_space}
-    woven = HierarchyPolicy(from_function(choose, **spaces), env.skills)
-    return evaluate(woven, "CartPole-v1", episodes=episodes)
+    hierarchy = HierarchyPolicy(from_function(choose, **spaces), env.skills)
+    return evaluate(hierarchy, "CartPole-v1", episodes=episodes)
 
 
 def main() -> None:
@@ -147,15 +147,21 @@ def main() -> None:
     options = make_options_env(hierarchy, 8, GAMMA)
     env = SB3VecEnv(options, args.seed)
     model = PPO(
-        "MlpPolicy", env, n_steps=32, batch_size=64, learning_rate=1e-3,
-        gamma=GAMMA**CALL_STEPS, seed=args.seed, device="cpu",
-    )  # fmt: skip
+        "MlpPolicy",
+        env,
+        n_steps=32,
+        batch_size=64,
+        learning_rate=1e-3,
+        gamma=GAMMA**CALL_STEPS,
+        seed=args.seed,
+        device="cpu",
+    )
     for skill in hierarchy.skills:
         assert skill.policy is not None
         alone = evaluate(skill.policy, "CartPole-v1", episodes=args.episodes)
         print(f"{skill.name} alone: {alone}")
     model.learn(total_timesteps=args.steps, callback=StepBudget(args.steps))
-    print(f"woven by the selector: {score(model, options, args.episodes)}")
+    print(f"skills under the selector: {score(model, options, args.episodes)}")
     env.close()
 
 

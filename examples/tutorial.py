@@ -26,7 +26,7 @@ X, Y, ANGLE = 0, 1, 4
 
 
 def movement(step, *columns):
-    """``Σ (10·Δ)²`` over the columns; 0 on the first step, which has nothing before it."""
+    """Return ``Σ (10·Δ)²`` over the columns; 0 on the first step, which has no step before it."""
     moved = 10.0 * (step.next_obs[:, columns] - step.obs[:, columns])
     return np.where(step.elapsed > 1, np.square(moved).sum(axis=1), 0.0)
 

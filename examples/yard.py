@@ -16,7 +16,9 @@ import numpy as np
 
 import skillweave as sw
 
-BUTTON, FLAG, NEAR = np.array([-0.8, 0.8]), np.array([0.8, -0.8]), 0.12
+BUTTON = np.array([-0.8, 0.8])
+FLAG = np.array([0.8, -0.8])
+NEAR = 0.12
 GATE = 0.15
 """Half the gate's width; it is in the middle of the wall, at x = 0."""
 OPEN, BEHIND = 4, 5
@@ -58,7 +60,7 @@ class Yard(gym.Env[np.ndarray, np.ndarray]):
 
 
 def near(place: np.ndarray, point: np.ndarray) -> bool:
-    """Whether ``place`` is at ``point``."""
+    """Return whether ``place`` is at ``point``."""
     return bool(np.hypot(*(place - point)) < NEAR)
 
 
@@ -110,12 +112,12 @@ class Reach(sw.Skill):
 
 
 def algorithm(**how: Any) -> sw.PPO:
-    """Who learns."""
+    """Return the learner's settings."""
     return sw.PPO(**how)
 
 
 def declare(steps: int = 300_000, workers: int | None = None, **how: Any) -> sw.Hierarchy:
-    """The hierarchy; ``how`` changes any of its settings."""
+    """Return the hierarchy; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "steps": steps,
         "together": sw.Together(task_weight=0.0),

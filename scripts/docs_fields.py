@@ -1,4 +1,4 @@
-"""What griffe asks while it reads the library: comments beside fields, and plain annotations."""
+"""An extension of griffe: it reads comments beside fields, and writes plain annotations."""
 
 from __future__ import annotations
 

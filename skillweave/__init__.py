@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from skillweave.algorithms.parameters import ParameterGroup
     from skillweave.algorithms.registry import register_algorithm
     from skillweave.algorithms.schedules import Linear
-    from skillweave.api import Agent, Hierarchy, Run, load, train_agent
-    from skillweave.api.hub import from_hub
+    from skillweave.api import Agent, Hierarchy, Run, train_agent
+    from skillweave.api.loading import from_hub, load
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
     from skillweave.collecting.cluster import Ray
@@ -127,12 +127,12 @@ _HOME = {
     "envpool": "envs.pool",
     "evaluate": "training.evaluation",
     "from_function": "skills",
-    "from_hub": "api.hub",
+    "from_hub": "api.loading",
     "from_onnx": "skills",
     "from_sb3": "skills",
     "from_torch": "skills",
     "gae": "ops.returns",
-    "load": "api",
+    "load": "api.loading",
     "make_options_env": "api.options",
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",

@@ -1,7 +1,7 @@
 """Errors for wrong arguments and attributes: they name the one that was probably meant.
 
-``@checked_names`` stands above public functions and classes. Where an argument is misspelt, missing
-or one too many, it raises a ``DeclarationError`` that says what to write, in place of Python's
+``@checked_names`` decorates public functions and classes. Where an argument is misspelt, missing
+or one too many, it raises a ``DeclarationError`` with the right spelling, in place of Python's
 TypeError; and it refuses to set an attribute that does not exist.
 """
 
@@ -72,7 +72,7 @@ STARTS_BY = (
 def checked_names(target: T) -> T:
     """Let a function, or a class, raise a DeclarationError where its arguments are wrong.
 
-    Of a dataclass, attributes are checked as well: those of a frozen one cannot be set, those of
+    Of a dataclass, attributes are checked as well: a frozen one's cannot be set, those of
     another only if they exist.
 
     Args:
@@ -110,7 +110,7 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
 def _wrong_arguments(
     function: Callable[..., Any], args: tuple[Any, ...], named: dict[str, Any]
 ) -> str | None:
-    """A sentence about arguments that do not fit a function; None: they fit."""
+    """Return a sentence about arguments that do not fit a function; None: they fit."""
     signature = inspect.signature(function)
     try:
         signature.bind(*args, **named)
@@ -157,16 +157,16 @@ def _wrong_arguments(
 
 
 class _Place(NamedTuple):
-    """Where an argument of some name can be given."""
+    """A place where an argument of some name can be given."""
 
     name: str
     where: str
-    """Part of a sentence: "a setting of apart"; empty: where it was written."""
+    """Part of a sentence: "a setting of apart"; empty: the place where it was written."""
     example: str
 
 
 def meant(name: str, places: Sequence[_Place | str], otherwise: str, least: float = SIMILAR) -> str:
-    """The end of a sentence about an unknown name: where a similar one can be given.
+    """Return the end of a sentence about an unknown name: where a similar one can be given.
 
     Args:
         name: what was written.
@@ -180,7 +180,7 @@ def meant(name: str, places: Sequence[_Place | str], otherwise: str, least: floa
     known = [_Place(p, "", "") if isinstance(p, str) else p for p in places]
     wanted = name.lower().replace("-", "_")
     for spelling in (wanted, ELSEWHERE.get(wanted, "")):
-        # Names that stand right here come first.
+        # Names of this place come first.
         exact = [p for p in known if p.name == spelling]
         if exact and (exact[0].where or exact[0].name != name):
             return _where(exact[0], exact=spelling == name)
@@ -202,7 +202,7 @@ def _where(place: _Place, exact: bool) -> str:
 
 
 def _other_places(owner: type, makes: bool) -> Iterator[_Place]:
-    """Where else a user of a class may give an argument: its groups of settings, ``train``."""
+    """Yield the other places of a class's arguments: its groups of settings, ``train``."""
     if makes:
         yield from _groups(owner, "{}")
         train = getattr(owner, "train", None)
@@ -217,13 +217,13 @@ def _other_places(owner: type, makes: bool) -> Iterator[_Place]:
 
 
 def _names(function: Callable[..., Any]) -> list[str]:
-    """The arguments of a method that have names."""
+    """Return the arguments of a method that have names."""
     parameters = list(inspect.signature(function).parameters.values())
     return [p.name for p in parameters if p.name != "self" and p.kind is not p.VAR_KEYWORD]
 
 
 def _groups(owner: Any, example: str) -> Iterator[_Place]:
-    """The settings in the fields of a dataclass that hold settings themselves, and below them."""
+    """Yield the settings in the fields of a dataclass that hold settings, and below them."""
     if not is_dataclass(owner):
         return
     for field in fields(owner):
@@ -237,7 +237,7 @@ def _groups(owner: Any, example: str) -> Iterator[_Place]:
 
 
 def _group(owner: Any, field: Any) -> Any:
-    """The dataclass whose instance a field holds; None: it holds something else."""
+    """Return the dataclass of a field's instance; None: it holds something else."""
     if isinstance(made := field.default_factory, type) and is_dataclass(made):
         return made
     if made is not MISSING and is_dataclass(value := made()):

@@ -1,4 +1,4 @@
-"""Parts of sentences for people: values, errors and numbers as messages tell them."""
+"""Parts of sentences for people: values, errors and numbers in messages."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST = 10**12
 
 
 def short(value: object, longest: int = 100) -> str:
-    """``repr(value)`` for a message, its middle left out where it is long."""
+    """Return ``repr(value)`` for a message, its middle left out where it is long."""
     try:
         text = repr(value)
     except Exception:
@@ -27,23 +27,23 @@ def short(value: object, longest: int = 100) -> str:
 
 
 def shortened(text: str, longest: int = 500) -> str:
-    """Text for a message, its middle left out where it is long."""
+    """Return text for a message, its middle left out where it is long."""
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
 
 
 def close_matches(name: str, known: Iterable[str]) -> str:
-    """A sentence, after a space, that names up to four known names like ``name``; or nothing."""
+    """Return a sentence after a space with up to four known names like ``name``; "" if none is."""
     near = difflib.get_close_matches(name, known, n=4, cutoff=0.6)
     return f" Close matches: {', '.join(near)}." if near else ""
 
 
 def observed(obs: Array) -> str:
-    """An observation for a message, in one line, its middle left out where it is long."""
+    """Return an observation for a message, in one line, its middle left out where it is long."""
     return shortened(" ".join(np.array2string(obs, precision=3).split()), 200)
 
 
-def told(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return an error of the user's code for a sentence: its kind, message, file and line."""
     try:
         message = str(error)
@@ -54,8 +54,11 @@ def told(error: BaseException) -> str:
     return f"{text.removesuffix('.')} ({where})" if where else text
 
 
+told = error_text  # the name in rooms that are not yet rewritten
+
+
 def whole_number(value: object, name: str, least: int) -> int:
-    """``value`` as an int.
+    """Return ``value`` as an int.
 
     Raises:
         DeclarationError: it is no whole number, less than ``least``, or more than ``MOST``; the
@@ -93,7 +96,7 @@ def shown_path(path: Path) -> Path:
 
 
 def as_path(path: str | Path, name: str) -> Path:
-    """``path`` as one; an error names the argument where it is none."""
+    """Return ``path`` as a ``Path``; an error names the argument where it is none."""
     if not isinstance(path, str | Path) or "\0" in str(path) or len(str(path)) > 4_096:
         raise DeclarationError(f"{name} is {short(path)}; it must be a path")
     return Path(path)

@@ -57,7 +57,7 @@ class Area:
         self._handle: Any = None
 
     def show(self, html: str, text: str) -> None:
-        """Show this, in place of what was shown before; ``text`` is for what knows no HTML."""
+        """Show this, in place of what was shown before; ``text`` is for outputs without HTML."""
         display: Any = importlib.import_module("IPython.display").display
         data = {"text/html": html, "text/plain": text}
         if self._handle is None:

@@ -1,6 +1,6 @@
-"""Which lines of a traceback are the user's own, and tracebacks that show only these.
+"""Lines of a traceback that are the user's own, and tracebacks that show only these.
 
-This module imports nothing of the library, so that ``types`` can stand on it.
+This module imports nothing of the library, so that ``types`` can import it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _PACKAGES = {"site-packages", "dist-packages"}
 
 
 def all_frames_wanted() -> bool:
-    """Return whether the user asks for the library's frames."""
+    """Return whether the user wants the library's frames."""
     return os.environ.get(SWITCH, "") not in ("", "0")
 
 
@@ -116,9 +116,9 @@ def _is_hidden(file: str) -> bool:
 
 
 def _name(frame: FrameType) -> str:
-    """Return what people call the file of a frame; in a notebook the cell."""
+    """Return the name of a frame's file for people; in a notebook the cell."""
     file = _file(frame)
-    if file == SENT:  # the file is still known where it was a module's or a script's
+    if file == SENT:  # the file is still there where it was a module's or a script's
         known = frame.f_globals.get("__file__")
         return Path(known).name if isinstance(known, str) else f"{frame.f_code.co_name}()"
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()

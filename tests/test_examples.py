@@ -48,14 +48,14 @@ NEEDS = {
 SAYS = {
     "bridge.py": "solved: ",
     "doorkey.py": "solved: ",
-    "foreign_skills.py": "woven by the selector: ",
+    "foreign_skills.py": "skills under the selector: ",
     "four_rooms.py": "steps from the corner to the goal: ",
     "key_door.py": "over 100 episodes",
     "nested.py": "both errands done: ",
     "own_algorithm.py": "mean return: ",
     "own_network.py": "mean return: ",
     "ready_selectors.py": "automaton  return 1.00",
-    "sb3_selector.py": "woven by the selector: ",
+    "sb3_selector.py": "skills under the selector: ",
     "tutorial.py": "the hierarchy: ",
     "yard.py": "solved: ",
 }

@@ -17,8 +17,8 @@ import pytest
 from skillweave import PPO, Agent, Evaluation, Hierarchy, Network, Run, Skill, tree
 from skillweave import notebooks as module
 from skillweave.notebooks import facts, in_notebook, joined, table
-from skillweave.reporting.film import Film
 from skillweave.reporting.progress import EpisodeProgress, Progress
+from skillweave.reporting.video import Film
 
 TINY = PPO(num_envs=2, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 

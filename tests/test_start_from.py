@@ -337,7 +337,7 @@ WRONG = {
     "network": (
         {"algorithm": replace(ON, network=Network((9,)))},
         None,
-        r"'left' cannot begin with what it learnt in .*it has other networks here",
+        r"'left' cannot start with what it learnt in .*it has other networks here",
     ),
     "activation": (
         {"algorithm": replace(ON, network=Network((8,), "relu"))},
@@ -436,12 +436,12 @@ def test_who_is_not_named_begins_afresh(source, tmp_path):
 def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_path):
     _, plain = other_runs
     for start, says in (
-        ({}, r"start_from is \{\}; name who begins"),
+        ({}, r"start_from is \{\}; name the run of each"),
         ({"lefft": source}, r"names 'lefft', which does not learn here.*Close matches: left"),
         ({"push": source}, r"names 'push', which does not learn here; here learn left, other"),
         ({"left": tmp_path / "no"}, "holds no run"),
         ({"left": 5}, r"start_from\['left'\] is 5; it must be a path"),
-        ({"selector": plain}, r"'selector' cannot begin with what it learnt in .*plain"),
+        ({"selector": plain}, r"'selector' cannot start with what it learnt in .*plain"),
     ):
         with pytest.raises(SkillweaveError, match=says):
             declare().train(tmp_path / "run", quiet=True, start_from=start)
@@ -463,7 +463,7 @@ def test_the_command_takes_several_runs(source, other_runs, tmp_path, capsys):
     assert_near(after["other"], weights_of(other_runs[0])["other"])
     again = ["--start-from", str(source), "--start-from", f"left={source}"]
     assert main(["train", str(recipe), *again, *out]) == 1
-    assert "write who begins with each" in capsys.readouterr().err
+    assert "name the learner of each" in capsys.readouterr().err
     twice = ["--start-from", f"left={source}", "--start-from", f"left={source}"]
     assert main(["train", str(recipe), *twice, *out]) == 1
     assert "names left twice" in capsys.readouterr().err

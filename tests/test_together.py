@@ -40,7 +40,7 @@ from skillweave import (
 )
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.api.adoption import told_differences
+from skillweave.api.adoption import describe_differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING
@@ -347,8 +347,8 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
     run = new_run(declare(learn=learn), tmp_path / "run")
     assert run.manifest["greedy_skills"] is said
     run.manifest["greedy_skills"] = True
-    assert told_differences(declare(learn=learn), run) == ""
-    told = told_differences(declare(learn=learn, greedy_skills=False), run)
+    assert describe_differences(declare(learn=learn), run) == ""
+    told = describe_differences(declare(learn=learn, greedy_skills=False), run)
     assert "greedy_skills is yes (declared now: no)" in told
     run.close()
 

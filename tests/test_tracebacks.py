@@ -17,7 +17,7 @@ import pytest
 
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
 from skillweave.errors import SkillweaveError
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.skills.outputs import blame
 from skillweave.tracebacks import LIBRARY, place
 from skillweave.types import Memoryless
@@ -45,12 +45,12 @@ def test_the_line_is_the_users_and_not_that_of_numpy_or_of_the_standard_library(
 
     assert place(caught(of_numpy)) == f"{HERE}, line {line_of('function of NumPy fails')}"
     assert place(caught(of_json)) == f"{HERE}, line {line_of('function of Python fails')}"
-    assert told(caught(of_json)).startswith("JSONDecodeError: Expecting")
+    assert error_text(caught(of_json)).startswith("JSONDecodeError: Expecting")
 
 
 def test_without_a_frame_there_is_no_place() -> None:
     assert place(ValueError()) == ""
-    assert told(ValueError("x")) == "ValueError: x"
+    assert error_text(ValueError("x")) == "ValueError: x"
 
 
 def test_code_that_was_sent_to_another_process_is_named_by_its_file_or_its_function() -> None:

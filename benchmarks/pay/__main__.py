@@ -29,7 +29,7 @@ from skillweave.errors import SkillweaveError
 
 
 def chosen(asked: list[str]) -> dict[str, list[str] | None]:
-    """By suite, the tasks that were asked for; None: all of them.
+    """Return the requested tasks by suite; None: all of them.
 
     Raises:
         SkillweaveError: there is no such suite or task.
@@ -86,8 +86,8 @@ def main(arguments: list[str] | None = None) -> None:
         spent += hours(every)
         if results:
             print(f"\n{name}\n{make_table(suite, results)}")
-            if told := of_other_code(results):
-                print(told)
+            if warning := of_other_code(results):
+                print(warning)
             print(*draw(suite, results, out), sep="\n", flush=True)
     print(f"\nall results of these suites took {spent:.1f} hours, one after another")
 

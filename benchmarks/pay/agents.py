@@ -1,4 +1,4 @@
-"""How each agent of the protocol is trained and scored: the hierarchy, and F0 to F4."""
+"""Training and scoring of each agent of the protocol: the hierarchy, and F0 to F4."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
 from skillweave import Array, Hierarchy, Lengths, Selection, Skill, TrainDefaults
-from skillweave.api.run import Run
+from skillweave.api import Run
 from skillweave.runs.directory import RunDirectory
 
 HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
@@ -103,19 +103,19 @@ class Bench:
         self._score(run, task, agent, budget, started, keep, ("selector", "together"))
 
     def _skills(self) -> dict[str, Any]:
-        """The skills that were learnt on the first task from this seed."""
+        """Return the skills that were learnt on the first task from this seed."""
         policy = self._source_policy()
         return dict(zip(policy.labels, policy.skills.policies, strict=True))
 
     def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
-        """Skills are greedy, or sample, as on the first task, if neither the suite says it nor a
+        """Let skills be greedy, or sample, as on the first task, if neither the suite sets it nor a
         stage in which they go on learning finds it out."""
         if hierarchy.selection.greedy_skills is None and not hierarchy.learns_together:
             regroup(hierarchy, greedy_skills=self._source_policy().skills.greedy)
         return hierarchy
 
     def _source_policy(self) -> Any:
-        """The hierarchy that was learnt on the first task from this seed."""
+        """Return the hierarchy that was learnt on the first task from this seed."""
         source = self.suite.tasks[0]
         run = self.suite.hierarchy(source, None).load(self._path(source, HIERARCHY))
         self._builds_on(source, HIERARCHY)
@@ -154,7 +154,7 @@ class Bench:
         return by_lot(hierarchy, self.seed)
 
     def _ready(self, task: Task, agent: str, hierarchy: Hierarchy) -> Run:
-        """The run of a hierarchy in which nobody learns."""
+        """Return the run of a hierarchy without a learner."""
         path = self._path(task, agent)
         shutil.rmtree(path, ignore_errors=True)
         self.results.begin(path)
@@ -189,7 +189,7 @@ class Bench:
             self._learn(agent, task, BONUS)
 
     def tuned_weights(self) -> dict[str, float]:
-        """The weights with which F1 does best on the first task, from a seed of its own.
+        """Return the weights with which F1 does best on the first task, from a seed of its own.
 
         After a third of its steps, so that choosing takes no longer than learning.
         """
@@ -232,7 +232,7 @@ class Bench:
         )
 
     def _before(self, task: Task) -> Path:
-        """The run of the flat agent with which F3 begins a further task."""
+        """Return the run of the flat agent with which F3 begins a further task."""
         source = self.suite.tasks[0]
         before = source if task.starts_from is None else self.suite.task(task.starts_from)
         name = FLAT if before is source else TUNED
@@ -243,19 +243,33 @@ class Bench:
     # What all share
 
     def _score(
-        self, run: Run, task: Task, agent: str, budget: int, started: float,
-        keep: bool = False, stages: tuple[str, ...] = (), greedy: bool | None = None,
-    ) -> Result:  # fmt: skip
+        self,
+        run: Run,
+        task: Task,
+        agent: str,
+        budget: int,
+        started: float,
+        keep: bool = False,
+        stages: tuple[str, ...] = (),
+        greedy: bool | None = None,
+    ) -> Result:
         greedy = self.suite.greedy if greedy is None else greedy
         found = run.evaluate(self.suite.episodes, deterministic=greedy)
         usage = found.to_json()["skill_usage"]
         return self._save(run, task, agent, budget, started, found.returns, usage, keep, stages)
 
     def _save(
-        self, run: Run, task: Task, agent: str, budget: int, started: float,
-        returns: Sequence[float], usage: dict[str, float], keep: bool = False,
+        self,
+        run: Run,
+        task: Task,
+        agent: str,
+        budget: int,
+        started: float,
+        returns: Sequence[float],
+        usage: dict[str, float],
+        keep: bool = False,
         stages: tuple[str, ...] = (),
-    ) -> Result:  # fmt: skip
+    ) -> Result:
         scores = [float(r) / self.suite.unit for r in returns]
         curve = curve_of(run.path, self.suite.unit, stages) if stages else []
         spent = sum(int(s["steps"]) for s in run.info()["stages"])
@@ -265,21 +279,31 @@ class Bench:
         begun = self.results.begun_by(run.path)
         code = CODE if begun == CODE and not self._on_older else ""
         result = Result(
-            self.suite.name, task.name, agent, self.seed, score, spent, budget, seconds,
-            [*curve, (spent, score)], scores, usage, code,
-        )  # fmt: skip
+            self.suite.name,
+            task.name,
+            agent,
+            self.seed,
+            score,
+            spent,
+            budget,
+            seconds,
+            [*curve, (spent, score)],
+            scores,
+            usage,
+            code,
+        )
         self.results.save(result)
         if not keep:
             shutil.rmtree(run.path, ignore_errors=True)
         return result
 
     def _found(self, task: Task, agent: str, budget: int, keep: bool = False) -> Result | None:
-        """A result that is there; not where others need its run, and that is not at its end."""
+        """Return a stored result; None where others need its run, and that is not finished."""
         found = self.results.find(self.suite.name, task.name, agent, self.seed, budget)
         return None if keep and not is_over(self._path(task, agent)) else found
 
     def _builds_on(self, task: Task, agent: str) -> None:
-        """What follows needs this result, so it is of other code if this one is."""
+        """Note that further results need this one, so they are of other code if it is."""
         path = self.results.file(self.suite.name, task.name, agent, self.seed)
         self._on_older |= read(path).code != CODE
 
@@ -305,14 +329,14 @@ class Bench:
 
 
 def is_over(path: Path) -> bool:
-    """Whether there is a run, and all its stages are done."""
+    """Return whether there is a run, and all its stages are done."""
     if not path.exists():
         return False
     return all(s["status"] == "done" for s in RunDirectory.open(path).manifest["stages"])
 
 
 def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:
-    """The same skills under a ready selector: nothing is learnt any more."""
+    """Return the same skills under a ready selector, without further learning."""
     skills: list[Skill] = list(hierarchy.skills)
     return Hierarchy(
         hierarchy.env,

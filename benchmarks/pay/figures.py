@@ -27,13 +27,13 @@ def reported(results: Sequence[Result], seeds: Sequence[int]) -> list[Result]:
 
 
 def of(results: Sequence[Result], task: str, agent: str) -> list[Result]:
-    """An agent's results on a task, by seed."""
+    """Return an agent's results on a task, by seed."""
     found = [r for r in results if r.task == task and r.agent == agent]
     return sorted(found, key=lambda r: r.seed)
 
 
 def make_table(suite: Suite, results: Sequence[Result]) -> str:
-    """A line for each task and agent, and one for each agent over all tasks."""
+    """Return a line for each task and agent, and one for each agent over all tasks."""
     header = ("task", "agent", "steps", "IQM", "95 % interval", "median", "worst", "s", "each seed")
     agents = list(dict.fromkeys(r.agent for r in results))
     agents.sort(key=lambda a: (a != HIERARCHY, a))
@@ -72,7 +72,7 @@ def _numbers(found: Sequence[Result]) -> tuple[str, ...]:
 
 
 def draw(suite: Suite, results: Sequence[Result], folder: Path) -> list[Path]:
-    """Curves of every task, and steps against tasks solved, each as PNG and SVG.
+    """Draw the curves of every task, and steps against tasks solved, each as PNG and SVG.
 
     Raises:
         MissingExtra: matplotlib is missing.

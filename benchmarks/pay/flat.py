@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import Agent, Skill
-from skillweave.api.run import Run
+from skillweave.api import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
@@ -32,7 +32,7 @@ class Flat(Agent):
     """F3: the run in which it has learnt another task."""
 
     def stages(self) -> list[Stage]:
-        """Its only stage."""
+        """Return its only stage."""
         spec, skill = self.spec, self.learns
         return [
             Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))
@@ -69,8 +69,11 @@ class _FlatLearner(OneAgent):
         """Make the environments and the agent."""
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
-            skill_scene(self._flat.spec), self.stage.seeds,
-            manifest["eval_every"], manifest["eval_episodes"], self.stage.config.num_envs,
-        )  # fmt: skip
+            skill_scene(self._flat.spec),
+            self.stage.seeds,
+            manifest["eval_every"],
+            manifest["eval_episodes"],
+            self.stage.config.num_envs,
+        )
         self._resources.callback(self.evaluation.close)
         return fresh

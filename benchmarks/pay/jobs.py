@@ -1,5 +1,5 @@
 """The jobs of ``python -m benchmarks.pay``: in a module of their own, as a process that is made
-anew can import nothing from a package's ``__main__``.
+again can import nothing from a package's ``__main__``.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ SUITES: dict[str, Callable[[], Suite]] = {
 
 
 def suite_of(name: str, quick: bool) -> Suite:
-    """A suite by its name."""
+    """Return a suite by its name."""
     found = SUITES[name]()
     return found.quick() if quick else found
 
 
 def one(name: str, quick: bool, out: Path, chain: str, seed: int, tasks: list[str] | None) -> None:
-    """A chain of agents from one seed, in this process."""
+    """Do a chain of agents from one seed, in this process."""
     Bench(suite_of(name, quick), Results(out), seed).run(chain, tasks)
 
 
 def run_all(jobs: list[tuple[str, bool, Path, str, int, list[str] | None]], processes: int) -> None:
-    """Do all jobs, so many side by side; F1's weights are chosen first, as all its seeds need them.
+    """Do all jobs side by side; F1's weights are chosen first, as all its seeds need them.
 
     Raises:
         Exception: of a job that failed; all others are ended then.

@@ -18,12 +18,12 @@ def source(task: Task) -> Hierarchy:
 
 
 def further(task: Task, skills: Policies) -> Hierarchy:
-    """Skills and selector, which go on together from what they learnt in the small rooms."""
+    """Return skills and selector that continue together after the small rooms."""
     return rooms.going_on(task.name)
 
 
 def cells(obs: Array) -> Array:
-    """All that is in view, (n, 147)."""
+    """Return all that is in view, (n, 147)."""
     found: Array = obs.reshape(len(obs), -1)
     return found
 

@@ -1,4 +1,4 @@
-"""Lander missions: four skills, woven for each mission (``skillweave train lander-missions``)."""
+"""Lander missions: four skills for all missions (``skillweave train lander-missions``)."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def source(task: Task) -> Hierarchy:
 
 
 def further(task: Task, skills: Policies) -> Hierarchy:
-    """A selector for one mission, over skills that are there already."""
+    """Return a selector for one mission, over skills that are there already."""
     mission, gusts = TASKS[task.name]
     return missions.with_skills(mission, skills, gusts)
 
 
 def by_leg(task: Task, skills: Policies) -> Hierarchy:
-    """The same skills, chosen by the leg that is flown: tells what bounds a result."""
+    """Return the skills under the rule by leg: an upper bound for a result."""
     mission, gusts = TASKS[task.name]
     return missions.with_skills(mission, skills, gusts, selector=missions.by_leg)
 
 
 def cells(obs: Array) -> Array:
-    """Where it is, how fast, and what is still to be done, (n, 16)."""
+    """Return place, speed, and the legs still to be done, (n, 16)."""
     return np.concatenate([np.floor(obs[:, :4] / 0.2), obs[:, missions.TO_DO]], axis=1)
 
 

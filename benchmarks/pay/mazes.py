@@ -24,18 +24,18 @@ def source(task: Task) -> Hierarchy:
 
 
 def further(task: Task, skills: Policies) -> Hierarchy:
-    """A selector over skills that are there already."""
+    """Return a selector over skills that are there already."""
     return mazes.with_skills(task.name, skills)
 
 
 def shortest_path(task: Task, skills: Policies) -> Hierarchy:
-    """The same skills, chosen by who knows the maze: tells what bounds a result."""
+    """Return the skills under the maze's shortest path: an upper bound for a result."""
     chooses = _mazes.ShortestPath(task.name)
     return mazes.with_skills(task.name, skills, selector=chooses, call_steps=10)
 
 
 def cells(obs: Array) -> Array:
-    """Where the ball is, and where the goal, in metres, (n, 4)."""
+    """Return where the ball is, and where the goal, in metres, (n, 4)."""
     return np.floor(obs[:, [0, 1, 4, 5]])
 
 

@@ -19,22 +19,22 @@ FURTHER_STEPS = 30_000
 
 
 def source(task: Task) -> Hierarchy:
-    """One skill and the selector are learnt."""
+    """Return the first task, on which one skill and the selector learn."""
     return arm.declare(DISTURBANCES[task.name])
 
 
 def further(task: Task, skills: Policies) -> Hierarchy:
-    """A selector over the same skills, learnt anew."""
+    """Return a new selector over the same skills."""
     return with_skills(arm.declare, task, skills)
 
 
 def anchored(task: Task, skills: Policies) -> Hierarchy:
-    """The same, kept near the behaviour tree while it learns."""
+    """Return a new selector that is kept near the behaviour tree while it learns."""
     return with_skills(arm.anchored, task, skills)
 
 
 def with_skills(declare: Callable[..., Hierarchy], task: Task, skills: Policies) -> Hierarchy:
-    """A hierarchy with the learnt skill."""
+    """Return a hierarchy with the learnt skill."""
     found = declare(DISTURBANCES[task.name])
     regroup(found, selector_steps=FURTHER_STEPS)
     found.skill("recover").policy = skills["recover"]
@@ -42,7 +42,7 @@ def with_skills(declare: Callable[..., Hierarchy], task: Task, skills: Policies)
 
 
 def by_hand(selector: Any, call_steps: int = 1) -> Any:
-    """A hierarchy in which nothing is learnt."""
+    """Return a hierarchy in which nothing is learnt."""
 
     def declare(task: Task, skills: Policies) -> Hierarchy:
         return arm.by_hand(selector, DISTURBANCES[task.name], call_steps)
@@ -51,7 +51,7 @@ def by_hand(selector: Any, call_steps: int = 1) -> Any:
 
 
 def cells(obs: Array) -> Array:
-    """Where the block is seen from the gripper, its height, whether it is grasped, (n, 5)."""
+    """Return the block's place from the gripper, its height, and if it is grasped, (n, 5)."""
     places = np.column_stack([obs[:, arm.OFFSET], obs[:, arm.BLOCK][:, 2]])
     return np.column_stack([np.floor(places / 0.04), world.is_held(obs)])
 

@@ -18,7 +18,7 @@ from skillweave.runs.directory import RunDirectory
 
 @dataclass(frozen=True)
 class Result:
-    """How one agent did one task from one seed."""
+    """The result of one agent on one task from one seed."""
 
     suite: str
     task: str
@@ -51,15 +51,15 @@ class Results:
         self.folder = folder
 
     def file(self, suite: str, task: str, agent: str, seed: int) -> Path:
-        """Where a result is."""
+        """Return where a result is."""
         return self.folder / suite / task / agent / f"{seed}.json"
 
     def run_path(self, suite: str, task: str, agent: str, seed: int) -> Path:
-        """Where it is trained."""
+        """Return the directory of its training."""
         return self.file(suite, task, agent, seed).with_suffix(".run")
 
     def find(self, suite: str, task: str, agent: str, seed: int, budget: int) -> Result | None:
-        """A result that is there.
+        """Return a result that is there.
 
         Raises:
             SkillweaveError: the file is damaged, or was made with another budget.
@@ -90,19 +90,19 @@ class Results:
             run.with_suffix(".code").write_text(CODE)
 
     def begun_by(self, run: Path) -> str:
-        """By which code a training was begun that is over now; empty: nobody noted it."""
+        """Return the checksum of the code that started a finished training; empty: not noted."""
         note = run.with_suffix(".code")
         found = note.read_text() if note.exists() else ""
         note.unlink(missing_ok=True)
         return found
 
     def all(self, suite: str) -> list[Result]:
-        """All results of a suite."""
+        """Return all results of a suite."""
         return [read(path) for path in sorted((self.folder / suite).glob("*/*/*.json"))]
 
 
 def read(path: Path) -> Result:
-    """The result of a file.
+    """Return the result of a file.
 
     Raises:
         SkillweaveError: it is damaged.
@@ -116,7 +116,7 @@ def read(path: Path) -> Result:
 
 
 def checksum(*packages: Path) -> str:
-    """Of all Python files in folders."""
+    """Return a checksum of all Python files in folders."""
     found = hashlib.sha256()
     for root in packages:
         for path in sorted(root.rglob("*.py")):
@@ -130,7 +130,7 @@ a file counts, comments too; versions of other packages do not."""
 
 
 def of_other_code(results: Sequence[Result]) -> str:
-    """A sentence that names the results that were made by other code than today's; or nothing."""
+    """Return a sentence on the results of other code than today's; empty without any."""
     others = [r for r in results if r.code != CODE]
     if not others:
         return ""
@@ -143,13 +143,13 @@ def of_other_code(results: Sequence[Result]) -> str:
 
 
 def hours(results: Sequence[Result]) -> float:
-    """What these results took, in hours, one after another: trainings and scores."""
+    """Return what these results took, in hours, one after another: trainings and scores."""
     own = {(r.suite, r.task, r.seed, r.seconds): r.seconds for r in results}  # F3 has one of F0's
     return sum(own.values()) / 3600.0
 
 
 def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int, float]]:
-    """What the periodic evaluations of a run found: steps of the whole run, and scores.
+    """Return what the periodic evaluations of a run found: steps of the whole run, and scores.
 
     Args:
         stages: whose evaluations are of the task.
@@ -161,7 +161,7 @@ def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int
         total += int(stage.get("steps", 0))
     found = []
     for line in (path / "metrics.jsonl").read_text().splitlines():
-        told = json.loads(line)
-        if told.get("stage") in stages and "eval_return" in told:
-            found.append((before[told["stage"]] + told["steps"], told["eval_return"] / unit))
+        entry = json.loads(line)
+        if entry.get("stage") in stages and "eval_return" in entry:
+            found.append((before[entry["stage"]] + entry["steps"], entry["eval_return"] / unit))
     return found

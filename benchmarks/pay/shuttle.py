@@ -24,30 +24,30 @@ FURTHER_STEPS = 300_000
 
 
 def bar(points: tuple[float, ...]) -> float:
-    """What counts as solved: the paper's best on its own task, for the same metres a second."""
+    """Return the bar of a solved task: the paper's best, for the same metres a second."""
     metres = float(np.abs(np.subtract(points, np.roll(points, 1))).sum())
     return BEST * ROUND / metres
 
 
 def source(task: Task) -> Hierarchy:
-    """Skills and selector learn together, from nothing."""
+    """Return the first task: skills and selector learn together, from nothing."""
     return shuttle.declare(POINTS[task.name])
 
 
 def further(task: Task, skills: Policies) -> Hierarchy:
-    """A selector over skills that are there already."""
+    """Return a selector over skills that are there already."""
     found = shuttle.with_skills(POINTS[task.name], skills)
     regroup(found, selector_steps=FURTHER_STEPS)
     return found
 
 
 def by_automaton(task: Task, skills: Policies) -> Hierarchy:
-    """The same skills, chosen by the task's own automaton: tells what bounds a result."""
+    """Return the skills under the task's own automaton: an upper bound for a result."""
     return shuttle.by_automaton(POINTS[task.name], skills)
 
 
 def cells(obs: Array) -> Array:
-    """Metres from the point, speed in 2 metres a second, and the leg, (n, 3)."""
+    """Return metres from the point, speed in 2 metres a second, and the leg, (n, 3)."""
     leg = obs[:, cheetah.LEG].argmax(axis=1)
     x = cheetah.from_log(obs[:, cheetah.X])
     return np.stack([np.floor(x), np.floor(obs[:, cheetah.SPEED] / 2.0), leg], 1)

@@ -16,7 +16,7 @@ def interval(
     """Between which values the interquartile mean of all scores lies, by the bootstrap.
 
     Args:
-        scores: of each task, those of its seeds. Seeds are drawn anew within each task, so every
+        scores: of each task, those of its seeds. Seeds are drawn again within each task, so every
             task counts in every sample as often as it does in the scores.
         level: the share of samples within the interval.
     """
@@ -30,19 +30,19 @@ def interval(
 
 
 def mean_of_all(scores: Sequence[Sequence[float]]) -> float:
-    """The interquartile mean over all tasks and seeds."""
+    """Return the interquartile mean over all tasks and seeds."""
     return interquartile_mean(np.concatenate([np.asarray(row, float) for row in scores]))
 
 
 def first_solved(curve: Sequence[tuple[int, float]], solved: float) -> int | None:
-    """Steps at which a curve's score is first at ``solved`` or more; None: never."""
+    """Return the steps at which a curve's score first reaches ``solved``; None: never."""
     return next((steps for steps, score in curve if score >= solved), None)
 
 
 def solved_over_steps(
     curves: Sequence[Sequence[tuple[int, float]]], solved: Sequence[float], budgets: Sequence[int]
 ) -> Array:
-    """After how many steps in all so many tasks were solved, (1 + tasks solved, 2): steps, tasks.
+    """Return the steps in all until each number of solved tasks, (1 + tasks solved, 2).
 
     Tasks are learnt one after another. Who has solved one goes on with the next at once; who does
     not solve it has spent its whole budget.

@@ -1,4 +1,4 @@
-"""What a suite declares: tasks, skills, budgets, and what the baselines need to know."""
+"""The declaration of a suite: tasks, skills, budgets, and the baselines' needs."""
 
 from __future__ import annotations
 
@@ -85,27 +85,27 @@ class Suite:
     """All budgets are multiplied by this."""
 
     def task(self, name: str) -> Task:
-        """The task of this name."""
+        """Return the task of this name."""
         return next(t for t in self.tasks if t.name == name)
 
     def goes_on(self, task: Task) -> bool:
-        """Whether others need what was learnt on a task."""
+        """Return whether others need what was learnt on a task."""
         return task is self.tasks[0] or any(t.starts_from == task.name for t in self.tasks)
 
     def scaled(self, factor: float) -> Suite:
-        """The same with other budgets."""
+        """Return the suite with other budgets."""
         return replace(self, scale=self.scale * factor)
 
     def quick(self) -> Suite:
-        """A two-hundredth of the steps, one episode for each score: to see that all runs."""
+        """Return a two-hundredth of the steps, one episode for each score: to see that all runs."""
         return replace(self.scaled(0.005), episodes=1, evaluations=1, evaluated=1)
 
     def hierarchy(self, task: Task, skills: Policies | None) -> Hierarchy:
-        """The hierarchy for a task: without ``skills`` it learns them, too."""
+        """Return the hierarchy for a task: without ``skills`` it learns them, too."""
         return self.fitted(self.source(task) if skills is None else self.further(task, skills))
 
     def fitted(self, found: Hierarchy) -> Hierarchy:
-        """A hierarchy with the suite's budgets.
+        """Return a hierarchy with the suite's budgets.
 
         Runs go side by side, so one has several processes only where its recipe says so.
         """
@@ -114,21 +114,21 @@ class Suite:
         return found
 
     def steps(self) -> list[int]:
-        """What the hierarchy takes for each task; its skills are in the first."""
+        """Return the hierarchy's steps for each task; those of its skills are in the first."""
         first, *others = self.tasks
-        ready: Any = {s.name: _nobody for s in self.source(first).skills}
+        ready: Any = {s.name: _no_policy for s in self.source(first).skills}
         further = [self.hierarchy(t, ready).total_steps for t in others]
         return [self.hierarchy(first, None).total_steps, *further]
 
     def steps_flat(self) -> list[int]:
-        """What a flat agent gets for each task: as much as the hierarchy, or more (``alone``)."""
+        """Return a flat agent's steps for each task: the hierarchy's, or more (``alone``)."""
         own = self.steps()
         more = [own[0] if t.alone else 0 for t in self.tasks[1:]]
         return [own[0], *(n + m for n, m in zip(own[1:], more, strict=True))]
 
     @property
     def headlines(self) -> list[Task]:
-        """Where F1 and F2 learn: the first task, and those that flat agents learn alone."""
+        """Return the tasks of F1 and F2: the first one, and those that flat agents learn alone."""
         return [t for t in self.tasks if t is self.tasks[0] or t.alone]
 
 
@@ -141,7 +141,7 @@ class Shaped(Skill):
         self.skills, self.weights, self.task_weight = skills, weights, task_weight
 
     def reward(self, step: Step) -> Array:
-        """The sum."""
+        """Return the sum."""
         own = [self.weights[s.name] * s.reward(step) for s in self.skills if s.name in self.weights]
         total: Array = np.sum([self.task_weight * step.reward, *own], axis=0)
         return total
@@ -151,7 +151,7 @@ class Seldom(Skill):
     """F2: the task's own reward, and ``size / √n`` for the n-th visit of a cell.
 
     Bellemare et al. 2016 and Tang et al. 2017 ("#Exploration"): counts of cells in place of states.
-    A training that was stopped counts anew.
+    A training that was stopped counts from its start.
 
     Args:
         cells: observations (n, ...) to whole numbers (n, k).
@@ -163,7 +163,7 @@ class Seldom(Skill):
         self._counts: Counter[bytes] = Counter()
 
     def reward(self, step: Step) -> Array:
-        """With the bonus for where each step leads."""
+        """Return the reward with the bonus for the cell that each step leads to."""
         visits = np.empty(len(step.reward))
         for i, cell in enumerate(self._cells(step.next_obs).astype(np.int64)):
             key = cell.tobytes()
@@ -173,6 +173,6 @@ class Seldom(Skill):
         return found
 
 
-def _nobody(obs: Array) -> Array:
-    """Stands for a learnt skill where only budgets are asked for."""
+def _no_policy(obs: Array) -> Array:
+    """Stand in for a learnt skill where only budgets are read."""
     return np.zeros(len(obs))

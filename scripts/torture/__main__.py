@@ -51,7 +51,7 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    """The command line."""
+    """Return the command line."""
     parser = argparse.ArgumentParser("scripts.torture", description=__doc__)
     parser.add_argument(
         "parts", nargs="*", metavar="part", help=f"{', '.join(PARTS)}; default: all"
@@ -82,7 +82,7 @@ def preload() -> None:
 
 
 def run_part(name: str, options: argparse.Namespace) -> Tally | None:
-    """One part: its tally, or None where it is not there."""
+    """Run one part; return its tally, or None where it is not there."""
     count = options.count or options.counts[name]
     if name == "code":
         from scripts.torture.code import tally
@@ -124,7 +124,7 @@ def run_all(part: Any, numbers: range, found: Tally, options: argparse.Namespace
 
 
 def make_part(name: str, folder: Path, seed: int, only: list[str] | None) -> Any:
-    """The part of this name; ``only``: the samples or kinds that it takes."""
+    """Return the part of this name; ``only``: the samples or kinds that it takes."""
     module = importlib.import_module(f"scripts.torture.{name}")
     return getattr(module, name.capitalize())(folder, seed, *([only] if only else []))
 

@@ -14,7 +14,7 @@ PORTION = 1_000
 
 
 def tally(count: int, seed: int) -> Tally | None:
-    """The counts of so many examples, failures in capitals; None: there is no tests/hostile.py.
+    """Return the counts of ``n`` examples, failures in capitals; None without tests/hostile.py.
 
     They are drawn in portions, whose seeds are ``seed``, ``seed + 1``, and so on.
     """

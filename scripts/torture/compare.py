@@ -1,4 +1,4 @@
-"""What distinguishes two finished runs that should be equal."""
+"""Differences of two finished runs that should be equal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TIMES = {"seconds", "steps_per_second", "created"}
 
 
 def differences(run: Path, whole: Path) -> dict[str, list[str]]:
-    """By sort ("weights", "metrics", "files"), a line for each difference; {} where there is none.
+    """Return by sort ("weights", "metrics", "files") a line for each difference; {} if none.
 
     Weights are the policies' files: every tensor bit for bit, every header. Metrics are the lines
     of metrics.jsonl and lineage.jsonl and what run.json says, all but times. Files: which there
@@ -31,7 +31,7 @@ def differences(run: Path, whole: Path) -> dict[str, list[str]]:
 
 
 def tensors_and_header(path: Path) -> tuple[bytes, Any]:
-    """The parts of a safetensors file: the tensors' bytes, and the header with its keys sorted."""
+    """Return a safetensors file's tensors as bytes, and its header with sorted keys."""
     data = path.read_bytes()
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])

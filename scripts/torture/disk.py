@@ -31,9 +31,11 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 
 NAMES = (
-    "skills and selector", "replay of continuous actions", "population, replay",
+    "skills and selector",
+    "replay of continuous actions",
+    "population, replay",
     "start from another run",
-)  # fmt: skip
+)
 """Together they write every file that a training writes."""
 FAULTS = ("no space, once", "no space from here on", "an error, once", "death")
 SENTENCE = 3
@@ -66,14 +68,14 @@ class Disk:
         random.Random(f"disk {seed}").shuffle(self.faults)
 
     def whole(self, name: str) -> Path:
-        """The run of a kind that met no fault."""
+        """Return the run of a kind that met no fault."""
         return self.folder / "whole" / name
 
     def prepare(self) -> None:
         """Nothing: a case's trainings have processes of their own."""
 
     def cases(self, count: int) -> int:
-        """All faults, or so many of them."""
+        """Return all faults, or a number of them."""
         return min(count, len(self.faults))
 
     def case(self, number: int) -> Outcome:
@@ -81,32 +83,32 @@ class Disk:
         name, operation, what, fault = self.faults[number]
         run = self.folder / f"case-{number}"
         shutil.rmtree(run, ignore_errors=True)
-        told = partial(Outcome, what=f"{fault}, {what}: operation {operation} of {name}")
+        outcome = partial(Outcome, what=f"{fault}, {what}: operation {operation} of {name}")
         log = log_of(run)
         pid = fork(partial(train_badly, KINDS[name], run, operation, fault), log)
         code = wait(pid, PATIENCE)
         kill_group(pid)
         if code is None:
-            return told(HANG, said="the training with the fault does not end")
+            return outcome(HANG, said="the training with the fault does not end")
         if code not in (0, SENTENCE, -signal.SIGKILL):
-            return told(TRACEBACK, said=log.read_text())
+            return outcome(TRACEBACK, said=log.read_text())
         before = tuple(json.loads(noted(run).read_text()))
         if (after := position(run)) < before:
-            return told(LOST, said=f"saved before {before}, after {after}")
+            return outcome(LOST, said=f"saved before {before}, after {after}")
         log.write_text("")
         pid = fork(partial(go_on, KINDS[name], run), log)
         if (ended := wait(pid, PATIENCE)) != 0:
             kill_group(pid)
-            return told(LOST, said=f"the resume ended with {ended}: {log.read_text()}")
+            return outcome(LOST, said=f"the resume ended with {ended}: {log.read_text()}")
         if found := differences(run, self.whole(name)):
             said = "; ".join(line for lines in found.values() for line in lines)
-            return told(SORTS[next(iter(found))], said=said)
+            return outcome(SORTS[next(iter(found))], said=said)
         shutil.rmtree(run)
-        return told(FINISHED if code == 0 else EQUAL)
+        return outcome(FINISHED if code == 0 else EQUAL)
 
 
 def can_meet(operation: str, fault: str) -> bool:
-    """Whether the fault can come at this operation: some need no space."""
+    """Return whether the fault can come at this operation: some need no space."""
     return not ("no space" in fault and operation.startswith(("chmod", "truncate", "unlink")))
 
 
@@ -115,7 +117,7 @@ def train_badly(kind: Kind, run: Path, operation: int | None, fault: str) -> int
     seen: list[str] = []
 
     def met(what: str, path: Any) -> bool:
-        """Whether an operation fails; may not come back."""
+        """Return whether an operation fails; may not come back."""
         if isinstance(path, int) or not Path(os.fspath(path)).is_relative_to(run):
             return False
         number = len(seen)
@@ -141,7 +143,7 @@ def train_badly(kind: Kind, run: Path, operation: int | None, fault: str) -> int
 
 
 def spoil(met: Callable[[str, Any], bool], number: int) -> None:
-    """From now on ask ``met`` before each operation on a file, and fail where it says so."""
+    """Call ``met`` before each further operation on a file, and fail where it returns True."""
 
     def fail(path: Any) -> None:
         raise OSError(number, os.strerror(number), str(path))
@@ -194,12 +196,12 @@ class _File:
 
 
 def _path_of(path: Any) -> Any:
-    """The path of an open file, or the path itself."""
+    """Return the path of an open file, or the path itself."""
     return os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else path
 
 
 def position(run: Path) -> tuple[int, int, int]:
-    """How much of a run is saved: whether there is one, stages that are done, updates."""
+    """Return how much of a run is saved: whether there is one, stages that are done, updates."""
     if not (run / "run.json").exists():
         return 0, 0, 0
     found = RunDirectory.open(run)
@@ -217,5 +219,5 @@ def position(run: Path) -> tuple[int, int, int]:
 
 
 def noted(run: Path) -> Path:
-    """Where a training notes what it met."""
+    """Return where a training notes what it met."""
     return run.parent / f"noted-{run.name}.json"

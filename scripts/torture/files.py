@@ -77,15 +77,15 @@ class Files:
         (folder / "evil" / "evil.py").write_text(EVIL)
 
     def original(self, name: str) -> Path:
-        """Where a sample lies."""
+        """Return where a sample lies."""
         return self.folder / "samples" / name.replace(" ", "-")
 
     def cases(self, count: int) -> int:
-        """One case is one mutated run or file."""
+        """Return the cases: each is one mutated run or file."""
         return count
 
     def prepare(self) -> None:
-        """In each process, before its first case."""
+        """Prepare a process before its first case."""
         sys.path.insert(0, str(self.folder / "evil"))
         sys.dont_write_bytecode = True
         warnings.simplefilter("ignore")
@@ -93,7 +93,7 @@ class Files:
         limit_memory(MORE_MEMORY)
 
     def copy(self, name: str, what: str) -> Path:
-        """A sample's copy for one case."""
+        """Return a sample's copy for one case."""
         target = self.folder / f"{what}-{os.getpid()}"
         _remove(target)
         shutil.copytree(self.original(name), target)
@@ -117,7 +117,7 @@ class Files:
         return Outcome(outcome.category, what, outcome.said)
 
     def afterwards(self, name: str, outcome: Outcome) -> Outcome:
-        """The outcome, unless the pickle has changed the reader itself."""
+        """Return the outcome, unless the pickle has changed the reader itself."""
         if touched := changed_functions():
             return Outcome(CHANGED, said=f"functions of the reader were changed: {touched}")
         if SAMPLES[name].use(self.copy(name, "again"), "") != self.expected[name]:
@@ -159,7 +159,7 @@ def judge(sample: Sample, folder: Path, changed: Change, expected: Play) -> Outc
 
 
 def functions() -> dict[str, types.FunctionType]:
-    """What the reader of pickles is made of."""
+    """Return what the reader of pickles is made of."""
     return {n: f for n, f in vars(pickles).items() if isinstance(f, types.FunctionType)}
 
 
@@ -167,7 +167,7 @@ DEFAULTS = {name: function.__defaults__ for name, function in functions().items(
 
 
 def changed_functions() -> list[str]:
-    """Functions of the reader that have attributes or defaults of a pickle's; they are mended."""
+    """Mend and return functions of the reader with attributes or defaults of a pickle's."""
     found = []
     for name, function in functions().items():
         if vars(function) or function.__defaults__ != DEFAULTS.get(name):
@@ -197,23 +197,23 @@ def play_original(sample: Sample, folder: Path) -> None:
 
 
 def played(folder: Path) -> Path:
-    """Where it is written down how a sample plays."""
+    """Return the file that holds a sample's plays."""
     return folder.with_suffix(".plays")
 
 
 def forget_peak() -> None:
-    """Let Linux measure this process's most memory anew."""
+    """Let Linux measure this process's most memory from now on."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 def resident(which: str) -> int:
-    """Bytes of memory that this process has (VmRSS), or had at most (VmHWM)."""
+    """Return bytes of memory that this process has (VmRSS), or had at most (VmHWM)."""
     found = re.search(rf"{which}:\s*(\d+) kB", Path("/proc/self/status").read_text())
     return int(found[1]) * 1024 if found else 0
 
 
 def shortened(text: str) -> str:
-    """A traceback without the repetitions of a deep recursion, and with short lines."""
+    """Return a traceback without the repetitions of a deep recursion, and with short lines."""
     lines = [line[:400] for line in text.splitlines()]
     return "\n".join(lines if len(lines) < 80 else [*lines[:40], "...", *lines[-30:]])
 

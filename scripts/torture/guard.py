@@ -14,15 +14,41 @@ from pathlib import Path
 from typing import Any
 
 STARTS = {
-    "os.system", "os.exec", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.startfile",
-    "subprocess.Popen", "pty.spawn", "socket.connect", "socket.bind", "socket.getaddrinfo",
-    "webbrowser.open", "code.__new__", "function.__new__", "ctypes.dlopen", "os.kill", "os.putenv",
-}  # fmt: skip
+    "os.system",
+    "os.exec",
+    "os.fork",
+    "os.forkpty",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.startfile",
+    "subprocess.Popen",
+    "pty.spawn",
+    "socket.connect",
+    "socket.bind",
+    "socket.getaddrinfo",
+    "webbrowser.open",
+    "code.__new__",
+    "function.__new__",
+    "ctypes.dlopen",
+    "os.kill",
+    "os.putenv",
+}
 """Events that no reader of a file has any need for."""
 CHANGES = {
-    "os.chmod", "os.chown", "os.link", "os.mkdir", "os.remove", "os.rename", "os.rmdir",
-    "os.symlink", "os.truncate", "os.utime", "shutil.copyfile", "shutil.move", "shutil.rmtree",
-}  # fmt: skip
+    "os.chmod",
+    "os.chown",
+    "os.link",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.symlink",
+    "os.truncate",
+    "os.utime",
+    "shutil.copyfile",
+    "shutil.move",
+    "shutil.rmtree",
+}
 """Events that may only concern the case's own folder."""
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 PREFIXES = (sys.prefix, sys.base_prefix, str(Path(__file__).parents[2]))

@@ -15,10 +15,23 @@ def change(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool
     model = onnx.load(str(path))
     graph = model.graph
     node, weight = graph.node[0], graph.initializer[0]
-    kind = rng.choice((
-        "operator", "domain", "opset", "input shape", "input type", "no input", "weight NaN",
-        "weight shape", "outside file", "no weight", "output name", "cycle", "huge constant",
-    ))  # fmt: skip
+    kind = rng.choice(
+        (
+            "operator",
+            "domain",
+            "opset",
+            "input shape",
+            "input type",
+            "no input",
+            "weight NaN",
+            "weight shape",
+            "outside file",
+            "no weight",
+            "output name",
+            "cycle",
+            "huge constant",
+        )
+    )
     match kind:
         case "operator":
             node.op_type = rng.choice(("Add", "Gemm", "Evil", "", "MatMul\x00", "Loop", "If"))

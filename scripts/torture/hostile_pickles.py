@@ -58,8 +58,10 @@ CALLS: tuple[tuple[str, str, tuple[Any, ...]], ...] = (
     ("dill._dill", "_import_module", ("evil",)),
     ("codecs", "decode", (b"x", "hex")),
     ("_codecs", "encode", ("x", "evil")),
-    ("", "", ()), ("os", "", ()), ("é", "\u2028", ()),
-)  # fmt: skip
+    ("", "", ()),
+    ("os", "", ()),
+    ("é", "\u2028", ()),
+)
 """Functions that a hostile pickle would call."""
 ODD: tuple[tuple[str, str, tuple[Any, ...]], ...] = (
     ("torch._utils", "_rebuild_tensor_v2", ()),
@@ -82,7 +84,7 @@ ODD: tuple[tuple[str, str, tuple[Any, ...]], ...] = (
     ("numpy.core.multiarray", "_reconstruct", (7, 8, 9)),
     ("dill._dill", "_create_array", (0, (), ())),
     ("_codecs", "encode", ("x" * 10, 7)),
-)  # fmt: skip
+)
 """Functions that a checkpoint may name, with arguments that no checkpoint has."""
 
 
@@ -124,12 +126,21 @@ def _values(rng: random.Random, path: Path) -> tuple[str, str, bool]:
         name = rng.choice(sorted(part))
         value = part[name]
         kinds: dict[str, Any] = {
-            "NaN": value * float("nan"), "transposed": value.t().contiguous().clone(),
-            "flat": value.flatten(), "double": value.double(), "whole numbers": value.long(),
-            "empty": value[:0], "other": -value, "numpy": value.numpy(), "list": value.tolist(),
-            "complex": value + 1j, "reshaped": value.reshape(-1, value.shape[0]),
-            "half": value.half(), "scalar": value.flatten()[0], "quoted": str(value),
-        }  # fmt: skip
+            "NaN": value * float("nan"),
+            "transposed": value.t().contiguous().clone(),
+            "flat": value.flatten(),
+            "double": value.double(),
+            "whole numbers": value.long(),
+            "empty": value[:0],
+            "other": -value,
+            "numpy": value.numpy(),
+            "list": value.tolist(),
+            "complex": value + 1j,
+            "reshaped": value.reshape(-1, value.shape[0]),
+            "half": value.half(),
+            "scalar": value.flatten()[0],
+            "quoted": str(value),
+        }
         kind = rng.choice(sorted(kinds))
         part[name] = kinds[kind]
         details, asks = (
@@ -167,7 +178,7 @@ def _pickle_bytes(rng: random.Random, path: Path) -> tuple[str, str, bool]:
 
 
 def _hostile(rng: random.Random, path: Path) -> tuple[str, str, bool]:
-    """A pickle that is no checkpoint, or a checkpoint with something more in it."""
+    """Return a pickle that is no checkpoint, or a checkpoint with something more in it."""
     name, program = rng.choice(programs())
     entries = _entries(path)
     key = _pickle_name(entries)
@@ -203,10 +214,15 @@ def _builds() -> dict[str, bytes]:
     """BUILD sets attributes of what is on the stack."""
     found = {}
     for module, name in (
-        ("torch._utils", "_rebuild_tensor_v2"), ("torch._utils", "_rebuild_parameter"),
-        ("numpy.core.multiarray", "scalar"), ("numpy", "dtype"), ("_codecs", "encode"),
-        ("torch.nn.modules.loss", "MSELoss"), ("collections", "OrderedDict"), ("builtins", "set"),
-    ):  # fmt: skip
+        ("torch._utils", "_rebuild_tensor_v2"),
+        ("torch._utils", "_rebuild_parameter"),
+        ("numpy.core.multiarray", "scalar"),
+        ("numpy", "dtype"),
+        ("_codecs", "encode"),
+        ("torch.nn.modules.loss", "MSELoss"),
+        ("collections", "OrderedDict"),
+        ("builtins", "set"),
+    ):
         target = f"c{module}\n{name}\n".encode()
         for state in ({"mine": 1}, (None, {"mine": 1}), (None, {"__defaults__": (1,)}), 7):
             found[f"BUILD of {name} with {state}"] = target + _plain(state) + b"b"
@@ -215,7 +231,7 @@ def _builds() -> dict[str, bytes]:
 
 
 def _sizes() -> dict[str, bytes]:
-    """Sizes that are not there."""
+    """Return pickles with sizes that are not there."""
     eight = struct.pack("<Q", 2**62)
     return {
         "BINUNICODE8 of 4 EiB": b"\x8d" + eight + b"x",
@@ -233,15 +249,21 @@ def _sizes() -> dict[str, bytes]:
         "PERSID": b"Pabc\n",
         "odd persistent id": _plain(("storage", 7, 8)) + b"Q",
         "persistent id of another storage": _plain(("storage", "x", "../../x", "cpu", 3)) + b"Q",
-        "persistent id that is huge": b"(" + _text("storage") + b"ctorch\nFloatStorage\n"
-        + _text("0") + _text("cpu") + _plain(2**40) + b"tQ",
-    }  # fmt: skip
+        "persistent id that is huge": b"("
+        + _text("storage")
+        + b"ctorch\nFloatStorage\n"
+        + _text("0")
+        + _text("cpu")
+        + _plain(2**40)
+        + b"tQ",
+    }
 
 
 def _shapes() -> dict[str, bytes]:
-    """Structures that are deep, endless, or grow when they are shown."""
-    bomb = b"]" + b"".join(b"q" + bytes([i]) + b"]h" + bytes([i]) + b"ah" + bytes([i]) + b"a"
-                           for i in range(60))  # fmt: skip
+    """Return structures that are deep, endless, or grow when they are shown."""
+    bomb = b"]" + b"".join(
+        b"q" + bytes([i]) + b"]h" + bytes([i]) + b"ah" + bytes([i]) + b"a" for i in range(60)
+    )
     return {
         "lists 200,000 deep": b"]" * 200_000 + b"a" * 199_999,
         "tuples 200,000 deep": b")" + b"\x85" * 200_000,
@@ -256,7 +278,7 @@ def _shapes() -> dict[str, bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """A value as a pickle's opcodes, without header, memo and end."""
+    """Return a value as a pickle's opcodes, without header, memo and end."""
     data = pickletools.optimize(pickle.dumps(value, 2))
     return data[2:-1]
 
@@ -270,7 +292,7 @@ def _text(text: str) -> bytes:
 
 
 def _zip(rng: random.Random, path: Path) -> tuple[str, str, bool]:
-    """Entries are missing, doubled, renamed, or far larger than they look."""
+    """Return zips with entries missing, doubled, renamed, or far larger than they look."""
     entries = _entries(path)
     name = rng.choice(sorted(entries))
     kind = rng.choice(

@@ -2,7 +2,7 @@
 
 A case trains one kind of run until it has been killed ``EACH`` times, at moments drawn over the
 whole training's duration. After each kill it does what a user does: it resumes the run, or begins
-where there is none. Every run that ends is compared with one that nobody killed. The moments come
+where there is none. Every run that ends is compared with one without a kill. The moments come
 from the seed and the case's number; what they hit depends on the machine.
 """
 
@@ -24,7 +24,7 @@ from scripts.torture.report import EQUAL, FILES, HANG, LEFT, LOST, METRICS, WEIG
 EACH = 5
 """Kills of a case."""
 PATIENCE = 60.0
-"""Seconds that a training may take that nobody kills."""
+"""Seconds for a training without a kill."""
 SORTS = {"weights": WEIGHTS, "metrics": METRICS, "files": FILES}
 
 
@@ -46,11 +46,11 @@ class Kills:
         """Nothing: a case's trainings have processes of their own."""
 
     def cases(self, count: int) -> int:
-        """How many cases make so many kills."""
+        """Return the number of cases that make this number of kills."""
         return -(-count // EACH)
 
     def whole(self, name: str) -> Path:
-        """The uninterrupted run of a kind."""
+        """Return the uninterrupted run of a kind."""
         return self.folder / "whole" / name
 
     def case(self, number: int) -> Outcome:
@@ -61,7 +61,7 @@ class Kills:
         shutil.rmtree(run, ignore_errors=True)
         moments: list[str] = []
 
-        def told(category: str, said: str = "") -> Outcome:
+        def outcome(category: str, said: str = "") -> Outcome:
             return Outcome(category, f"{name}: killed after {', '.join(moments)} s", said)
 
         while True:
@@ -73,21 +73,21 @@ class Kills:
                 os.waitpid(pid, 0)
                 moments.append(f"{moment:.3f}")
                 if moment == PATIENCE:
-                    return told(HANG, "the last resume does not end")
+                    return outcome(HANG, "the last resume does not end")
             last = len(moments) == EACH
             if last and not group_is_gone(pid):
-                return told(LEFT, "the killed training's own processes do not end")
+                return outcome(LEFT, "the killed training's own processes do not end")
             kill_group(pid)
             if code:
-                return told(LOST, log_of(run).read_text())
+                return outcome(LOST, log_of(run).read_text())
             if code == 0:
                 if found := differences(run, self.whole(name)):
                     said = "; ".join(line for lines in found.values() for line in lines)
-                    return told(SORTS[next(iter(found))], said)
+                    return outcome(SORTS[next(iter(found))], said)
                 shutil.rmtree(run)
                 log_of(run).unlink()
                 if last:
-                    return told(EQUAL)
+                    return outcome(EQUAL)
 
 
 def train_whole(kind: Kind, run: Path) -> None:
@@ -103,5 +103,5 @@ def go_on(kind: Kind, run: Path) -> None:
 
 
 def log_of(run: Path) -> Path:
-    """Where a training's output goes."""
+    """Return where a training's output goes."""
     return run.with_name(f"{run.name}.log")

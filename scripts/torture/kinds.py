@@ -94,12 +94,12 @@ class Leaning(Skill):
     max_steps = 9
 
     def initiation(self, obs: Any) -> Any:
-        """Where it leans."""
+        """Return whether the pole leans."""
         return obs[:, 2] > 0.01
 
 
 def leans_left(obs: Any) -> Any:
-    """Where the pole is about to fall to the left."""
+    """Return where the pole is about to fall to the left."""
     return obs[:, 2] < -0.15
 
 
@@ -133,24 +133,30 @@ class Kind:
 
 
 def _before(run: Path) -> Path:
-    """Where the run is that another one starts from."""
+    """Return where the run is that another one starts from."""
     return run.with_name(f"{run.name}-before")
 
 
 NET = Network((6,))
 LEARNS: dict[str, Any] = {"num_envs": 4, "n_steps": 16, "batch_size": 32, "update_epochs": 2}
 REPLAYS: dict[str, Any] = {
-    "num_envs": 4, "batch_size": 8, "learning_starts": 40, "buffer_size": 200, "update_ratio": 0.25,
+    "num_envs": 4,
+    "batch_size": 8,
+    "learning_starts": 40,
+    "buffer_size": 200,
+    "update_ratio": 0.25,
     "network": Network((6,), "relu"),
-}  # fmt: skip
+}
 EVOLVES: dict[str, Any] = {
-    "population": 3, "generations": 3, "episodes": 2,
+    "population": 3,
+    "generations": 3,
+    "episodes": 2,
     "mutations": Mutations(units=(4, 16), layers=(1, 2)),
-}  # fmt: skip
+}
 
 
-def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
-    """Two skills and a selector."""
+def hierarchy_of(steps: int, skill: Any, selector: Any) -> Hierarchy:
+    """Return two skills and a selector."""
     return Hierarchy(
         IN_PYTHON,
         [Left(), Balance()],
@@ -164,7 +170,7 @@ def woven(steps: int, skill: Any, selector: Any) -> Hierarchy:
 
 
 def alone(env: Any, algorithm: Any, steps: int) -> Agent:
-    """One agent."""
+    """Return one agent."""
     often = TrainDefaults(checkpoint_every=max(1, steps // 5))
     return Agent(env, algorithm, steps, train_defaults=often)
 
@@ -201,10 +207,10 @@ def together_replay(steps: int) -> Hierarchy:
 
 KINDS: dict[str, Kind] = {
     "skills and selector": Kind(
-        lambda: woven(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
+        lambda: hierarchy_of(1200, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET))
     ),
     "skills and selector, replay": Kind(
-        lambda: woven(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
+        lambda: hierarchy_of(500, DQN.rainbow(**REPLAYS), SAC(**REPLAYS))
     ),
     "replay of continuous actions": Kind(
         lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 800)
@@ -244,9 +250,7 @@ KINDS: dict[str, Kind] = {
             IN_PYTHON,
             [Leaning(), Balance()],
             call_steps=4,
-            algorithm=PPO(
-                **LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))
-            ),
+            algorithm=PPO(**LEARNS | {"batch_size": 64}, network=Network((6,), rnn=RNN("gru", 4))),
             selector=DQN(**REPLAYS),
             learn="apart",
             apart=Apart(skill_steps=300, selector_steps=300),
@@ -262,5 +266,5 @@ KINDS: dict[str, Kind] = {
         lambda: alone(IN_PYTHON, DQN(**REPLAYS), 300),
         evolve=Evolution(**EVOLVES),
     ),
-}  # fmt: skip
+}
 """Every kind of stage and engine that could lose something."""

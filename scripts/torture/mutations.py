@@ -29,7 +29,7 @@ ASKED = re.compile(
 
 @dataclass(frozen=True)
 class Change:
-    """What was done to which file."""
+    """A change of a file."""
 
     file: str
     kind: str
@@ -91,10 +91,20 @@ def damage(rng: random.Random, data: bytearray) -> tuple[str, str]:
 
 def _place(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
     others = [p for p in sorted(folder.rglob("*")) if p.is_file() and p != path]
-    kind = rng.choice((
-        "FIFO", "directory", "missing", "empty", "link to itself", "/dev/zero", "swapped",
-        "swapped", "copied from", "twin of a folder",
-    ))  # fmt: skip
+    kind = rng.choice(
+        (
+            "FIFO",
+            "directory",
+            "missing",
+            "empty",
+            "link to itself",
+            "/dev/zero",
+            "swapped",
+            "swapped",
+            "copied from",
+            "twin of a folder",
+        )
+    )
     data, details = path.read_bytes(), ""
     path.unlink()
     match kind:
@@ -125,15 +135,79 @@ def _place(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool
 DEEP, DIGITS, EXPONENT, TWICE = "@deep@", "@digits@", "@exponent@", "@twice@"
 """Marks in the tree for what ``json.dumps`` does not write."""
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, 2, 3, 5, 0.5, -0.0, 2**31, 2**63, 2**64, 10**18, 1e308, -1e308,
-    float("nan"), float("inf"), float("-inf"), "", "x", "nan", "0", "1", "None", "é\u2028\x00",
-    "\ud800", "x" * 10_000, [], {}, [[]], [None], {"": None}, [0] * 1000, {"x": {"y": []}},
-    "agent", "flat", "skill", "hierarchy", "selector", "done", "training", "waiting", "left",
-    "balance", "PPO", "SAC",
-    "CartPole-v0", "Acrobot-v1", "Pendulum-v1", "CartPole", "NoSuchEnv-v0", "evil:Evil-v0", "evil",
-    "../../x", "/etc/passwd", "/dev/zero", "~", "a/b", "{0.__class__}", "%s%n", "wandb",
-    "__import__('evil')", "Box", "Discrete", "float32", "F64", "BF16", DEEP, DIGITS, EXPONENT,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    2,
+    3,
+    5,
+    0.5,
+    -0.0,
+    2**31,
+    2**63,
+    2**64,
+    10**18,
+    1e308,
+    -1e308,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    "",
+    "x",
+    "nan",
+    "0",
+    "1",
+    "None",
+    "é\u2028\x00",
+    "\ud800",
+    "x" * 10_000,
+    [],
+    {},
+    [[]],
+    [None],
+    {"": None},
+    [0] * 1000,
+    {"x": {"y": []}},
+    "agent",
+    "flat",
+    "skill",
+    "hierarchy",
+    "selector",
+    "done",
+    "training",
+    "waiting",
+    "left",
+    "balance",
+    "PPO",
+    "SAC",
+    "CartPole-v0",
+    "Acrobot-v1",
+    "Pendulum-v1",
+    "CartPole",
+    "NoSuchEnv-v0",
+    "evil:Evil-v0",
+    "evil",
+    "../../x",
+    "/etc/passwd",
+    "/dev/zero",
+    "~",
+    "a/b",
+    "{0.__class__}",
+    "%s%n",
+    "wandb",
+    "__import__('evil')",
+    "Box",
+    "Discrete",
+    "float32",
+    "F64",
+    "BF16",
+    DEEP,
+    DIGITS,
+    EXPONENT,
+)
 """What may stand in place of anything."""
 
 
@@ -195,7 +269,7 @@ def _keys(holder: Any) -> Any:
 
 
 def dump(rng: random.Random, tree: Any) -> str:
-    """A tree as JSON, with what ``json.dumps`` would not write."""
+    """Return a tree as JSON, with what ``json.dumps`` would not write."""
     text = json.dumps(tree, indent=rng.choice((None, 2)))
     depth = rng.choice((100, 2_000, 100_000))
     text = text.replace(f'"{DEEP}"', "[" * depth + "]" * depth)
@@ -212,11 +286,20 @@ def _json(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]
 def _text(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
     """JSON that is another document altogether."""
     text = path.read_text()
-    kind, data = rng.choice((
-        ("a list", f"[{text}]"), ("a number", "7"), ("null", "null"), ("empty object", "{}"),
-        ("byte order mark", "\ufeff" + text), ("twice", text + text), ("deep", "[" * 100_000),
-        ("UTF-16", text.encode("utf-16")), ("NUL", text + "\x00"), ("a string", json.dumps(text)),
-    ))  # fmt: skip
+    kind, data = rng.choice(
+        (
+            ("a list", f"[{text}]"),
+            ("a number", "7"),
+            ("null", "null"),
+            ("empty object", "{}"),
+            ("byte order mark", "\ufeff" + text),
+            ("twice", text + text),
+            ("deep", "[" * 100_000),
+            ("UTF-16", text.encode("utf-16")),
+            ("NUL", text + "\x00"),
+            ("a string", json.dumps(text)),
+        )
+    )
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
     return kind, "", False
 
@@ -250,7 +333,7 @@ def _line(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]
 
 
 def _raw_header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """The outer header: dtypes, shapes, offsets; the checksum stays as it is."""
+    """Return the outer header: dtypes, shapes, offsets; the checksum stays as it is."""
     data = path.read_bytes()
     size = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + size])
@@ -262,7 +345,7 @@ def _raw_header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str,
 
 
 def _header(rng: random.Random, path: Path, folder: Path) -> tuple[str, str, bool]:
-    """Skillweave's own header, its checksum made right again where JSON can say it."""
+    """Change Skillweave's own header, and correct its checksum where JSON can hold it."""
     tensors, header = _parts(path)
     where, how = mutate_tree(rng, header)
     return where, how, _seal(rng, path, folder, tensors, header)

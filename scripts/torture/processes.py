@@ -29,7 +29,7 @@ _notes: list[int] = []
 
 
 def note(what: str) -> None:
-    """Say what the case under way is about to do, for the report of one that never comes back."""
+    """Note the next action of the running case, for the report of one that never ends."""
     for pipe in _notes:
         _send(pipe, what)
 
@@ -64,7 +64,7 @@ def fork(job: Callable[[], int | None], log: Path | None = None) -> int:
 
 
 def wait(pid: int, seconds: float) -> int | None:
-    """The exit code of a child, negative for a signal; None: it is still running after so long."""
+    """Return the exit code of a child, negative for a signal; None: it is still running."""
     end = time.monotonic() + seconds
     while True:
         done, status = os.waitpid(pid, os.WNOHANG)
@@ -82,7 +82,7 @@ def kill_group(pid: int) -> None:
 
 
 def group_is_gone(pid: int, seconds: float = 10.0) -> bool:
-    """Whether all of a dead child's group ends by itself."""
+    """Return whether all of a dead child's group ends by itself."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         try:
@@ -163,7 +163,7 @@ class _Worker:
         os.write(self._tasks, _SIZE.pack(number))
 
     def outcome(self, limit: float) -> Outcome | None:
-        """What came of its case; None: nothing yet."""
+        """Return what came of its case; None: nothing yet."""
         while select.select([self.answers], [], [], 0)[0]:
             if not (size := self._read(_SIZE.size)):
                 return self._crash(self._bury())

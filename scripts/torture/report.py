@@ -1,4 +1,4 @@
-"""What came of a case, counts of it, and the failing cases as they are kept."""
+"""Outcomes of cases, their counts, and the files of failing cases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LEFT = "PROCESSES LEFT"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one case."""
+    """The outcome of one case."""
 
     category: str
     what: str = ""
@@ -42,7 +42,7 @@ class Outcome:
 
     @property
     def bad(self) -> bool:
-        """Whether it must not be."""
+        """It is a failure."""
         return self.category.isupper()
 
     @property
@@ -64,7 +64,7 @@ class Tally:
 
     part: str
     words: str
-    """What the command line was told besides: the seed, which samples."""
+    """Further words of the command line: the seed, the samples."""
     counts: Counter[str] = field(default_factory=Counter)
     causes: dict[tuple[str, str], list[int]] = field(default_factory=dict)
 
@@ -79,16 +79,16 @@ class Tally:
                 file.write(json.dumps(again | asdict(outcome)) + "\n")
 
     def again(self, number: int) -> str:
-        """The command that does one case again."""
+        """Return the command that does one case again."""
         return f"python -m scripts.torture {self.part} {self.words} --case {number}"
 
     @property
     def bad(self) -> int:
-        """How many cases failed."""
+        """The number of failed cases."""
         return sum(n for category, n in self.counts.items() if category.isupper())
 
     def examples(self) -> str:
-        """A line for each cause of failure, the most frequent first."""
+        """Return a line for each cause of failure, the most frequent first."""
         found = sorted(self.causes.items(), key=lambda item: -len(item[1]))
         return "\n".join(
             f"{len(cases):>6} × {category}: {cause}\n         {self.again(cases[0])}"
@@ -97,7 +97,7 @@ class Tally:
 
 
 def table(tallies: Iterable[Tally]) -> str:
-    """One table: a row for each category, a column for each part."""
+    """Return one table: a row for each category, a column for each part."""
     tallies = list(tallies)
     names = sorted({c for t in tallies for c in t.counts}, key=lambda c: (c.isupper(), c))
     rows = [["", *(t.part for t in tallies)]]

@@ -1,4 +1,4 @@
-"""What is mutated: small runs and files of every kind, each with what a user does with it."""
+"""Samples for mutation: small runs and files of every kind, each with its use."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from scripts.torture.kinds import (
     Kind,
     Tiny,
     alone,
+    hierarchy_of,
     together,
     together_replay,
-    woven,
 )
 from skillweave import (
     PPO,
@@ -58,7 +58,7 @@ Play = dict[str, Any]
 """What a policy does, so that two can be compared by ==."""
 ROWS = 32
 PLOTTED = 5
-"""Plotting takes a second, so of the cases that change a .jsonl file one in so many is plotted, and
+"""Plotting takes a second, so one in this number of cases that change a .jsonl file is plotted, and
 each in which the file is empty, or no file any more. 1: all are."""
 CART_SPACE = gym.make(CART).observation_space
 
@@ -79,22 +79,26 @@ class Sample:
 
 
 def play(run: Run) -> Play:
-    """A trained policy's actions, and an episode of its."""
+    """Return a trained policy's actions, and an episode of its."""
     score = run.evaluate(1)
     return plays(run.policy) | {"returns": score.returns, "lengths": score.lengths}
 
 
 def plays(policy: Policy) -> Play:
-    """A policy's actions on fixed observations, greedy and sampled."""
+    """Return a policy's actions on fixed observations, greedy and sampled."""
     known = Tiny.observation_space if isinstance(policy.observation_space, Dict) else CART_SPACE
     # Not the policy's own bounds: a file may say others, and it must act the same all the same.
     fits = policy.observation_space.shape == known.shape
     space = known if fits else policy.observation_space
     space.seed(0)
-    obs = pack(space, gym.vector.utils.concatenate(
-        space, [space.sample() for _ in range(ROWS)],
-        gym.vector.utils.create_empty_array(space, ROWS),
-    ))  # fmt: skip
+    obs = pack(
+        space,
+        gym.vector.utils.concatenate(
+            space,
+            [space.sample() for _ in range(ROWS)],
+            gym.vector.utils.create_empty_array(space, ROWS),
+        ),
+    )
     return {
         f"deterministic {greedy}": policy.act(
             policy.start(ROWS), obs, deterministic=greedy, rng=np.random.default_rng(0)
@@ -104,7 +108,7 @@ def plays(policy: Policy) -> Play:
 
 
 def looked_at(run: Path, changed: str) -> None:
-    """The commands that only read."""
+    """Run the commands that only read."""
     with contextlib.redirect_stdout(io.StringIO()):
         execute.run(commands.Info(target=str(run)))
     found = RunDirectory.open(run)
@@ -186,7 +190,7 @@ class _Stop(Exception):
 
 
 def unfinished(kind: Kind, cuts: int) -> Callable[[Path], None]:
-    """Make a run that was stopped after so many checkpoints."""
+    """Make a run that was stopped after ``count`` checkpoints."""
 
     def make(folder: Path) -> None:
         saved, count = RunDirectory.save_checkpoint, 0
@@ -241,16 +245,31 @@ def agilerl(folder: Path) -> None:
 
     def described(outputs: int, end: str | None) -> dict[str, Any]:
         return {
-            "num_inputs": 4, "num_outputs": outputs, "hidden_size": [6], "mlp_activation": "Tanh",
-            "mlp_output_activation": end, "layer_norm": False, "device": torch.device("cpu"),
-        }  # fmt: skip
+            "num_inputs": 4,
+            "num_outputs": outputs,
+            "hidden_size": [6],
+            "mlp_activation": "Tanh",
+            "mlp_output_activation": end,
+            "layer_norm": False,
+            "device": torch.device("cpu"),
+        }
 
     checkpoint = {
-        "algo": "PPO", "gamma": 0.97, "lr": 3e-4, "batch_size": 32, "one_hot": False, "index": 2,
-        "scores": [np.float64(1.5)], "fitness": [np.float32(2.0)], "steps": [0, np.int64(9)],
-        "actor_init_dict": described(2, "Softmax"), "critic_init_dict": described(1, None),
-        "actor_state_dict": network(2), "critic_state_dict": network(1), "array": np.arange(3.0),
-    }  # fmt: skip
+        "algo": "PPO",
+        "gamma": 0.97,
+        "lr": 3e-4,
+        "batch_size": 32,
+        "one_hot": False,
+        "index": 2,
+        "scores": [np.float64(1.5)],
+        "fitness": [np.float32(2.0)],
+        "steps": [0, np.int64(9)],
+        "actor_init_dict": described(2, "Softmax"),
+        "critic_init_dict": described(1, None),
+        "actor_state_dict": network(2),
+        "critic_state_dict": network(1),
+        "array": np.arange(3.0),
+    }
     torch.save(checkpoint, folder / "old.pt")
 
 
@@ -298,7 +317,7 @@ def agent(folder: Path) -> None:
 
 
 # Few steps to resume: there are many cases.
-SHORT = Kind(lambda: woven(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)))
+SHORT = Kind(lambda: hierarchy_of(128, PPO(**LEARNS, network=NET), PPO(**LEARNS, network=NET)))
 SHORT_REPLAY = Kind(
     lambda: alone(TINY_IN_PYTHON, SAC(**REPLAYS, normalize_obs=True, n_step=3), 200)
 )
@@ -318,12 +337,11 @@ SAMPLES: dict[str, Sample] = {
     "population": Sample(whole("population"), from_data),
     "unfinished": Sample(unfinished(SHORT, 5), resumed(SHORT), share=0.4),
     "unfinished population": Sample(
-        unfinished(KINDS["population, replay"], 2), resumed(KINDS["population, replay"]),
+        unfinished(KINDS["population, replay"], 2),
+        resumed(KINDS["population, replay"]),
         share=0.1,
     ),
-    "unfinished replay": Sample(
-        unfinished(SHORT_REPLAY, 3), resumed(SHORT_REPLAY), share=0.2
-    ),
+    "unfinished replay": Sample(unfinished(SHORT_REPLAY, 3), resumed(SHORT_REPLAY), share=0.2),
     "unfinished together": Sample(
         unfinished(SHORT_TOGETHER, 2), resumed(SHORT_TOGETHER), share=0.2
     ),
@@ -333,12 +351,8 @@ SAMPLES: dict[str, Sample] = {
     "unfinished start from another run": Sample(
         unfinished(SHORT_START, 1), resumed(SHORT_START), share=0.2
     ),
-    "weights": Sample(
-        weights("skills and selector"), weights_file(KINDS["skills and selector"])
-    ),
-    "flat weights": Sample(
-        weights("replay of continuous actions"), flat_weights
-    ),
+    "weights": Sample(weights("skills and selector"), weights_file(KINDS["skills and selector"])),
+    "flat weights": Sample(weights("replay of continuous actions"), flat_weights),
     "AgileRL": Sample(agilerl, converted),
     "ONNX": Sample(onnx_run, onnx_skill, share=0.3),
-}  # fmt: skip
+}

@@ -68,7 +68,7 @@ class Walk(gym.Env[Any, Any]):
         return self.seen(), -abs(self.x), False, self.t == 10, {}
 
     def seen(self) -> Any:
-        """Where it is, and when."""
+        """Return its place and time."""
         return np.array([self.x, self.t], np.float32)
 
 
@@ -94,7 +94,7 @@ class Unclosed(Walk):
 
 
 class Blocking(Walk):
-    """Waits for ever in a step, once in a while."""
+    """An environment that once in a while waits forever in a step."""
 
     def step(self, action: Any) -> Any:
         if self.np_random.random() < 0.002:
@@ -140,8 +140,9 @@ def drawn(rng: random.Random, env: Any = Walk, workers: int | None = 2) -> Any:
         skills = [type(f"Home{i}", (Home,), {"name": f"home{i}"})() for i in range(12)]
     agents = {"algorithm": PPO(**ON), "selector": PPO(**ON)}
     if kind == "apart":
-        return Hierarchy(spec, skills, learn="apart", apart=Apart(skill_steps=300), **agents,
-                         steps=900), how  # fmt: skip
+        return Hierarchy(
+            spec, skills, learn="apart", apart=Apart(skill_steps=300), **agents, steps=900
+        ), how
     return Hierarchy(spec, skills, steps=600, **agents), how
 
 
@@ -177,7 +178,7 @@ def torch_threads(rng: random.Random, run: Path) -> None:
 
 
 def trainings_in_threads(rng: random.Random, run: Path) -> None:
-    """One program trains three times at once."""
+    """Train three times at once in one program."""
     failed: list[BaseException] = []
 
     def job(number: int) -> None:
@@ -186,8 +187,10 @@ def trainings_in_threads(rng: random.Random, run: Path) -> None:
         except BaseException as error:
             failed.append(error)
 
-    jobs = [threading.Thread(target=job, args=(rng.randrange(100 * i, 100 * i + 100),))
-            for i in range(3)]  # fmt: skip
+    jobs = [
+        threading.Thread(target=job, args=(rng.randrange(100 * i, 100 * i + 100),))
+        for i in range(3)
+    ]
     for one in jobs:
         one.start()
     for one in jobs:
@@ -197,7 +200,7 @@ def trainings_in_threads(rng: random.Random, run: Path) -> None:
 
 
 def killed(rng: random.Random, run: Path) -> None:
-    """The process is killed while it trains."""
+    """Kill the process while it trains."""
     seconds = rng.uniform(0.3, 3.0)
     threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGKILL)).start()
     while True:
@@ -206,7 +209,7 @@ def killed(rng: random.Random, run: Path) -> None:
 
 
 def linked(rng: random.Random, run: Path) -> None:
-    """A part of the run is a link to a file of the user's; then it is resumed."""
+    """Make a part of the run a link to a user's file, and resume the run."""
     trained(random.Random(1), run, workers=1)
     mine = run.parent / "mine"
     files = sorted(p for p in run.rglob("*") if p.is_file())
@@ -234,20 +237,20 @@ def linked(rng: random.Random, run: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files of a folder."""
+    """Return all files of a folder."""
     return {str(p): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def escapes(rng: random.Random, run: Path) -> None:
-    """The manifest holds what a terminal would obey."""
+    """Put control characters of a terminal into the manifest."""
     from skillweave.cli import main
 
     trained(rng, run, workers=1)
-    told = json.loads((run / "run.json").read_text())
-    del told["sha256"], told["schema"]
+    manifest = json.loads((run / "run.json").read_text())
+    del manifest["sha256"], manifest["schema"]
     evil = "\x1b]52;c;ZXZpbA==\x07\x1b[2J"
-    told[rng.choice(("env", "created"))] += evil
-    write_json(run / "run.json", told)
+    manifest[rng.choice(("env", "created"))] += evil
+    write_json(run / "run.json", manifest)
     out = run.parent / "said"
     plain = os.dup(1), os.dup(2)
     with out.open("wb") as file:
@@ -307,7 +310,7 @@ def small_shm(rng: random.Random, run: Path, read_only: bool = False) -> None:
 
 
 def other_directory(rng: random.Random, run: Path) -> None:
-    """The program changes its directory."""
+    """Change the program's directory."""
     os.chdir(run.parent)
     run.parent.joinpath("relative").mkdir(exist_ok=True)
     name = Path("relative") / run.name
@@ -318,14 +321,14 @@ def other_directory(rng: random.Random, run: Path) -> None:
 
 
 def ascii_locale(rng: random.Random, run: Path) -> None:
-    """Texts can be ASCII only."""
+    """Train where texts can be ASCII only."""
     locale.setlocale(locale.LC_ALL, "C")
     sys.stderr.reconfigure(encoding="ascii", errors="strict")  # type: ignore[union-attr]
     trained(rng, run).report(run / "report.html", episodes=1, films=0)
 
 
 def umask(rng: random.Random, run: Path) -> None:
-    """Files are for the user or the group."""
+    """Train where files are for the user or the group."""
     mask = rng.choice((0o077, 0o002, 0o027))
     os.umask(mask)
     trained(rng, run)
@@ -336,7 +339,7 @@ def umask(rng: random.Random, run: Path) -> None:
 
 
 def daemonic(rng: random.Random, run: Path) -> None:
-    """The training is in a process that may have no children."""
+    """Train in a process that may have no children."""
     process = multiprocessing.get_context("fork").Process(
         target=in_daemon, args=(rng, run, rng.choice((None, 1))), daemon=True
     )
@@ -358,12 +361,12 @@ def in_daemon(rng: random.Random, run: Path, workers: int | None) -> None:
 
 
 def unclosed(rng: random.Random, run: Path) -> None:
-    """Environments cannot be closed."""
+    """Train with environments that cannot be closed."""
     trained(rng, run, Unclosed, rng.choice((1, 2)))
 
 
 def lost_files(rng: random.Random, run: Path) -> None:
-    """A file of the run is gone; then it is resumed."""
+    """Remove a file of the run, and resume the run."""
     found = trained(rng, run, workers=1)
     names = [p for p in sorted(run.rglob("*")) if p.is_file() and p.suffix != ".safetensors"]
     lost = rng.choice([p for p in names if p.name != "run.json"])
@@ -374,7 +377,7 @@ def lost_files(rng: random.Random, run: Path) -> None:
 
 
 def start_methods(rng: random.Random, run: Path) -> None:
-    """Processes are not forked."""
+    """Train where processes are not forked."""
     multiprocessing.set_start_method(rng.choice(("spawn", "forkserver")), force=True)
     trained(rng, run, workers=rng.choice((None, 2)))
 
@@ -414,7 +417,7 @@ class Surroundings:
         """Nothing: a case's training has a process of its own."""
 
     def cases(self, count: int) -> int:
-        """As many as are asked for, the same number of each."""
+        """Return the requested number of cases, the same number of each."""
         return count
 
     def case(self, number: int) -> Outcome:
@@ -428,25 +431,25 @@ class Surroundings:
         log = folder / "log"
         outside = self.folder / "outside"
         outside.mkdir(exist_ok=True)
-        told = partial(Outcome, what=f"{name}: case {number}")
+        outcome = partial(Outcome, what=f"{name}: case {number}")
         pid = fork(partial(guarded, function, rng, folder / "run"), log)
         code = wait(pid, PATIENCE)
         if code is None:
             kill_group(pid)
-            return told(HANG, said=log.read_text(errors="replace"))
+            return outcome(HANG, said=log.read_text(errors="replace"))
         gone = group_is_gone(pid, 10.0)
         kill_group(pid)
         said = log.read_text(errors="replace")
         if not gone:
-            return told(LEFT, said=said)
+            return outcome(LEFT, said=said)
         if code == SENTENCE:
-            return told(REFUSED if may_refuse else LOST, said=said)
+            return outcome(REFUSED if may_refuse else LOST, said=said)
         if code == WRONG:
-            return told(FILES, said=said)
+            return outcome(FILES, said=said)
         if code not in (0, -signal.SIGKILL if function is killed else 0):
-            return told(TRACEBACK, said=f"exit code {code}\n{said}")
+            return outcome(TRACEBACK, said=f"exit code {code}\n{said}")
         shutil.rmtree(folder, ignore_errors=True)
-        return told(FINISHED)
+        return outcome(FINISHED)
 
 
 def guarded(function: Callable[[random.Random, Path], None], rng: random.Random, run: Path) -> int:

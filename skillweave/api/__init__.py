@@ -1,39 +1,70 @@
-"""What users call: declare a ``Hierarchy`` or an ``Agent``, train it, get a ``Run``."""
+"""The public API: declare a ``Hierarchy`` or an ``Agent``, train it, get a ``Run``.
+
+The three classes refer to one another, so they are one module.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
+import numpy as np
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api.adoption import adopted, check_run, spec_of, told_differences
-from skillweave.api.loading import load
-from skillweave.api.notebook_tables import agent_html, agent_line, hierarchy_html, hierarchy_line
+from skillweave.api.adoption import (
+    Trained,
+    apply_manifest,
+    check_run,
+    describe_differences,
+    load_policy,
+    spec_of,
+)
+from skillweave.api.hub import push_run
+from skillweave.api.notebook_tables import (
+    agent_html,
+    agent_line,
+    hierarchy_html,
+    hierarchy_line,
+    run_html,
+)
+from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
-from skillweave.api.run import Run
 from skillweave.api.running import begin, evolving, go_on
-from skillweave.api.starting import StartFrom
+from skillweave.api.starting import Directories
 from skillweave.arguments import checked_names
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
-from skillweave.envs.make import EnvSpec
-from skillweave.errors import RunError
+from skillweave.envs.make import EngineName, EnvSpec
+from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.plan import Evolve
+from skillweave.export.write import Export, write_export
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import below, copied
-from skillweave.hierarchy.weights import open_weights, read_agent, read_weights
-from skillweave.messages import as_path, whole_number
+from skillweave.hierarchy.nesting import below, copied, every_skill
+from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.schedule import stages_of
+from skillweave.hierarchy.weights import open_weights, read_agent, read_weights, write_weights
+from skillweave.messages import as_path, shown_path, whole_number
+from skillweave.reporting.palette import RGB, color_of
+from skillweave.reporting.progress import EpisodeProgress
+from skillweave.reporting.report.single import write_report
+from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
+from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
+from skillweave.terminal import printable
 from skillweave.training.callback import Callback
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.evaluation import Evaluation, evaluate
+from skillweave.training.evaluation_file import load_evaluation, save_evaluation
+from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.types import Memory, Policy
 
 
 class Agent(PlainAgent):
@@ -45,7 +76,7 @@ class Agent(PlainAgent):
         return agent_line(self)
 
     def _repr_html_(self) -> str:
-        """Return a table of what it declares, for notebooks."""
+        """Return a table of the declaration, for notebooks."""
         return agent_html(self)
 
     @checked_names
@@ -83,18 +114,19 @@ class Agent(PlainAgent):
             log_info=log_info,
         )
         content = self.manifest(whole_number(seed, "seed", 0), how)
-        return begin(
+        trained = begin(
             self,
-            content,
+            content | {"recipe": self.recipe},
             run_dir,
             quiet,
             track,
             evolve,
             cluster,
-            start_from,
+            _directories(start_from),
             callback=callback,
             resume=resume,
         )
+        return run_of(trained)
 
     @checked_names
     def resume(
@@ -113,26 +145,26 @@ class Agent(PlainAgent):
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
-        note = told_differences(self, run)
-        return go_on(self, run, quiet, evolve, cluster, note, callback)
+        note = describe_differences(self, run, self.recipe)
+        return run_of(go_on(self, run, quiet, evolve, cluster, note, callback))
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """Load the finished run of this agent in ``run_dir``."""
-        return load(run_dir, self)
+        return run_of(load_policy(self, as_path(run_dir, "run_dir")))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
-        """The agent of a run's ``manifest`` (``run.json``) that needs none of the user's code."""
+        """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
         (stage,) = manifest["stages"]
         config = config_from_json(stage["algorithm"])
-        found = cls(spec_of(manifest), config, int(stage["budget"]))
-        found.recorded = True
-        return found
+        agent = cls(spec_of(manifest), config, int(stage["budget"]))
+        agent.recorded = True
+        return agent
 
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
-        """This agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        """Load this agent with the weights in the file ``path`` (see ``Run.save_weights``)."""
         self.validate()
         path = as_path(path, "path")
         return Run(self, path, read_agent(self.spec, *open_weights(path), path))
@@ -140,7 +172,7 @@ class Agent(PlainAgent):
     @classmethod
     @checked_names
     def from_weights(cls, path: str | Path) -> Run:
-        """A plain agent with its environment, from the file that ``Run.save_weights`` wrote.
+        """Return a plain agent with its environment, from the file that ``Run.save_weights`` wrote.
 
         Raises:
             RunError: ``path`` is no such file, or the environment needs code.
@@ -148,7 +180,10 @@ class Agent(PlainAgent):
         path = as_path(path, "path")
         tensors, header = open_weights(path)
         if header["kind"] != "agent" or "env" not in header:
-            raise RunError(f"{path} does not say which environment its agent is for")
+            raise RunError(
+                f"{path} does not name the environment of its agent; declare the agent, and "
+                "use its load_weights"
+            )
         agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
@@ -170,13 +205,13 @@ class Hierarchy(Declaration):
     """
 
     recipe: str | None = None
-    """Where it was declared: a shipped recipe's name or a file; written into runs."""
+    """The place of the declaration: a shipped recipe's name or a file; written into runs."""
 
     def __repr__(self) -> str:
         return hierarchy_line(self)
 
     def _repr_html_(self) -> str:
-        """Return tables of what it declares, for notebooks."""
+        """Return tables of the declaration, for notebooks."""
         return hierarchy_html(self)
 
     @checked_names
@@ -204,16 +239,17 @@ class Hierarchy(Declaration):
         Args:
             run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
                 recipe, the hierarchy or the environment. A run that has learnt something is never
-                replaced; one without a checkpoint, which no process trains, is.
-            resume: continue the run in ``run_dir`` if it has learnt something, else begin. Its
+                replaced; one without a checkpoint is, unless a process trains it.
+
+            resume: continue the run in ``run_dir`` if it has learnt something, else start one. Its
                 settings count, and those that differ are named. If steps have grown, a finished run
-                learns on: in new episodes, with schedules over the new budget. Steps of stages
+                continues: in new episodes, with schedules over the new budget. Steps of stages
                 whose learners learn again in a later one go to that stage.
             seed: the root of every random stream.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
             eval_every: environment steps between evaluations while training, by the learner's own
-                reward; None: as ``train_defaults`` says, by default none.
+                reward; None: that of ``train_defaults``, by default none.
             eval_episodes: episodes of each of these evaluations; None: 20.
             checkpoint_every: environment steps between checkpoints; None: 100,000.
             quiet: no progress.
@@ -223,21 +259,21 @@ class Hierarchy(Declaration):
                 Skills and selector of a population cannot learn together yet: they learn apart.
             cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
                 where it pays.
-            start_from: another run, or its directory: whoever learns here and has learnt there, by
-                the same name, begins with its policy. Or several runs, by the name of who begins:
-                ``{"left": run, "right": other}``; a run of a plain agent fits any name. What is
-                taken over is the policy (of PPO and DQN all networks, of SAC and TD3
-                the actor). The task may be another one; spaces, networks and the names of a
-                selector's skills must be the same.
+
+            start_from: another run, or its directory: a learner that has learnt there, by the same
+                name, starts with its policy. Or several runs, by learner:
+                ``{"left": run, "right": other}``; a run of a plain agent fits any name. The policy
+                is copied (of PPO and DQN all networks, of SAC and TD3 the actor). The task may be
+                another one; spaces, networks and the names of a selector's skills must be the same.
             callback: a function that is called with a ``TrainEvent`` for each report of training
                 and each checkpoint. Where it returns False, the stage ends with what it has
                 learnt, as at a target, and the next one starts. An exception in it stops the
-                training and leaves ``train`` as it is; the run can be resumed from its last
+                training and leaves ``train`` unchanged; the run can be resumed from its last
                 checkpoint. It is called in this process, and is not stored in the run.
             keep: "best": each stage ends with the weights whose periodic evaluation was best, by
                 the mean return or by what its target is of; the last weights are evaluated, too.
                 It needs ``eval_every``. A population ends with its best member in any case. None:
-                as ``train_defaults`` says, by default "last".
+                that of ``train_defaults``, by default "last".
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
                 last step counts (in a skill's own stage: of its call). None, NaN and infinity are
@@ -263,21 +299,22 @@ class Hierarchy(Declaration):
             keep=keep,
             log_info=log_info,
         )
-        own, note = (self, "") if flat is not False else evolving(self, evolve)
-        content = training.manifest(own, seed=seed, flat=flat, how=how)
-        return begin(
-            own,
-            content,
+        declared, note = (self, "") if flat is not False else evolving(self, evolve)
+        content = training.manifest(declared, seed=seed, flat=flat, how=how)
+        trained = begin(
+            declared,
+            content | {"recipe": declared.recipe},
             run_dir,
             quiet,
             track,
             evolve,
             cluster,
-            start_from,
+            _directories(start_from),
             note,
             callback,
             resume=resume,
         )
+        return run_of(trained)
 
     @checked_names
     def resume(
@@ -301,14 +338,14 @@ class Hierarchy(Declaration):
         """
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        own = adopted(self, run)
-        note = told_differences(self, run)
-        return go_on(own, run, quiet, evolve, cluster, note, callback)
+        declared = apply_manifest(self, run)
+        note = describe_differences(self, run, self.recipe)
+        return run_of(go_on(declared, run, quiet, evolve, cluster, note, callback))
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
         """Load the finished run in ``run_dir``, of this hierarchy or of its flat baseline."""
-        return load(run_dir, self)
+        return run_of(load_policy(self, as_path(run_dir, "run_dir")))
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> Agent:
         """Return the flat baseline: one agent on the task itself, without skills and reflexes.
@@ -319,42 +356,434 @@ class Hierarchy(Declaration):
 
     @checked_names
     def load_weights(self, path: str | Path) -> Run:
-        """This hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
+        """Load this hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         self.validate()
         path = as_path(path, "path")
-        own = copied(self)  # it takes over how skills are called
-        policy = read_weights(own, path)
+        declared = copied(self)  # the file sets how skills are called
+        policy = read_weights(declared, path)
         plain = isinstance(policy, AgentPolicy)
-        return Run(self.plain_agent() if plain else own, path, policy)
+        return Run(self.plain_agent() if plain else declared, path, policy)
 
     @staticmethod
     @checked_names
     def pretrained(name: str) -> Run:
-        """The shipped recipe ``name`` with its shipped weights."""
+        """Load the shipped recipe ``name`` with its shipped weights."""
         return hierarchy_in(name, Hierarchy).load_weights(weights_path(name))
 
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
-        """The hierarchy of a run's ``manifest`` that needs none of the user's code."""
+        """Return the hierarchy of a run's ``manifest``, without the user's code."""
         entries = {s["name"]: s for s in manifest["skills"]}
         return cls._recorded(spec_of(manifest), manifest, entries)
 
     @classmethod
     def _recorded(
-        cls, spec: EnvSpec, told: dict[str, Any], entries: dict[str, dict[str, Any]]
+        cls, spec: EnvSpec, manifest: dict[str, Any], entries: dict[str, dict[str, Any]]
     ) -> Hierarchy:
-        """A hierarchy of a run, or one below it, from the entries of its skills by their paths."""
+        """Return a run's hierarchy, or one below it, from the entries of its skills by path."""
         skills = []
         for name, entry in entries.items():
             if "/" in name:
                 continue
-            own = {k: entry[k] for k in ("max_steps", "call_steps") if k in entry} | {"name": name}
+            attributes: dict[str, Any] = {
+                k: entry[k] for k in ("max_steps", "call_steps") if k in entry
+            }
+            attributes["name"] = name
             if "hierarchy" in entry:
-                own["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
-            skills.append(type(name, (RecordedSkill,), own)())
-        found = cls(spec, skills, call_steps=calls_from_json(told))
-        found.recorded = True
-        return found
+                attributes["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
+            skills.append(type(name, (RecordedSkill,), attributes)())
+        hierarchy = cls(spec, skills, call_steps=calls_from_json(manifest))
+        hierarchy.recorded = True
+        return hierarchy
+
+
+class Run:
+    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+
+    Args:
+        declaration: what was trained.
+        path: its directory, or its weights file.
+        policy: the trained policy.
+    """
+
+    def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
+        self.declaration, self.path, self.policy = declaration, path, policy
+        self._player: Player | None = None
+
+    def __repr__(self) -> str:
+        return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
+
+    def _repr_html_(self) -> str:
+        """Return tables of the declaration and the stages, for notebooks."""
+        return run_html(self.path, self.declaration)
+
+    @property
+    def hierarchy(self) -> Hierarchy:
+        """The hierarchy that was trained.
+
+        Raises:
+            DeclarationError: this is the run of a plain agent.
+        """
+        if isinstance(self.declaration, PlainAgent):
+            raise DeclarationError("this is the run of a plain agent: it has no hierarchy")
+        return self.declaration
+
+    @checked_names
+    def evaluate(
+        self,
+        episodes: int = 100,
+        *,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+        num_envs: int | None = None,
+        max_steps: int | None = None,
+        save: bool = False,
+        engine: EngineName = "sync",
+        quiet: bool = False,
+    ) -> Evaluation:
+        """Score it in whole episodes.
+
+        Args:
+            episodes: whole episodes.
+            seed: the seed that picks the episodes.
+            deterministic: act greedily, else sample. In a hierarchy this is about the selector;
+                ``greedy_skills`` is about its skills.
+            skill: score this skill alone, as if the selector always chose it. The hierarchy's
+                reflexes are in force, also where it was trained without them. Returns are the
+                environment's; ``skills`` has its call in each episode, from the step in which it
+                may start to its own end, by its own reward and success.
+            num_envs: environments that exist at once; None: at most as many as in training. It
+                does not change the result of a greedy policy; what is sampled differs with it.
+            max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
+            save: keep the result in the run's directory, where ``info`` finds it, instead of the
+                one before. A sampled one is kept beside the score, and does not replace it. Not
+                with ``skill`` or another engine.
+            engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
+            quiet: no progress; else it is shown where an evaluation takes longer than a second.
+
+        Returns:
+            Returns, lengths, and what each skill did.
+
+        Raises:
+            DeclarationError: no such skill or engine; or ``save`` where it cannot be.
+        """
+        if save and (skill is not None or engine != "sync"):
+            raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
+        if save:
+            must_be_own(self.path)  # an error comes before anything is played
+        policy = self._policy(skill)
+        with EpisodeProgress(episodes, quiet=quiet) as progress:
+            score = evaluate(
+                policy,
+                self.declaration.spec,
+                episodes=episodes,
+                seed=seed,
+                deterministic=deterministic,
+                num_envs=self._training_envs() if num_envs is None else num_envs,
+                max_steps=max_steps,
+                watch=progress.watch,
+                engine=engine,
+            )
+        if save:
+            save_evaluation(RunDirectory.open(self.path), score, seed, deterministic)
+        return score
+
+    @checked_names
+    def render(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 1,
+        seed: int = 0,
+        deterministic: bool = True,
+        skill: str | None = None,
+        max_steps: int | None = None,
+        quiet: bool = False,
+    ) -> Film:
+        """Write a captioned film; one in the run's own folder goes to its trackers, too.
+
+        A notebook shows the film that is returned.
+
+        Args:
+            path: the file, ``.gif`` or ``.mp4``. None: ``film.gif`` in the
+                run's folder, with a skill's name where it acts alone. A policy without a folder of
+                its own (a weights file, a copy of the hub's) writes its film where Python runs.
+            episodes: how many, one after another.
+            seed: picks them.
+            deterministic: act greedily, else sample.
+            skill: show this skill alone, as in ``evaluate``.
+            max_steps: an episode that nothing has ended by then is cut.
+            quiet: no progress; else it is shown where a film takes longer than a second.
+
+        Returns:
+            ``path``, and what was filmed, as plain JSON.
+        """
+        policy = self._policy(skill)
+        path = self._film_path(skill) if path is None else as_path(path, "path")
+        must_be_own(path.parent)
+        seed = whole_number(seed, "seed", 0)
+        plain = isinstance(self.declaration, PlainAgent)
+        skills = () if plain else self.hierarchy.skills
+        film = render_policy(
+            self.declaration.spec,
+            policy,
+            path,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            label=_labels_of(policy, skills, skill),
+            max_steps=max_steps,
+            rng=np.random.default_rng(seed),
+            quiet=quiet,
+        )
+        if path.parent.resolve() == self.path.resolve():
+            track_film(RunDirectory.open(self.path), path)
+        return Film(film)
+
+    def _film_path(self, skill: str | None) -> Path:
+        """Return the default path of a film."""
+        ending = "" if skill is None else "-" + skill.replace("/", ".")
+        if self.path.is_dir() and not is_copy_of_hub(self.path):
+            return self.path / f"film{ending}.gif"
+        return Path(f"{self.path.name.removesuffix('.safetensors')}{ending}.gif")
+
+    @checked_names
+    def act(self, obs: Any, **given: Any) -> Any:
+        """Return the greedy action for one observation.
+
+        A policy with a memory needs ``reset`` at the start of each episode.
+
+        Args:
+            obs: what the environment's ``reset`` or ``step`` returned.
+            **given: ``reward``, ``info``, ``mask``: see ``Player.act``.
+
+        Returns:
+            The action, as the environment takes it.
+        """
+        if self._player is None:
+            self._player = self.player()
+        return self._player.act(obs, **given)
+
+    @checked_names
+    def reset(self) -> None:
+        """Start a new episode for ``act``."""
+        if self._player is not None:
+            self._player.reset()
+
+    @checked_names
+    def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
+        """Return a player: the policy for one environment, with a memory of its own.
+
+        Args:
+            deterministic: act greedily, else sample; as in ``evaluate``.
+            seed: of what is sampled.
+
+        Returns:
+            The player; call its ``reset`` where an episode begins.
+        """
+        return Player(self.policy, deterministic=deterministic, seed=seed)
+
+    @checked_names
+    def export(self, path: str | Path) -> Export:
+        """Write ONNX files, ``policy.json`` and ``runner.py``, which needs only onnxruntime.
+
+        What is Python code (initiation, termination, reflexes' conditions, functions) is not
+        written: ``Export.code`` lists it, and the ``Runner`` is given it by name.
+
+        Args:
+            path: a folder; files of the same names are replaced.
+
+        Returns:
+            The folder, its files, and what is code.
+
+        Raises:
+            PolicyError: a part cannot be exported; the message names it, and what to do.
+        """
+        path = as_path(path, "path")
+        must_be_own(path)
+        return write_export(path, self.policy, self.declaration.spec.name)
+
+    @checked_names
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 20,
+        films: int = 3,
+        seed: int = 0,
+        deterministic: bool = True,
+        quiet: bool = False,
+    ) -> dict[str, Any]:
+        """Write one HTML file about the run: film, calls, skills, curves, settings.
+
+        Args:
+            path: the file; None: ``report.html`` in the run.
+            episodes: to play, with seeds that training never used.
+            films: how many of them to film, from the worst to the best.
+            seed: picks the episodes.
+            deterministic: act greedily, else sample.
+            quiet: no progress; else it is shown where a part takes longer than a second.
+
+        Returns:
+            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
+            ``missing``: sentences on what is not in it.
+
+        Raises:
+            RunError: this is no run but a weights file, or the file cannot be written.
+        """
+        run = RunDirectory.open(self.path)
+        return write_report(
+            run,
+            run.path / "report.html" if path is None else as_path(path, "path"),
+            self.policy,
+            self.declaration.spec,
+            episodes=episodes,
+            filmed=films,
+            seed=seed,
+            deterministic=deterministic,
+            quiet=quiet,
+        )
+
+    @checked_names
+    def save_weights(self, path: str | Path) -> Path:
+        """Write every policy into one file for ``Hierarchy.load_weights``.
+
+        Args:
+            path: the file to write.
+
+        Returns:
+            The path.
+        """
+        path = as_path(path, "path")
+        must_be_own(path.parent)
+        write_weights(path, self.declaration, self.policy)
+        return path
+
+    @checked_names
+    def push(self, name: str, *, private: bool = False) -> dict[str, Any]:
+        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
+
+        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
+        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
+        ``hf auth login``, or set ``HF_TOKEN``.
+
+        Args:
+            name: ``owner/name``; made if it is not there. An older run there is replaced.
+            private: others may not read it.
+
+        Returns:
+            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
+
+        Raises:
+            RunError: the run is not finished or damaged, ``name`` may not be written or
+                holds something else, or the hub does not answer.
+        """
+        return push_run(self.path, name, private)
+
+    @checked_names
+    def as_skill(self, name: str, **attributes: Any) -> Skill:
+        """Return the whole policy as one skill of another hierarchy.
+
+        Args:
+            name: of the skill.
+            **attributes: of the skill, ``max_steps=50`` for example.
+
+        Returns:
+            The skill, which needs no training.
+        """
+        kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
+        skill: Skill = kind()
+        return skill
+
+    @checked_names
+    def info(self) -> dict[str, Any]:
+        """Return its manifest, with the latest saved evaluation under ``evaluation``.
+
+        One that sampled actions on request is under ``evaluation_sampled``.
+        """
+        run = RunDirectory.open(self.path)
+        scores = {
+            "evaluation": load_evaluation(run),
+            "evaluation_sampled": load_evaluation(run, deterministic=False),
+        }
+        return run.manifest | {k: v.to_json() for k, v in scores.items() if v is not None}
+
+    def _training_envs(self) -> int | None:
+        """Return the number of environments in training; None: nothing was trained."""
+        if self.path.is_dir():
+            return RunDirectory.open(self.path).num_envs
+        declared = self.declaration
+        stages = declared.stages() if isinstance(declared, PlainAgent) else stages_of(declared)
+        return max((stage.config.num_envs for stage in stages), default=None)
+
+    def _policy(self, skill: str | None) -> Policy:
+        if skill is None:
+            return self.policy
+        policy = self.policy
+        if not isinstance(policy, HierarchyPolicy):
+            raise DeclarationError("this is a plain agent: it has no skills")
+        self.hierarchy.skill(skill)
+        *nodes, name = skill.split("/")
+        for node in nodes:
+            below = policy.skills.policies[policy.labels.index(node)]
+            assert isinstance(below, HierarchyPolicy)
+            policy = below
+        return SkillAlone(policy.skills, name, skill)
+
+
+OneRun = str | Path | Run
+StartFrom = OneRun | Mapping[str, OneRun] | None
+"""A run from which learners start, or such runs by the learners' names."""
+
+
+def _directories(start_from: StartFrom) -> Directories:
+    """Return ``start_from`` with the directory of each run in place of the run."""
+    if isinstance(start_from, Mapping):
+        return {name: _directory(run) for name, run in start_from.items()}
+    return None if start_from is None else _directory(start_from)
+
+
+def _directory(run: OneRun) -> str | Path:
+    return run.path if isinstance(run, Run) else run
+
+
+def declaration_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
+    """Return what a run trained: the hierarchy, or its flat baseline."""
+    if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
+        return declared.plain_agent()
+    return declared
+
+
+def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
+    """Return what training or loading made as a ``Run``."""
+    declared, run, policy = trained
+    return Run(declaration_of(declared, run), run.path, policy)
+
+
+def _labels_of(
+    policy: Policy, skills: Sequence[Skill], alone: str | None
+) -> Callable[[Memory], tuple[str, RGB]]:
+    """Return a function from a policy's memory to the acting skill's name and colour.
+
+    Args:
+        skills: of the hierarchy that acts; none: a plain agent.
+        alone: the skill that acts alone.
+    """
+    colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(every_skill(skills))}
+
+    def label(memory: Memory) -> tuple[str, RGB]:
+        if not skills:
+            return AGENT, color_of(len(colors), None)
+        acting = policy.policy if isinstance(policy, SkillAlone) else policy
+        below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
+        name = "/".join(filter(None, (alone, below)))
+        known = name
+        while known not in colors:  # a run that is a ready skill has skills of its own
+            known = known.rpartition("/")[0]
+        return name, colors[known]
+
+    return label
 
 
 @checked_names
@@ -387,20 +816,20 @@ def train_agent(
         algorithm: its settings, ``SAC()`` for example.
         steps: training budget in environment steps.
         target_return: stop early at this mean return of the periodic evaluation.
-        target_success: stop early at this share of episodes whose ``info["success"]`` is true.
+        target_success: stop early at this share of episodes with a true ``info["success"]``.
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
         checkpoint_every: environment steps between checkpoints.
         run_dir: a new directory; None: the next number of ``runs/<environment>-<n>``.
         resume: continue the run in ``run_dir`` if it has learnt something, for more ``steps`` if
-            they have grown, else begin; see ``Hierarchy.train``.
+            they have grown, else start; see ``Hierarchy.train``.
         seed: the root of every random stream.
         quiet: no progress.
         track: any of "tensorboard", "wandb" and "mlflow".
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
-        start_from: another plain agent's run, or its directory: it begins with that policy; see
+        start_from: another plain agent's run, or its directory: it starts with that policy; see
             ``Hierarchy.train``.
         callback: is called with a ``TrainEvent`` for each report and each checkpoint; returning
             False ends the training; see ``Hierarchy.train``.
@@ -411,7 +840,7 @@ def train_agent(
         The finished run.
 
     Raises:
-        DeclarationError: the algorithm cannot act in the environment; the message says which can.
+        DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
     agent = Agent(
         env,
@@ -439,4 +868,4 @@ def train_agent(
         )
 
 
-__all__ = ["Agent", "Hierarchy", "Run", "load", "train_agent"]
+__all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

@@ -1,12 +1,12 @@
-"""``train(..., resume=True)``: continue what is in a directory, perhaps for more steps."""
+"""Continue the run in a directory, perhaps for more steps: apart, as a new run needs none of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
-from skillweave.api.adoption import adopted, check_run, differences
+from skillweave.api.adoption import apply_manifest, check_run, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.hierarchy import training
@@ -14,10 +14,10 @@ from skillweave.hierarchy.declaration import Declaration
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
+from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import decides
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
+D = TypeVar("D", bound=Declaration | PlainAgent)
 
 EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
@@ -32,25 +32,25 @@ def to_continue(path: Path) -> RunDirectory | None:
 
 
 def prepared(
-    declared: Hierarchy | Agent,
+    declared: D,
     content: dict[str, Any],
     run: RunDirectory,
     evolve: Evolve,
     track: Sequence[str],
-) -> tuple[Hierarchy | Agent, str]:
-    """Return a declaration as a run has it, and what people should know; the run is locked.
+) -> tuple[D, str]:
+    """Return a declaration with a run's manifest applied, and sentences; the run is locked.
 
     Stages whose budgets have grown get the new ones.
 
     Args:
-        content: the manifest of the declaration, as a new run would have it.
+        content: the manifest that a new run of the declaration would have.
 
     Raises:
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
     _check_same(declared, content, run)
-    own = adopted(declared, run) if isinstance(declared, Declaration) else declared
-    budgets = _budgets(own, content, run, evolve)
+    declared = apply_manifest(declared, run)
+    budgets = _budgets(declared, content, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
     if tuple(track) != tuple(run.manifest.get("track", ())):
         known = ", ".join(run.manifest.get("track", ())) or "none"
@@ -67,10 +67,12 @@ def prepared(
         sentences.append(
             f"{run.path} is finished, so nothing is trained; to train it for longer, give it {more}"
         )
-    return own, "; ".join(filter(None, sentences))
+    return declared, "; ".join(filter(None, sentences))
 
 
-def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: RunDirectory) -> None:
+def _check_same(
+    declared: Declaration | PlainAgent, content: Mapping[str, Any], run: RunDirectory
+) -> None:
     """Raise a RunError where a run is one of another declaration."""
     check_run(declared, run)
     manifest = run.manifest
@@ -83,7 +85,7 @@ def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: Ru
             f"{run.path} is the run of {one}, but it was to continue as {other}; choose another "
             "directory"
         )
-    mine, theirs = declared.recipe, manifest.get("recipe")
+    mine, theirs = content["recipe"], manifest.get("recipe")
     if mine and theirs and Path(mine).name != Path(theirs).name:
         raise RunError(
             f"{run.path} is a run of the recipe {theirs}, not of {mine}; choose another directory"
@@ -96,7 +98,7 @@ def _check_same(declared: Hierarchy | Agent, content: Mapping[str, Any], run: Ru
 
 
 def _budgets(
-    declared: Hierarchy | Agent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
+    declared: Declaration | PlainAgent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
 ) -> dict[str, int]:
     """Return the budgets of a run's stages as they are declared now, where both have the stage."""
     stages: list[dict[str, Any]] = content["stages"]
@@ -108,13 +110,13 @@ def _budgets(
         if not isinstance(evolve, Mapping) or set(evolve) <= names:
             plan(stages, evolve)
     theirs = {entry["name"]: entry for entry in run.manifest["stages"]}
-    found = {}
+    budgets = {}
     for stage in stages:
         if (entry := theirs.get(stage["name"])) is not None:
             members, known = _members(stage), _members(entry)
             # A population's budget is that of all members.
-            found[stage["name"]] = stage["budget"] // members * known
-    return found
+            budgets[stage["name"]] = stage["budget"] // members * known
+    return budgets
 
 
 def _members(entry: Mapping[str, Any]) -> int:
@@ -122,24 +124,26 @@ def _members(entry: Mapping[str, Any]) -> int:
 
 
 def _more(stages: Sequence[Mapping[str, Any]], budgets: Mapping[str, int]) -> dict[str, int]:
-    """Return by how much the budgets of stages are larger now."""
-    found: dict[str, int] = {}
+    """Return by stage the steps that its budget has grown by."""
+    more: dict[str, int] = {}
     for entry in stages:
         heir = _heir(stages, entry)["name"]
         declared = budgets.get(entry["name"], entry["budget"])
-        found[heir] = found.get(heir, 0) + declared - entry["budget"]
-    return found
+        more[heir] = more.get(heir, 0) + declared - entry["budget"]
+    return more
 
 
 def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
-    """Give stages of a run more steps, and write that; sentences about it.
+    """Give stages of a run more steps, and write that; return sentences about it.
 
-    A stage whose learners learn again in a later one stays as it is: what it would learn now, that
-    stage would not know of. The later one gets its steps, too.
+    A stage whose learners learn again in a later one stays as it is, as the later one would not
+    start from the new weights. The later one gets its steps, too.
     """
     stages: list[dict[str, Any]] = run.manifest["stages"]
     more = _more(stages, budgets)
-    finished, grown, sentences = run.finished, list[dict[str, Any]](), list[str]()
+    finished = run.finished
+    grown = list[dict[str, Any]]()
+    sentences = list[str]()
     for entry in stages:
         name, budget = entry["name"], entry["budget"]
         wanted = budget + more.get(name, 0)
@@ -180,19 +184,19 @@ MADE_AT_THE_END = (
     "sha256",
     "policies",
 )
-"""Of a stage's entry what training writes again when it has continued."""
+"""Fields of a stage's entry that training writes again when it has continued."""
 
 
 def _heir(stages: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the latest stage in which one learns who learns in this one."""
-    own = set(entry["learns"])
-    return next(other for other in reversed(stages) if own & set(other["learns"]))
+    """Return the latest stage with a learner of this one."""
+    learners = set(entry["learns"])
+    return next(other for other in reversed(stages) if learners & set(other["learns"]))
 
 
 def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None:
     """Raise a RunError where a stage cannot be given more steps."""
     name = entry["name"]
-    new = f"Begin a new run with what it has learnt: {start_words(run)}"
+    new = f"Start a new run from what it has learnt: {start_words(run)}"
     if entry.get("evolution"):
         raise RunError(
             f"{run.path}: stage {name!r} is a population, which cannot be given more steps, as "
@@ -205,7 +209,8 @@ def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None
             f"{run.path} cannot be given more steps: it does not hold the final state of stage "
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
         )
-    tensors, left = run.final_tensors(name), entry["budget"] + more - entry["steps"]
+    tensors = run.final_tensors(name)
+    left = entry["budget"] + more - entry["steps"]
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
         place = "extra.learner." + (f"{learner}." if "together" in entry else "") + "store."
@@ -225,8 +230,8 @@ def _algorithms(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a sentence on each selector that stays as it is, while skills of it learn on."""
-    found = []
+    """Return a sentence on each selector that stays as it is while its skills continue."""
+    sentences = []
     for at, entry in enumerate(stages):
         node = entry["name"].rpartition("/")[0]
         if entry["status"] != "done" or entry in grown or not decides(str(entry["decides"])):
@@ -240,8 +245,8 @@ def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any
             if name.startswith(within)
         ]
         if skills:
-            found.append(
+            sentences.append(
                 f"{entry['name']} stays as it is, so it still chooses for {', '.join(skills)} as "
                 "they were; give it more steps, too"
             )
-    return found
+    return sentences

@@ -1,24 +1,29 @@
-"""Loading finished runs: one way for Python, the command line and the hub."""
+"""Finished runs for Python, the command line and the hub: load one, or finish it first."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from skillweave.api.adoption import adopted, check_run
-from skillweave.api.run import Run
-from skillweave.api.running import caller_of, declared_of
+from skillweave.api import Agent, Hierarchy, Run, run_of
+from skillweave.api.adoption import load_policy
+from skillweave.api.recipe_file import hierarchy_in
+from skillweave.api.running import begin, begun
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError
-from skillweave.hierarchy import training
+from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
-from skillweave.runs.command_words import called_by, python_string
+from skillweave.runs import hub
+from skillweave.runs.command_words import python_string
 from skillweave.runs.directory import RunDirectory
+from skillweave.shipped import names
 from skillweave.training.plain_agent import PlainAgent
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
+ASK = "Point to the file that defines it, if you trust it: --recipe FILE.py"
+ASK_FROM_HUB = (
+    "Pass the hierarchy that was trained, if you have its code and trust it: "
+    "from_hub(name, hierarchy)"
+)
 
 
 @checked_names
@@ -55,27 +60,92 @@ def load_from(
     """Load a finished run; errors are those of ``load``.
 
     Args:
-        declared: what was trained; None: ``recipe``, or what the run's data say.
+        declared: the declaration; None: ``recipe``, or the declaration in the run's data.
         recipe: a shipped recipe, or a file that is trusted.
-        ask: what to do where code is needed and was not given, as a sentence.
+        ask: a sentence for the error: how to give the code that is needed.
     """
-    from skillweave.api.declared import declared_by
-
     check_declared(declared)
-    run = RunDirectory.open(path)
     if declared is None:
-        declared = declared_by(run, recipe, ask=ask)
-    declared.validate()
-    with called_by(caller_of(declared)):
-        if isinstance(declared, Declaration):
-            declared = adopted(declared, run)
-        else:
-            check_run(declared, run)
-        return Run(declared_of(declared, run), run.path, training.load(declared, run))
+        declared = declared_by(RunDirectory.open(path), recipe, ask=ask)
+    return run_of(load_policy(declared, path))
+
+
+@checked_names
+def from_hub(
+    name: str, hierarchy: Hierarchy | Agent | None = None, *, revision: str | None = None
+) -> Run:
+    """Load a run from the Hugging Face Hub, as ``hierarchy.load`` loads one from a folder.
+
+    Only data comes from there: safetensors and JSON, checked like any run's files. It needs the
+    extra ``hub``. The files are kept where ``huggingface_hub`` keeps its own (``HF_HOME``), and
+    without a network a run is loaded from there. Nothing is written into that copy: to save an
+    evaluation or a report in the run, take a copy of your own (``skillweave pull``).
+
+    Args:
+        name: ``owner/name``.
+        hierarchy: what was trained, where acting needs its Python code; None: not needed, or a
+            recipe that is shipped.
+        revision: a branch, a tag or a commit; None: the latest.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        RunError: there is no such run, it holds a file that is not data, it is damaged, it
+            needs code that was not given, or the hub does not answer.
+        MissingExtra: the extra 'hub' is not installed.
+    """
+    check_declared(hierarchy)
+    return load_from(hub.download(hub.check_name(name), revision), hierarchy, ask=ASK_FROM_HUB)
+
+
+def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
+    """Return the finished run of this manifest in ``run_dir``; train what is missing.
+
+    Raises:
+        RunError: the directory holds a run of another manifest.
+    """
+    run = begun(declared, content, run_dir)
+    if run is None:
+        content = content | {"recipe": declared.recipe}
+        return run_of(begin(declared, content, run_dir, True, (), None, None))
+    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
+
+
+def declared_by(
+    run: RunDirectory, recipe: str | None = None, needs: str = "needs_recipe", ask: str = ASK
+) -> Hierarchy | Agent:
+    """Return the declaration that a run was trained from; code never comes from inside the run.
+
+    Args:
+        recipe: a shipped recipe, or a file that is trusted; None: the one that the run names.
+        needs: the field of the manifest that is true where code is needed.
+        ask: a sentence for the error: how to give the code.
+
+    Raises:
+        RunError: it needs code that was not given.
+    """
+    manifest = run.manifest
+    if recipe is None and not manifest.get(needs, True):
+        kind = Agent if manifest["kind"] == "agent" else Hierarchy
+        return kind.from_manifest(manifest)
+    return declared_in(recipe or manifest.get("recipe"), recipe, str(run.path), ask)
+
+
+def declared_in(recipe: str | None, given: str | None, where: str, ask: str = ASK) -> Hierarchy:
+    """Return the hierarchy of a recipe: a shipped one, or the one that was ``given``.
+
+    Raises:
+        RunError: it is neither; the message begins with ``where``.
+    """
+    if recipe is not None and (given is not None or recipe in names()):
+        return hierarchy_in(recipe, Hierarchy)
+    made = f"in {recipe}" if recipe else "in Python"
+    raise RunError(f"{where} was declared {made}, and needs that code. {ask}")
 
 
 def check_declared(declared: object) -> None:
-    """Raise a DeclarationError where something else is given as what was trained."""
+    """Raise a DeclarationError where ``declared`` is no declaration."""
     if declared is not None and not isinstance(declared, Declaration | PlainAgent):
         raise DeclarationError(
             f"hierarchy is {short(declared)}; it must be the Hierarchy or Agent that was trained"

@@ -1,10 +1,9 @@
-"""What ``Hierarchy``, ``Agent`` and ``Run`` say of themselves: a line, and tables for notebooks."""
+"""Lines and tables about ``Hierarchy``, ``Agent`` and ``Run``, for notebooks; HTML stays here."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import SkillweaveError
@@ -17,40 +16,38 @@ from skillweave.terminal import printable
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
 
-
-def hierarchy_line(declared: Hierarchy) -> str:
-    """Return what ``repr`` says of a hierarchy."""
+def hierarchy_line(declared: Declaration) -> str:
+    """Return the ``repr`` of a hierarchy."""
     names = ", ".join(s.name for s in declared.skills)
     return printable(f"<{type(declared).__name__} of {names} on {declared.spec.name}>")
 
 
-def agent_line(declared: Agent) -> str:
-    """Return what ``repr`` says of a plain agent."""
+def agent_line(declared: PlainAgent) -> str:
+    """Return the ``repr`` of a plain agent."""
     kind = _kind(declared.algorithm)
     return printable(f"<{type(declared).__name__} of {kind} on {declared.spec.name}>")
 
 
-def hierarchy_html(declared: Hierarchy) -> str:
+def hierarchy_html(declared: Declaration) -> str:
     """Return tables of a hierarchy, and of its skills at all levels."""
     return joined([facts(_hierarchy_facts(declared)), _skills(declared)])
 
 
-def agent_html(declared: Agent) -> str:
+def agent_html(declared: PlainAgent) -> str:
     """Return a table of a plain agent."""
     return joined([facts(_agent_facts(declared))])
 
 
-def run_html(path: Path, declared: Hierarchy | Agent) -> str:
-    """Return tables of a run: what was trained, its stages, and its latest saved evaluation."""
+def run_html(path: Path, declared: Declaration | PlainAgent) -> str:
+    """Return tables of a run: its declaration, its stages, and its latest saved evaluation."""
     if isinstance(declared, PlainAgent):
         rows, skills = list(_agent_facts(declared)), []
     else:
-        rows, skills = list(_hierarchy_facts(declared)), [_skills(declared)]
-    where = "run" if path.is_dir() else "weights"
-    shown = [facts([(where, path), *rows]), *skills]
+        rows = list(_hierarchy_facts(declared))
+        skills = [_skills(declared)]
+    kind = "run" if path.is_dir() else "weights"
+    shown = [facts([(kind, path), *rows]), *skills]
     try:
         run = RunDirectory.open(path) if path.is_dir() else None
         saved = None if run is None else load_evaluation(run)
@@ -63,7 +60,7 @@ def run_html(path: Path, declared: Hierarchy | Agent) -> str:
     return joined(shown)
 
 
-def _hierarchy_facts(declared: Hierarchy) -> Iterator[tuple[str, object]]:
+def _hierarchy_facts(declared: Declaration) -> Iterator[tuple[str, object]]:
     yield "hierarchy on", declared.spec.name
     if not declared.recorded:
         yield "selector", _kind(declared.selector)
@@ -73,15 +70,15 @@ def _hierarchy_facts(declared: Hierarchy) -> Iterator[tuple[str, object]]:
         yield "reflexes", ", ".join(str(reflex.name) for reflex in declared.reflexes)
 
 
-def _agent_facts(declared: Agent) -> Iterator[tuple[str, object]]:
+def _agent_facts(declared: PlainAgent) -> Iterator[tuple[str, object]]:
     yield "agent on", declared.spec.name
     yield "algorithm", _kind(declared.algorithm)
     if not declared.recorded:
         yield "training steps", f"{declared.steps:,}"
 
 
-def _skills(declared: Hierarchy) -> Markup:
-    """Return a table of a hierarchy's skills; a column in which nothing stands is left out."""
+def _skills(declared: Declaration) -> Markup:
+    """Return a table of a hierarchy's skills; empty columns are left out."""
     head = ["skill", "policy", "defines", "about", "max_steps"]
     rows = []
     for path, skill in every_skill(declared.skills):
@@ -96,7 +93,7 @@ def _skills(declared: Hierarchy) -> Markup:
 
 
 def _learns_by(owner: Declaration, skill: Skill) -> str:
-    """Return how a skill gets its policy."""
+    """Return the source of a skill's policy: learnt, ready, a hierarchy or an algorithm."""
     if isinstance(skill, RecordedSkill):
         return "learnt"
     if inner_of(skill) is not None:

@@ -16,7 +16,7 @@ from skillweave.seeding import Seeds, global_generators
 def make_options_env(
     hierarchy: Hierarchy | Run, num_envs: int, gamma: float, *, seed: int = 0
 ) -> OptionsEnv:
-    """A Gymnasium ``VectorEnv`` of ``num_envs`` environments in which each action is a call.
+    """Return a Gymnasium ``VectorEnv`` of ``num_envs`` environments; each action is a call.
 
     Args:
         hierarchy: a run of one, whose trained skills act; or a declaration whose skills all have a

@@ -38,9 +38,9 @@ class Player:
     ```
 
     Args:
-        policy: who acts.
+        policy: the policy that acts.
         deterministic: act greedily, else sample.
-        seed: of what is sampled.
+        seed: the seed of sampled actions.
     """
 
     def __init__(self, policy: Policy, *, deterministic: bool = True, seed: int = 0) -> None:
@@ -52,7 +52,7 @@ class Player:
         self.reset()
 
     def reset(self) -> None:
-        """A new episode begins: nothing is remembered."""
+        """Start a new episode with an empty memory."""
         self.memory: Memory = self.policy.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
@@ -65,18 +65,18 @@ class Player:
         info: Mapping[str, Any] | None = None,
         mask: Any = None,
     ) -> Any:
-        """The action for one observation, as the environment takes it.
+        """Return the action for one observation, as the environment takes it.
 
         Args:
             obs: what the environment's ``reset`` or ``step`` returned.
-            reward: what came with it; needed only where a skill's ``termination`` reads it.
-            info: the same; an ``action_mask`` in it is used where ``mask`` is left out.
+            reward: the reward of the step; needed only where a skill's ``termination`` reads it.
+            info: the step's info; an ``action_mask`` in it is used where ``mask`` is left out.
             mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example.
-                None: what ``info`` says, or the part ``action_mask`` of the observation; else all.
+                None: the mask in ``info``, or the observation's part ``action_mask``; else all.
 
         Raises:
-            DeclarationError: the observation is none of the policy's, or the mask none of its
-                actions'; the message says what is.
+            DeclarationError: the observation or the mask does not fit the policy; the message
+                names what does.
         """
         seen = self._seen(obs)
         if self._before is not None:
@@ -107,23 +107,29 @@ class Player:
         return allowed[None]
 
     def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
-        """The step that led to an observation."""
+        """Return the step that led to an observation."""
         assert self._before is not None
         obs, action = self._before
         no = np.zeros(1, bool)
-        told = {k: np.asarray([v]) for k, v in info.items()}
         return Step(
-            obs, action, seen, np.array([reward], np.float32), no, no, no,
-            np.array([self._elapsed]), told,
-        )  # fmt: skip
+            obs,
+            action,
+            seen,
+            np.array([reward], np.float32),
+            terminated=no,
+            truncated=no,
+            timed_out=no,
+            elapsed=np.array([self._elapsed]),
+            info={k: np.asarray([v]) for k, v in info.items()},
+        )
 
     def _seen(self, obs: Any) -> Array:
-        """One observation as a batch of one."""
-        found = np.empty((1, *self._shape), self._dtype)
+        """Return one observation as a batch of one."""
+        batch = np.empty((1, *self._shape), self._dtype)
         try:
-            put_observation(self._space, found, 0, obs)
+            put_observation(self._space, batch, 0, obs)
         except (TypeError, ValueError, KeyError, IndexError) as error:
             raise DeclarationError(
                 f"act() was given an observation that is none of {self._space}: {error}"
             ) from error
-        return found
+        return batch

@@ -1,4 +1,4 @@
-"""Reads a recipe's Python file, with the files beside it that it imports, and its hierarchy."""
+"""Read a recipe's Python file, with the files beside it that it imports, and its hierarchy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skillweave.api.running import READING
 from skillweave.collecting.shipping import add_folder
 from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.shipped import FOLDER, file_of, names
 from skillweave.tracebacks import place
 
@@ -51,8 +51,8 @@ def hierarchy_in(recipe: str, kind: type[H]) -> H:
         )
     hierarchy: Any = declared.get("hierarchy") or next(iter(declared.values()))
     hierarchy.recipe = recipe
-    found: H = hierarchy
-    return found
+    declaration: H = hierarchy
+    return declaration
 
 
 def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> ModuleType:
@@ -60,7 +60,7 @@ def read_recipe_file(path: Path, recipe: str, *, shipped: bool = False) -> Modul
 
     Args:
         path: the file.
-        recipe: how the user names it, for messages.
+        recipe: the user's name of the file, for messages.
         shipped: it is one of this library's, which imports nothing beside it by its bare name.
 
     Raises:
@@ -99,7 +99,7 @@ def _sentence(error: BaseException, recipe: str) -> str:
             "script inside a block that begins with: if __name__ == '__main__':"
         )
     if not isinstance(error, SkillweaveError):
-        return f"{recipe} raised {told(error)}"
+        return f"{recipe} raised {error_text(error)}"
     if str(error).startswith(recipe):
         return str(error)
     return f"{recipe}: {str(error).removesuffix('.')} ({place(error)})"
@@ -119,17 +119,17 @@ def _check_names(path: Path, recipe: str) -> None:
     """Raise a DeclarationError where a file beside a recipe would not be what it imports.
 
     Python keeps one module of each name. Without this check, a recipe could get the file of another
-    recipe, or a package, and nobody would notice.
+    recipe, or a package, in silence.
     """
     for name, beside in _beside(path).items():
         module = sys.modules.get(name)
         if module is None:
             spec = PathFinder.find_spec(name, sys.path)
-            found = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
+            known = None if spec is None or spec.origin is None else Path(spec.origin).resolve()
         else:
-            found = _file_of(module)
-        if found != beside:
-            where = "in Python itself" if found is None else str(found)
+            known = _file_of(module)
+        if known != beside:
+            where = "in Python itself" if known is None else str(known)
             raise DeclarationError(
                 f"{recipe} imports {name!r}: beside it lies {beside.name}, but Python finds "
                 f"another module of this name ({where}). Rename {beside.name}"
@@ -155,7 +155,7 @@ def _imported(file: Path) -> Iterator[str]:
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):
-        return  # importing it raises the same error, and says where
+        return  # importing it raises the same error, with its line
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name.partition(".")[0] for alias in node.names)

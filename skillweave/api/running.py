@@ -1,4 +1,4 @@
-"""How ``train`` and ``resume`` go: check, write a run, train it."""
+"""The course of ``train`` and ``resume``: check everything, write a run, train it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
+from skillweave.api.adoption import Trained, caller_of
 from skillweave.api.continuing import prepared, to_continue
-from skillweave.api.run import Run
-from skillweave.api.starting import Spaces, StartFrom, starts
+from skillweave.api.starting import Directories, Spaces, starts
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.start_methods import runs_again, why_no_processes
 from skillweave.collecting.where import HERE, Where
@@ -27,7 +27,7 @@ from skillweave.messages import absolute, as_path, short, shown_path
 from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
 from skillweave.reporting.progress import Progress
-from skillweave.runs.command_words import Caller, called_by, resume_words, saved_words
+from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.manifest import identity
@@ -37,43 +37,43 @@ from skillweave.runs.trackers import make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
+from skillweave.training.plain_agent import PlainAgent
 from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
-
-
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
-"""The Python file that is being read for what it declares; None: none is."""
+"""The Python file that is being read for its declaration; None: none is."""
 
 
 def _may_train() -> None:
-    """Raise a DeclarationError while a Python file is only read for what it declares."""
+    """Raise a DeclarationError while a Python file is only read for its declaration."""
     if (file := READING.get()) is not None:
         raise DeclarationError(
-            f"{file} trains as soon as it is read, and here it is only asked what it declares. Put "
+            f"{file} starts training on import. This command only needs its declaration. Put "
             "what trains inside a block that begins with: if __name__ == '__main__':\nIf a skill "
             "is made of what it trains, train that once in another file, and load it here: "
             "Agent(...).load(directory).as_skill(name)"
         )
 
 
+D = TypeVar("D", bound=Declaration | PlainAgent)
+
+
 def begin(
-    declared: Hierarchy | Agent,
+    declared: D,
     content: dict[str, Any],
     run_dir: str | Path | None,
     quiet: bool,
     track: Sequence[str],
     evolve: Evolve,
     cluster: Ray | None,
-    start_from: StartFrom = None,
+    start_from: Directories = None,
     note: str = "",
     callback: Callback | None = None,
     *,
     resume: bool = False,
-) -> Run:
-    """Check everything, begin a run of this manifest, and train it; ``note`` is printed first.
+) -> Trained[D]:
+    """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
 
     With ``resume``, continue what is in ``run_dir`` instead, if there is something.
     """
@@ -92,18 +92,18 @@ def begin(
         raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
     with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
-        stack.enter_context(collected_notices())  # they are told by the progress, later
+        stack.enter_context(collected_notices())  # the progress prints them later
         spaces = _plan(declared, content, evolve, cluster)
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
-            own, told = prepared(declared, content, run, evolve, track)
+            declared, sentences = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
-            return go_on(own, run, quiet, evolve, cluster, told, callback)
-        learnt, told = starts(declared, content, start_from, spaces)
-        note = " ".join(filter(None, (note, told, _kept_by_populations(content))))
-        make_trackers(track, None)  # a missing extra is said before anything is written
+            return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
+        learnt, origin = starts(declared, content, start_from, spaces)
+        note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
+        make_trackers(track, None)  # a missing extra is reported before anything is written
         if cluster is not None:
             cluster.check()
-        content = content | {"recipe": declared.recipe, "track": track}
+        content = content | {"track": track}
         if run_dir is None:
             run_dir = make_numbered(_run_name(declared, content), place)
             note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
@@ -114,22 +114,17 @@ def begin(
 
 
 def _kept_by_populations(content: dict[str, Any]) -> str:
-    """Return a sentence where ``keep="best"`` changes nothing; empty if it does everywhere."""
+    """Return a sentence on the stages in which ``keep="best"`` changes nothing; may be empty."""
     names = [stage["name"] for stage in content["stages"] if stage.get("evolution")]
     if content["keep"] != "best" or not names:
         return ""
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
-def caller_of(declared: Hierarchy | Agent) -> Caller:
-    """Return what messages call a declaration."""
-    return "hierarchy" if isinstance(declared, Declaration) else "agent"
-
-
-def _run_name(declared: Hierarchy | Agent, content: Mapping[str, Any]) -> str:
-    """Return what a numbered directory is named after: recipe, hierarchy, or environment."""
+def _run_name(declared: Declaration | PlainAgent, content: Mapping[str, Any]) -> str:
+    """Return the stem of a numbered directory: the recipe, the hierarchy, or the environment."""
     flat = isinstance(declared, Declaration) and content["kind"] == "agent"
-    name = "" if declared.recipe is None else Path(declared.recipe).stem
+    name = "" if content["recipe"] is None else Path(content["recipe"]).stem
     if not name and isinstance(declared, Declaration) and declared.name != Declaration.name:
         name = declared.name
     return (name or declared.spec.name) + ("-flat" if flat else "")
@@ -140,20 +135,8 @@ def _remove_if_empty(path: Path) -> None:
         path.rmdir()
 
 
-def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
-    """The finished run of this manifest in ``run_dir``: begun, or gone on with, where it is not.
-
-    Raises:
-        RunError: there is a run, but of another manifest.
-    """
-    run = begun(declared, content, run_dir)
-    if run is None:
-        return begin(declared, content, run_dir, True, (), None, None)
-    return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
-
-
-def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
-    """The run of this manifest in ``run_dir``; None: it is not begun.
+def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
+    """Return the run of this manifest in ``run_dir``; None: it is not started.
 
     Raises:
         RunError: there is a run, but of another manifest.
@@ -173,9 +156,9 @@ def begun(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> RunDir
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(
-    declared: Hierarchy | Agent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
+    declared: Declaration | PlainAgent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
 ) -> Spaces:
-    """Check everything, and write into a manifest's stages how they are trained; the spaces."""
+    """Check everything, and complete the entries of a manifest's stages; return the spaces."""
     observation_space, action_space = declared.check_spaces()
     plan(content["stages"], evolve)
     check_several(content["stages"], declared.spec)
@@ -193,7 +176,7 @@ def _plan(
             acts = declared.chooses_from(stage["decides"], action_space)
         check_replay(stage, observation_space, acts)
         for name, config in stage.get("algorithms", {}).items():
-            if not name.endswith(CRITIC):  # it keeps nothing
+            if not name.endswith(CRITIC):  # it has no replay
                 assert isinstance(declared, Declaration)
                 acts = declared.chooses_from(name, action_space)
                 check_replay(stage | {"algorithm": config}, observation_space, acts)
@@ -202,13 +185,13 @@ def _plan(
 
 @contextmanager
 def _surroundings() -> Iterator[None]:
-    """Train in surroundings that the user has made for other things."""
+    """Train with steady streams and normal tensors, whatever the user's program has set."""
     with steady_streams(), normal_tensors():
         yield
 
 
 def _must_not_run_again(spec: EnvSpec) -> None:
-    """Raise a DeclarationError where processes would run the program again that starts them."""
+    """Raise a DeclarationError where processes would run the program that starts them."""
     if not why_no_processes() and (why := runs_again()):
         raise DeclarationError(
             f"{spec.name} is to be stepped in {spec.workers} processes, but {why}\n"
@@ -217,15 +200,15 @@ def _must_not_run_again(spec: EnvSpec) -> None:
 
 
 def go_on(
-    declared: Hierarchy | Agent,
+    declared: D,
     run: RunDirectory,
     quiet: bool,
     evolve: Evolve,
     cluster: Ray | None,
     note: str = "",
     callback: Callback | None = None,
-) -> Run:
-    """Train what is left of a run; ``note``: what people should know first."""
+) -> Trained[D]:
+    """Train what is left of a run; ``note`` is printed first."""
     check_callback(callback)
     if not run.finished:
         _may_train()
@@ -244,7 +227,7 @@ def go_on(
         for tracker in trackers:
             stack.callback(tracker.close)
         listeners: tuple[Listener, ...] = (progress, *trackers)
-        if callback is not None:  # last: what it is called with is written by then
+        if callback is not None:  # last: the report that it receives is written by then
             listeners = (*listeners, TrainCallback(callback, run))
         make = _where(cluster, run, progress, stack)
         learner = make_learner(run.manifest["stages"], evolve, make)
@@ -253,68 +236,61 @@ def go_on(
                 policy = training.train(declared, run, listeners, learner)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
-    return Run(declared_of(declared, run), run.path, policy)
+    return declared, run, policy
 
 
 H = TypeVar("H", bound=Declaration)
 
 
 def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
-    """Return the hierarchy as it can evolve, and a sentence on what differs from the declaration.
+    """Return the hierarchy as it can evolve, and a sentence on differences from the declaration.
 
     Skills and selector cannot evolve together, so where that is declared they learn apart.
     """
-    asked = evolve if isinstance(evolve, Mapping) else {"": evolve}
-    if all(how is None for how in asked.values()):
+    by_stage = evolve if isinstance(evolve, Mapping) else {"": evolve}
+    if all(evolution is None for evolution in by_stage.values()):
         return declared, ""
     return apart_to_evolve(declared)
 
 
 def apart_to_evolve(declared: H) -> tuple[H, str]:
-    """Return a copy of a hierarchy that learns apart, and the sentence that says so."""
-    found = copied(declared)
-    changed = [h for _, h in every_hierarchy(found) if h.learns_together and h.learn == "together"]
+    """Return a copy of a hierarchy that learns apart, and a sentence about it."""
+    copy = copied(declared)
+    changed = [h for _, h in every_hierarchy(copy) if h.learns_together and h.learn == "together"]
     if not changed:
         return declared, ""
-    for own in changed:
-        own.learn = "apart"
-    return found, (
+    for hierarchy in changed:
+        hierarchy.learn = "apart"
+    return copy, (
         "Skills and selector cannot evolve together yet, so they learn apart here; "
         "learn='apart' in the declaration ends this message."
     )
 
 
-def declared_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
-    """What a run trained: a hierarchy, or its flat baseline."""
-    if run.manifest["kind"] == "agent" and isinstance(declared, Declaration):
-        return declared.plain_agent()
-    return declared
-
-
 def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack) -> Where:
-    """Where collectors of a run, and parts of its populations, run.
+    """Return the placement of a run's collectors, and of parts of its populations.
 
     A cluster is left when ``stack`` is closed.
 
     Raises:
-        RunError: the run was begun with another number of collectors.
+        RunError: the run was started with another number of collectors.
     """
     _check(cluster)
     if cluster is None or run.finished:
         return HERE
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
     counts = [s.get("workers", 1) for s in left]
-    asked = cluster.collectors
-    if asked is not None and any(s.get("workers", 1) != workers_of(s, asked) for s in left):
+    wanted = cluster.collectors
+    if wanted is not None and any(s.get("workers", 1) != workers_of(s, wanted) for s in left):
         raise RunError(
-            f"{run.path} was begun with {', '.join(map(str, sorted(set(counts))))} collectors, and "
-            f"goes on with as many, as results depend on it; leave out collectors={asked}"
+            f"{run.path} was started with {', '.join(map(str, sorted(set(counts))))} collectors, "
+            f"and continues with as many, as results depend on it; leave out collectors={wanted}"
         )
     alone = [s["name"] for s in left if s.get("evolution") and s.get("workers", 1) == 1]
     if alone:
         progress.message(
-            f"{', '.join(alone)}: the population trains in this process, as nobody said into how "
-            "many parts it is to be split: Ray(collectors=4), --collectors 4"
+            f"{', '.join(alone)}: the population trains in this process, as no number of "
+            "collectors was given: Ray(collectors=4), --collectors 4"
         )
     return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
 

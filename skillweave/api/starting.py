@@ -1,40 +1,39 @@
-"""Who begins a run with what it has learnt in another one."""
+"""Starts from other runs: find the policies with which learners of a new run start."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.api.run import Run
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, close_matches, short
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
 from skillweave.spaces import same_space
-from skillweave.training.plain_agent import AGENT
+from skillweave.training.plain_agent import AGENT, PlainAgent
 
-if TYPE_CHECKING:
-    from skillweave.api import Agent, Hierarchy
-
-OneRun = str | Path | Run
-StartFrom = OneRun | Mapping[str, OneRun] | None
-"""A run in which those who are to learn have learnt before, or such runs by the learners' names."""
+Directory = str | Path
+Directories = Directory | Mapping[str, Directory] | None
+"""The directory of a run to start from, or such directories by the learners' names."""
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """Of observations and of actions."""
 
 
 def starts(
-    declared: Hierarchy | Agent, content: dict[str, Any], start_from: StartFrom, spaces: Spaces
+    declared: Declaration | PlainAgent,
+    content: dict[str, Any],
+    start_from: Directories,
+    spaces: Spaces,
 ) -> tuple[dict[str, Learnt], str]:
-    """Who has learnt in another run, and what people should know of it.
+    """Return the policies that learners start from, by name, and a sentence about them.
 
-    The manifest then says who begins with what.
+    The manifest then holds the start of each learner.
     """
     if start_from is None:
         return {}, ""
@@ -46,29 +45,26 @@ def starts(
         places = dict.fromkeys(learnt, place)
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
-    begun = begin_with(content["stages"], learnt, where)
+    started = begin_with(content["stages"], learnt, where)
     observation_space, action_space = spaces
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
-            own = stage.get("algorithms", {}).get(name, stage["algorithm"])
+            config = stage.get("algorithms", {}).get(name, stage["algorithm"])
             acts: Any = action_space
             if isinstance(declared, Declaration) and content["kind"] == "hierarchy":
                 acts = declared.chooses_from(name, action_space)
-            algorithm = make_algorithm(config_from_json(own), observation_space, acts)
+            algorithm = make_algorithm(config_from_json(config), observation_space, acts)
             chooses = chosen_from(content, name)
             _check_start(name, algorithm, chooses, learnt[name], places[name])
-    return learnt, f"start from {where}: {', '.join(sorted(begun))}"
+    return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 
-def _place(run: OneRun, argument: str) -> Path:
+def _place(run: Directory, argument: str) -> Path:
     """Return the directory of a run.
 
     Raises:
-        DeclarationError: it is a policy, or a file with one; the message says what can be done with
-            it.
+        DeclarationError: it is a policy, or a file with one; the message names its use.
     """
-    if isinstance(run, Run):
-        run = run.path
     if (use := _use_of(run)) is not None:
         what, way = use
         raise DeclarationError(
@@ -79,7 +75,7 @@ def _place(run: OneRun, argument: str) -> Path:
 
 
 def _use_of(value: Any) -> tuple[str, str] | None:
-    """Return words on a value that was learnt elsewhere, and on its use; None for other values."""
+    """Return words on a policy from elsewhere, and on its use; None for other values."""
 
     def as_skill(policy: str) -> str:
         return (
@@ -118,9 +114,9 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 
 def _learnt_by_name(
-    content: dict[str, Any], start_from: Mapping[str, OneRun]
+    content: dict[str, Any], start_from: Mapping[str, Directory]
 ) -> tuple[dict[str, Learnt], dict[str, Path]]:
-    """Return what each named learner begins with, and in which run that is.
+    """Return the policy that each named learner starts from, and the run that holds it.
 
     Raises:
         DeclarationError: a name does not learn here.
@@ -131,7 +127,7 @@ def _learnt_by_name(
     places: dict[str, Path] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     if not start_from:
-        raise DeclarationError('start_from is {}; name who begins with which run: {"left": run}')
+        raise DeclarationError('start_from is {}; name the run of each learner: {"left": run}')
     for name, run in start_from.items():
         if name not in here:
             near = close_matches(str(name), here)
@@ -144,27 +140,30 @@ def _learnt_by_name(
             known[place] = learnt_in(place)
         there = known[place]
         # A plain agent's run has one learner, whatever it is to be here.
-        found = there.get(name) or (there.get(AGENT) if set(there) == {AGENT} else None)
-        if found is None:
+        policy = there.get(name) or (there.get(AGENT) if set(there) == {AGENT} else None)
+        if policy is None:
             raise RunError(
                 f"start_from[{name!r}]: {name!r} has not learnt in {place}; there learnt "
-                f"{', '.join(there) or 'nobody: no stage was finished'}"
+                f"{', '.join(there) or 'no one: no stage was finished'}"
             )
-        learnt[name], places[name] = found, place
+        learnt[name] = policy
+        places[name] = place
     return learnt, places
 
 
 def _check_start(
     name: str, algorithm: Algorithm, chooses: Chooses, learnt: Learnt, where: Path
 ) -> None:
-    """Raise a RunError where one cannot begin with what it has learnt in another run."""
+    """Raise a RunError where a learner cannot start from its policy in another run."""
     before = learnt.policy.algorithm
     kinds = [type(a.config).__name__ for a in (before, algorithm)]
     what = ""
     if before.weight_shapes().keys() != algorithm.weight_shapes().keys() and len(set(kinds)) > 1:
         what = f"it learnt by {kinds[0]} there, and is to learn by {kinds[1]} here"
     elif learnt.chooses != chooses:
-        what = f"there it chooses from {_told(learnt.chooses)}, and here from {_told(chooses)}"
+        what = (
+            f"there it chooses from {_choices(learnt.chooses)}, and here from {_choices(chooses)}"
+        )
     elif not same_space(before.observation_space, algorithm.observation_space):
         what = "its observations are others here"
     elif not same_space(before.action_space, algorithm.action_space):
@@ -172,10 +171,10 @@ def _check_start(
     elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):
         what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
     if what:
-        raise RunError(f"start_from: {name!r} cannot begin with what it learnt in {where}: {what}")
+        raise RunError(f"start_from: {name!r} cannot start with what it learnt in {where}: {what}")
 
 
-def _told(chooses: Chooses) -> str:
+def _choices(chooses: Chooses) -> str:
     skills, lengths = chooses
     return ", ".join(skills) + (f" in calls of {lengths} steps" if lengths else "")
 

@@ -1,4 +1,4 @@
-"""What can be asked on the command line, as dataclasses: the parser is generated from these.
+"""Commands of the command line as dataclasses: the parser is generated from these.
 
 Nothing here imports torch or gymnasium, so that help and argument errors are instant.
 """
@@ -16,7 +16,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 @dataclass(frozen=True)
 class Output:
-    """How results are told."""
+    """The form of results."""
 
     quiet: bool = False
     """No progress."""
@@ -28,10 +28,10 @@ class Output:
 
 @dataclass(frozen=True)
 class OnRay(Output):
-    """Where it runs."""
+    """A command that can run on Ray."""
 
     ray: str | None = None
-    """Use Ray: --ray alone on this machine (or where RAY_ADDRESS says), or --ray HOST:PORT, or
+    """Use Ray: --ray alone on this machine (or at RAY_ADDRESS), or --ray HOST:PORT, or
     --ray auto for the cluster that this machine is a part of."""
 
 
@@ -44,19 +44,19 @@ class Train(OnRay):
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
     resume: bool = False
-    """Continue the run in --out if it has learnt something, else begin. Steps that have grown
+    """Continue the run in --out if it has learnt something, else start one. Steps that have grown
     (--set steps=N, --scale) train a finished run for longer."""
     seed: int = 0
     """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
-    """Afterwards train the baseline too, on the same number of steps, and say which is better."""
+    """Afterwards train the baseline too, on the same number of steps, and print which is better."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
     start_from: UseAppendAction[tuple[str, ...]] = ()
-    """Another run: whoever has learnt there, too, begins with that (not --versus-flat's agent).
-    Several runs, by the name of who begins: --start-from left=RUN --start-from right=RUN."""
+    """Another run: learners of the same names start with what they learnt there (not
+    --versus-flat's agent). Several runs: --start-from left=RUN --start-from right=RUN."""
     keep: Literal["last", "best"] | None = None
     """best: end with the weights whose evaluation while training was best, not with the last ones
     (needs --set train.eval_every=STEPS, if the recipe does not set it)."""
@@ -130,7 +130,7 @@ class Sweep(OnRay):
 
 @dataclass(frozen=True)
 class Watched(Output):
-    """What to load, and how it acts."""
+    """A command that loads a policy and lets it act."""
 
     target: Positional[str] = tyro.MISSING
     """A run's directory, a weights file, or with --pretrained a recipe's name."""
@@ -256,7 +256,7 @@ class Export(Output):
     target: Positional[str] = tyro.MISSING
     """A run's directory, a weights file, or with --pretrained a recipe's name."""
     onnx: bool = False
-    """As ONNX, the only format there is; needed, so that a later one can be told apart."""
+    """Choose ONNX, the only format so far; required, so that a later format is a choice, too."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """The folder to write; default: NAME-onnx here."""
     pretrained: bool = False
@@ -340,5 +340,5 @@ Command = (
 
 
 def name_of(command: type) -> str:
-    """What a command is called: import-agilerl for ImportAgilerl."""
+    """Return the name of a command: import-agilerl for ImportAgilerl."""
     return re.sub(r"(?<!^)(?=[A-Z])", "-", command.__name__).lower()

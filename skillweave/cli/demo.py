@@ -1,4 +1,4 @@
-"""``skillweave demo``: two tasks, one where a flat agent is enough and one where skills pay.
+"""``skillweave demo``, a script apart: a task for a flat agent, and one where skills pay.
 
 The flat agents with all steps would take five minutes. ``python -m benchmarks.demo_flat`` trains
 them and writes their scores to ``demo_flat.json``, which is quoted here.
@@ -35,7 +35,7 @@ MOSTLY = 0.75
 
 @dataclass
 class Demo:
-    """Trains, scores and films, and says what comes out of it.
+    """A demonstration that trains, scores and films two tasks and prints the results.
 
     Args:
         command: as it was given.
@@ -119,7 +119,8 @@ class Demo:
         self, hierarchy: Hierarchy, task: str, name: str, flat: bool = False
     ) -> tuple[Run, Evaluation, float]:
         """Train and score; return the run, its score and the seconds of training."""
-        started, quiet = time.perf_counter(), self.command.quiet or self.command.json
+        started = time.perf_counter()
+        quiet = self.command.quiet or self.command.json
         run = hierarchy.train(
             self.command.out / name, seed=self.command.seed, flat=flat, quiet=quiet
         )
@@ -137,7 +138,7 @@ class Demo:
         self.say(f"   Film: {film['path']}")
 
     def _report(self, run: Run) -> None:
-        """Write a report, unless what draws its charts is not installed."""
+        """Write a report, unless the library that draws its charts is not installed."""
         try:
             page = run.report(self.command.out / "mission.html", episodes=10, films=1)
         except MissingExtra as error:

@@ -1,4 +1,4 @@
-"""``--evolve`` settings: ``population=8``, ``selector.mutations.units=16,64``."""
+"""``--evolve`` settings as ``population=8``: a parser of its own, apart from training."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation
 def parse_evolve(
     settings: Sequence[str], declaration: Declaration, flat: bool
 ) -> dict[str, Evolution | None] | None:
-    """Each stage's evolution, or None where nothing is to evolve.
+    """Return each stage's evolution, or None where nothing is to evolve.
 
     A name may begin with a stage; settings without one hold for all. ``selection=truncation``
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
@@ -34,24 +34,25 @@ def parse_evolve(
     else:
         stages = stages_of(apart_to_evolve(declaration)[0])
     names = [p.name for p in stages]
-    everyone, own = [], {name: list[tuple[str, str, str]]() for name in names}
+    shared = list[tuple[str, str, str]]()
+    by_stage = {name: list[tuple[str, str, str]]() for name in names}
     for setting in settings:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
             raise DeclarationError(f"--evolve {setting!r}: write name=value, such as population=8")
         head, _, rest = name.partition(".")
         if head in names and rest:
-            own[head].append((rest, name, text))
+            by_stage[head].append((rest, name, text))
         else:
-            everyone.append((name, name, text))
+            shared.append((name, name, text))
     return {
-        name: _evolution([*everyone, *own[name]]) if everyone or own[name] else None
+        name: _evolution([*shared, *by_stage[name]]) if shared or by_stage[name] else None
         for name in names
     }
 
 
 def _evolution(settings: list[tuple[str, str, str]]) -> Evolution:
-    """From dotted names, names as they were written, and values."""
+    """Return an evolution from dotted names, names as they were written, and values."""
     ranges: dict[str, Range] = {}
     changes: dict[tuple[str, ...], tuple[str, str]] = {}
     start = Evolution()

@@ -1,20 +1,23 @@
-"""Carries out each command of the command line."""
+"""Carry out each command of the command line: apart from parsing, as it imports torch."""
 
 from __future__ import annotations
 
 import ast
+import importlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
-from skillweave.cli import commands, share
+from skillweave.api.hub import pull_run, push_run
+from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.overrides import list_settings
-from skillweave.cli.run_lines import run_lines
 from skillweave.cli.sweep import sweep
-from skillweave.cli.targets import load_run, target
-from skillweave.cli.telling import save_score, tell
+from skillweave.cli.targets import free, load_run, target
+from skillweave.cli.telling import run_words, save_score, tell
 from skillweave.cli.training import resume, train
+from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.reporting.curves_figure import plot_curves
@@ -22,9 +25,11 @@ from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import check_name, hub
+from skillweave.runs.kept import best_words, kept_words
 from skillweave.runs.several import open_runs
 from skillweave.terminal import one_line
-from skillweave.training.evaluation_file import load_evaluation
+from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
 def run(command: commands.Command) -> int:
@@ -57,9 +62,9 @@ def run(command: commands.Command) -> int:
         case commands.Export():
             _export(command)
         case commands.Push():
-            tell(command, *share.push(command))
+            tell(command, *_push(command))
         case commands.Pull():
-            tell(command, *share.pull(command))
+            tell(command, *_pull(command))
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -72,8 +77,8 @@ def _sweep(command: commands.Sweep) -> int:
 
 
 def _evaluate(command: commands.Evaluate) -> None:
-    found = target(command)
-    score = found.evaluate(
+    trained = target(command)
+    score = trained.evaluate(
         command.episodes,
         seed=command.seed,
         deterministic=command.deterministic,
@@ -81,17 +86,17 @@ def _evaluate(command: commands.Evaluate) -> None:
         num_envs=command.num_envs,
         quiet=command.quiet,
     )
-    result = {"target": command.target, "env": found.declaration.spec.name, "seed": command.seed}
+    result = {"target": command.target, "env": trained.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
-        save_score(found, score, command.seed, command.deterministic)
+        save_score(trained, score, command.seed, command.deterministic)
     tell(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
-    found = target(command)
+    trained = target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
-    result = found.render(
+    result = trained.render(
         path,
         episodes=command.episodes,
         seed=command.seed,
@@ -105,8 +110,8 @@ def _render(command: commands.Render) -> None:
 
 def _plot(command: commands.Plot) -> None:
     runs = open_runs(command.runs)
-    own = (command.metric, command.agent, *command.label)
-    if len(runs) == 1 and all(word is None for word in own) and command.band == "iqr":
+    of_several = (command.metric, command.agent, *command.label)
+    if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
         paths = [str(path) for path in plot_run(runs[0], command.out)]
         tell(command, {"paths": paths}, "\n".join(paths))
         return
@@ -129,10 +134,12 @@ def _plot(command: commands.Plot) -> None:
 
 
 def _report(command: commands.Report) -> None:
-    run, why_not, trained = RunDirectory.open(command.run), None, None
-    told = run.manifest.get("recipe")
-    # Code of our own is as good as told: with it, the skills' rewards and successes are known.
-    recipe = command.recipe or (told if told in recipes.names() else None)
+    run = RunDirectory.open(command.run)
+    why_not = None
+    trained = None
+    named = run.manifest.get("recipe")
+    # A shipped recipe's code is trusted: with it, the skills' rewards and successes are known.
+    recipe = command.recipe or (named if named in recipes.names() else None)
     if run.finished:
         try:
             trained = load_run(command.run, recipe)
@@ -152,18 +159,18 @@ def _report(command: commands.Report) -> None:
         deterministic=command.deterministic,
         quiet=command.quiet,
     )
-    _tell_page(command, page)
+    _report_page(command, page)
 
 
 def _compare(command: commands.Compare) -> None:
-    _tell_page(command, write_comparison(open_runs(command.runs), command.out))
+    _report_page(command, write_comparison(open_runs(command.runs), command.out))
 
 
-def _tell_page(command: commands.Output, told: dict[str, Any]) -> None:
-    lines = [told["verdict"].replace("`", "")] if "verdict" in told else []
-    lines += [f"{told['path']}: {told['bytes'] / 1e6:.1f} MB, written in {told['seconds']:.1f} s"]
-    lines += [f"missing: {line}" for line in told["missing"]]
-    tell(command, told, "\n".join(lines))
+def _report_page(command: commands.Output, page: dict[str, Any]) -> None:
+    lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
+    lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
+    lines += [f"missing: {line}" for line in page["missing"]]
+    tell(command, page, "\n".join(lines))
 
 
 def _list(command: commands.List) -> None:
@@ -178,8 +185,8 @@ def _list(command: commands.List) -> None:
         lines.append(f"  {r['name']:<22} {r['about']}{' [weights]' if r['pretrained'] else ''}")
     if runs:
         lines.append("runs:")
-        told = [{k: one_line(v) for k, v in r.items()} for r in runs]
-        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in told]
+        printable = [{k: one_line(v) for k, v in r.items()} for r in runs]
+        lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in printable]
     tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 
@@ -189,13 +196,13 @@ def _info(command: commands.Info) -> None:
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
         tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
         return
-    found = RunDirectory.open(command.target)
-    m = found.manifest
-    saved = load_evaluation(found)
-    sampled = load_evaluation(found, deterministic=False)
-    told = {} if saved is None else {"evaluation": saved.to_json()}
-    told |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    tell(command, m | told, "\n".join(run_lines(m, [saved, sampled], command.target)))
+    run = RunDirectory.open(command.target)
+    m = run.manifest
+    saved = load_evaluation(run)
+    sampled = load_evaluation(run, deterministic=False)
+    scores = {} if saved is None else {"evaluation": saved.to_json()}
+    scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
+    tell(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
 
 
 def _weights(command: commands.Weights) -> None:
@@ -206,11 +213,11 @@ def _weights(command: commands.Weights) -> None:
 
 def _export(command: commands.Export) -> None:
     if not command.onnx:
-        raise DeclarationError("say as what to export: --onnx")
+        raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
-    found = target(command).export(command.out or Path(f"{name}-onnx"))
-    told = {"path": str(found.path), "files": list(found.files), "code": found.code}
-    tell(command, told, str(found))
+    export = target(command).export(command.out or Path(f"{name}-onnx"))
+    result = {"path": str(export.path), "files": list(export.files), "code": export.code}
+    tell(command, result, str(export))
 
 
 def _import_agilerl(command: commands.ImportAgilerl) -> None:
@@ -228,14 +235,89 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
 
 def _run_line(path: Path) -> dict[str, Any]:
     try:
-        found = RunDirectory.open(path)
+        run = RunDirectory.open(path)
     except RunError as error:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
-    status = "finished" if found.finished else "unfinished"
+    status = "finished" if run.finished else "unfinished"
     return {"path": str(path), "status": status} | {
-        k: found.manifest[k] for k in ("kind", "env", "seed")
+        k: run.manifest[k] for k in ("kind", "env", "seed")
     }
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+
+
+def run_lines(
+    m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
+) -> list[str]:
+    """Return a run's manifest and its saved evaluations, as lines."""
+    env, created = one_line(m["env"]), one_line(m["created"])
+    lines = [f"{m['kind']} on {env}, seed {m['seed']}, made {created}"]
+    calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
+    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
+    calls += f", guide: {m['guide']['kind']}" if "guide" in m else ""
+    lines += [f"  recipe: {one_line(m.get('recipe') or '(declared in Python)')}{calls}"]
+    lines += [
+        f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
+    ]
+    for p in m["stages"]:
+        final = p.get("final", {}).get("return")
+        lines.append(
+            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
+            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
+            f"{'' if final is None else f'{final:.1f}':>8}"
+        )
+        for name, start in p.get("starts", {}).items():
+            run = "" if start["run"] is None else f" {start['run']}"
+            lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
+        if continued := p.get("continued"):
+            lines.append(f"    continued after {', '.join(f'{k:,}' for k in continued)} steps")
+        if reached := p.get("reached"):
+            lines.append(
+                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
+                f"{p['target']['of']} {reached['value']:g}"
+            )
+        if stopped := p.get("stopped"):
+            lines.append(
+                f"    a callback ended it after {stopped['steps']:,} of {p['budget']:,} steps"
+            )
+        if best := p.get("best"):
+            lines.append(f"    {best_words(best)}")
+        if winner := p.get("winner"):
+            lines.append(
+                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
+                f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
+            )
+        if kept := p.get("kept"):
+            lines.append(f"    {kept_words(kept)}")
+    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in m["versions"].items())]
+    for score in saved:
+        if score is not None:
+            how = "greedy" if score.deterministic else "sampled"
+            lines.append(f"  evaluated {one_line(score.made)}, seed {score.seed}, {how}:")
+            lines += [f"    {line}" for line in score.evaluation.for_people().splitlines()]
+    return lines
+
+
+def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
+    """Put a run on the hub; return the result as JSON and for people."""
+    _no_bars()
+    pushed = push_run(command.run, command.name, command.private)
+    lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
+    lines.append(f"load it: skillweave.from_hub({command.name!r})")
+    return pushed, "\n".join(lines)
+
+
+def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
+    """Copy a run from the hub; return its new place as JSON and for people."""
+    _no_bars()
+    name = check_name(command.name).partition("/")[2]
+    path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
+    return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
+
+
+def _no_bars() -> None:
+    """Keep the hub's library from drawing a bar for each file."""
+    hub()  # a missing extra is reported
+    importlib.import_module("huggingface_hub.utils").disable_progress_bars()

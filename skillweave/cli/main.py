@@ -82,18 +82,18 @@ def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
 
 
 def _with_addresses(words: Sequence[str]) -> list[str]:
-    """The words with an empty address after each ``--ray`` that has none."""
-    found: list[str] = []
+    """Return the words with an empty address after each ``--ray`` that has none."""
+    complete: list[str] = []
     for word in words:
-        if found[-1:] == ["--ray"] and not ADDRESS.fullmatch(word):
-            found.append("")
-        found.append(word)
-    return [*found, ""] if found[-1:] == ["--ray"] else found
+        if complete[-1:] == ["--ray"] and not ADDRESS.fullmatch(word):
+            complete.append("")
+        complete.append(word)
+    return [*complete, ""] if complete[-1:] == ["--ray"] else complete
 
 
 def _fail(command: Any, message: str, code: int) -> int:
     if command.json:
-        with suppress(OSError):  # it is told below as well
+        with suppress(OSError):  # it is printed below as well
             put_result(json.dumps({"error": message}))
     kind = "stopped" if code == 130 else "error"
     say(f"{kind}: {message}")

@@ -21,7 +21,7 @@ from skillweave.skills import Skill
 PLAIN = ("call_steps", "steps", "learn")
 """Fields of a hierarchy that are set by themselves."""
 OF_SKILLS = ("steps", "task_weight", "target_return", "target_success")
-"""The same of a skill; its other settings are its algorithm's."""
+"""Fields of a skill that are set by themselves; its other settings are its algorithm's."""
 GROUPS = {
     "apart": "apart",
     "together": "together",
@@ -113,25 +113,29 @@ def _without_settings(name: str, owner: tuple[str, ...]) -> str:
 
 def list_settings(declaration: Declaration) -> dict[str, Any]:
     """Return the dotted name and the value of every setting."""
-    found: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
+    values: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
     for name, field in GROUPS.items():
         if (group := getattr(declaration, field)) is not None:
-            found |= {f"{name}.{f.name}": getattr(group, f.name) for f in fields(group)}
-    found = {k: v for k, v in found.items() if k not in ("train.flat", "guide.selector")}
+            values |= {f"{name}.{f.name}": getattr(group, f.name) for f in fields(group)}
+    values = {k: v for k, v in values.items() if k not in ("train.flat", "guide.selector")}
     budgets = declaration.budgets()
     for skill in declaration.skills:
         if skill.policy is None:
-            found[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
-            found[f"skills.{skill.name}.task_weight"] = skill.task_weight
+            values[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
+            values[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm
-            found |= _flatten(f"skills.{skill.name}.", config)
+            values |= _flatten(f"skills.{skill.name}.", config)
     trained = declaration.ready_selector is None
-    return found | (_flatten("selector.", declaration.selector) if trained else {})
+    return values | (_flatten("selector.", declaration.selector) if trained else {})
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
-    """``config`` with the fields at these paths set to values parsed from (full name, text)."""
-    known, hints = [f.name for f in fields(config)], annotations_of(type(config))
+    """Return ``config`` with the fields at these paths set to parsed values.
+
+    ``changes``: by path, the full name and the text of the value.
+    """
+    known = [f.name for f in fields(config)]
+    hints = annotations_of(type(config))
     values: dict[str, Any] = {}
     deeper: dict[str, dict[tuple[str, ...], tuple[str, str]]] = {}
     for (field, *rest), (name, text) in changes.items():
@@ -160,7 +164,7 @@ _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:
-    """``text`` as a value of the annotated type."""
+    """Return ``text`` as a value of the annotated type."""
     options = options_of(hint)
     if type(None) in options and text.lower() in ("none", "null"):
         return None
@@ -196,15 +200,15 @@ def _parse(name: str, text: str, hint: Any) -> Any:
 
 
 def _flatten(prefix: str, config: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for f in fields(config):
         value = getattr(config, f.name)
-        found |= (
+        values |= (
             _flatten(f"{prefix}{f.name}.", value)
             if is_dataclass(value)
             else {prefix + f.name: value}
         )
-    return found
+    return values
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:

@@ -1,7 +1,7 @@
 """Jobs side by side, each in a fresh process that ends when this one does, however it ends.
 
 ``ProcessPoolExecutor`` does not serve: where each of its processes does one job alone
-(``max_tasks_per_child=1``), it may wait for ever as it is shut down.
+(``max_tasks_per_child=1``), it may wait forever at its shutdown.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ class ProcessEnded(TrainingError):
 
 
 class Processes:
-    """So many jobs at once; see ``processes``."""
+    """A pool that runs a number of jobs at once; see ``processes``."""
 
     def __init__(self, count: int) -> None:
-        self._threads, self._lock = ThreadPoolExecutor(count), threading.Lock()
+        self._threads = ThreadPoolExecutor(count)
+        self._lock = threading.Lock()
         self._running: list[Any] = []
         self._over = False
 
     def submit(self, job: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        """What ``job(*arguments)`` will return; job and arguments must be importable there.
+        """Start ``job(*arguments)`` in a process; both must be importable there.
 
         Its result raises a ``SkillweaveError`` as the job did, a ``RuntimeError`` with the
         traceback for any other error, and ``ProcessEnded``.
@@ -48,12 +49,12 @@ class Processes:
         child = _START.Process(target=_answer, args=(sender, job, arguments))
         with self._lock:
             if self._over:
-                raise ProcessEnded("a job was not begun, as another one failed")
+                raise ProcessEnded("a job was not started, as another one failed")
             child.start()
             self._running.append(child)
         sender.close()
         try:
-            # A process that the job has begun may hold its pipes when the job is no more: so look.
+            # A process that the job has started may hold its pipes when the job has ended: so look.
             while not receiver.poll(PATIENCE) and child.exitcode is None:
                 pass
             if not receiver.poll():
@@ -75,7 +76,7 @@ class Processes:
         return result
 
     def end(self) -> None:
-        """End all jobs, and begin no other."""
+        """End all jobs, and start no other."""
         with self._lock:
             self._over = True
             for child in self._running:
@@ -88,7 +89,7 @@ class Processes:
 
 @contextmanager
 def processes(count: int) -> Iterator[Processes]:
-    """A pool of fresh processes, of which ``count`` run at once; an error here ends them all."""
+    """Yield a pool of fresh processes, ``count`` at once; an error in the block ends them all."""
     pool = Processes(count)
     try:
         yield pool
@@ -109,8 +110,8 @@ def _answer(sender: Any, job: Callable[..., Any], arguments: tuple[Any, ...]) ->
     except SkillweaveError as error:
         problem = reworded(error, str(error))
     except KeyboardInterrupt:
-        os._exit(128 + signal.SIGTERM)  # its run has saved; the parent knows why it ended it
-    except Exception:  # any, as it comes from what a user wrote; not all errors can be sent
+        os._exit(128 + signal.SIGTERM)  # its run has saved; the parent has the reason
+    except Exception:  # any error of a user's code; not all of them can be sent
         problem = RuntimeError(traceback.format_exc())
     try:
         sender.send((result, problem))

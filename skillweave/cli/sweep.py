@@ -1,7 +1,7 @@
-"""``sweep``: many runs of a recipe, here in processes or on Ray; the table of what came out.
+"""``sweep``: many runs of a recipe, here in processes or on Ray, and a table of their results.
 
-Each run is an ordinary run directory. So whoever is stopped, the sweep or one of its runs, goes on
-where it stood when the same command is given again.
+Each run is an ordinary run directory. A sweep that was stopped, or one of its runs, continues when
+the same command is given again.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import platform
 import re
+import statistics
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import astuple, dataclass, replace
@@ -16,27 +17,30 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skillweave import recipes
 from skillweave.api import Hierarchy
-from skillweave.api.running import begun, finish
+from skillweave.api.loading import finish
+from skillweave.api.running import begun
 from skillweave.cli import commands
 from skillweave.cli.overrides import apply_overrides
 from skillweave.cli.processes import ProcessEnded, processes
 from skillweave.cli.sweep_code import MARK, must_be_same_code
-from skillweave.cli.sweep_table import summary
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.messages import short, told, whole_number
+from skillweave.messages import error_text, short, whole_number
+from skillweave.reporting.report.seeds import over_seeds
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
 
 MOST = 10_000
 """Runs of a sweep."""
 RETRIES = 20
-"""How often Ray begins a run again whose machine was lost; it goes on from its checkpoint."""
+"""Most restarts of a run whose machine was lost; it continues from its checkpoint."""
 EVALUATION_SEED = 0
 """Picks the episodes of each run's evaluation, which is greedy."""
 
@@ -46,14 +50,14 @@ class Job:
     """One run of a sweep."""
 
     settings: str
-    """What it differs in from the others, beside the seed: "selector.gamma=0.99"; may be empty."""
+    """Its settings beside the seed, as "selector.gamma=0.99"; may be empty."""
     seed: int
     path: Path
     flat: bool
     evaluate: int
 
     def run(self, code: bytes) -> float | str:
-        """Train it, or what is left of it, and evaluate it: its mean return, or what went wrong."""
+        """Train it, or what is left of it, and evaluate it; return its mean return or an error."""
         try:
             if not (self.path.parent / MARK).exists():
                 raise RunError(
@@ -62,17 +66,17 @@ class Job:
                 )
             hierarchy = unpacked(code)
             trained = finish(hierarchy, self._manifest(hierarchy), self.path)
-            found = trained.evaluate(
+            score = trained.evaluate(
                 self.evaluate, seed=EVALUATION_SEED, deterministic=True, save=True, quiet=True
             )
-            return float(found.mean)
+            return float(score.mean)
         except SkillweaveError as error:
             return str(error)
         except Exception as error:
-            return told(error)
+            return error_text(error)
 
     def known(self, hierarchy: Hierarchy) -> float | str | None:
-        """What ``run`` would give, where nothing is left to be done; else None."""
+        """Return the result of ``run`` where nothing is left to do; else None."""
         try:
             run = begun(hierarchy, self._manifest(hierarchy), self.path)
             if run is None or not run.finished:
@@ -91,11 +95,12 @@ class Job:
 
 
 def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
-    """Train all runs of a sweep; what came out, as JSON and for people."""
+    """Train all runs of a sweep; return the results as JSON and for people."""
     whole_number(command.evaluate, "evaluate", 1)
     if command.jobs is not None:
         whole_number(command.jobs, "jobs", 1)
-    seeds, choices = parse_seeds(command.seeds), parse_choices(command.set_each)
+    seeds = parse_seeds(command.seeds)
+    choices = parse_choices(command.set_each)
     if len(seeds) * len(choices) > MOST:
         raise DeclarationError(
             f"{len(seeds)} seeds of {len(choices)} settings are {len(seeds) * len(choices):,} "
@@ -107,11 +112,11 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"could not write {out}: {error.strerror}") from error
-    found: dict[Job, float | str] = {}
+    results: dict[Job, float | str] = {}
     jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
         code = packed(hierarchy, command.recipe)
-        must_be_same_code(out, command.recipe)  # each time, as the recipe was read anew
+        must_be_same_code(out, command.recipe)  # each time, as the recipe was read again
         for seed in seeds:
             path = out / _file_name(settings, seed)
             job = Job(settings, seed, path, command.flat, command.evaluate)
@@ -119,24 +124,24 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
             if (known := job.known(hierarchy)) is None:
                 tasks.append((code, job))
             else:
-                found[job] = known
+                results[job] = known
     run = _on_ray if command.ray is not None else _in_processes
     try:
         for job, result in run(tasks, command) if tasks else ():
-            found[job] = result
+            results[job] = result
             if not command.quiet:
-                says = result if isinstance(result, str) else f"return {result:.1f}"
-                line = f"{len(found)} of {len(jobs)}: {job.path.name}: {says}"
+                score = result if isinstance(result, str) else f"return {result:.1f}"
+                line = f"{len(results)} of {len(jobs)}: {job.path.name}: {score}"
                 say(line)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(found)} of {len(jobs)} runs are finished; the same command goes on"
+            f"{len(results)} of {len(jobs)} runs are finished; the same command continues"
         ) from None
-    return summary([(j.settings, j.seed, j.path, found[j]) for j in jobs], out)
+    return summary([(j.settings, j.seed, j.path, results[j]) for j in jobs], out)
 
 
 def parse_seeds(text: str) -> list[int]:
-    """The seeds that "0:20" or "0,3,7" names."""
+    """Return the seeds that "0:20" or "0,3,7" names."""
     try:
         if ":" in text:
             first, last = (int(part) for part in text.split(":"))
@@ -153,7 +158,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
-    """All combinations of the values of ``--set-each``, as settings; one without any if none."""
+    """Return all combinations of the values of ``--set-each``; without any, one empty one."""
     names, options = set[str](), []
     for setting in each:
         name, sign, text = (part.strip() for part in setting.partition("="))
@@ -173,12 +178,12 @@ def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
 def _hierarchies(
     command: commands.Sweep, choices: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[str, Hierarchy]]:
-    """For each choice its name, and the hierarchy with these settings."""
+    """Yield for each choice its name, and the hierarchy with these settings."""
     for choice in choices:
         hierarchy = recipes.load(command.recipe)
         apply_overrides(hierarchy, [*command.set, *choice])
         hierarchy.scale(command.scale)
-        # Runs share the cores, so each has one process, or as many as the recipe says: the same
+        # Runs share the cores, so each has one process, or as many as the recipe sets: the same
         # number on every machine.
         hierarchy.env = replace(hierarchy.spec, workers=hierarchy.spec.workers or 1)
         yield ", ".join(choice), hierarchy
@@ -193,19 +198,19 @@ Tasks = Sequence[tuple[bytes, Job]]
 
 
 def _in_processes(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
-    """Each run in a process of its own, so many at once as there are cores."""
+    """Do each run in a process of its own, as many at once as there are cores."""
     with processes(min(command.jobs or cores(), len(tasks))) as pool:
         due = {pool.submit(job.run, code): job for code, job in tasks}
         for future in as_completed(due):
             try:
                 yield due[future], future.result()
             except ProcessEnded as error:
-                says = f"{error}; the same command goes on with it (fewer at once: --jobs)"
-                yield due[future], says
+                message = f"{error}; the same command continues it (fewer at once: --jobs)"
+                yield due[future], message
 
 
 def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float | str]]:
-    """Each run as a task of Ray; one whose machine is lost goes on elsewhere."""
+    """Do each run as a task of Ray; one whose machine is lost continues on another."""
     cluster = Ray(address=command.ray or None)
     with cluster.joined(command.jobs or cores()) as ray:
         from skillweave.collecting.actors import LOST, check_versions
@@ -213,7 +218,8 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
         kind = ray.remote(num_cpus=1, max_retries=RETRIES, max_calls=1)(_task())
         good = [(metadata.version("skillweave"), platform.python_version())]
         codes = {code: ray.put(code) for code in {code for code, _ in tasks}}
-        waiting, due = list(reversed(tasks)), dict[Any, tuple[bytes, Job]]()
+        waiting = list(reversed(tasks))
+        due = dict[Any, tuple[bytes, Job]]()
         while waiting or due:
             while waiting and len(due) < (command.jobs or MOST):
                 code, job = waiting.pop()
@@ -223,9 +229,9 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
             try:
                 there, result = ray.get(ref)
             except LOST as error:
-                yield job, f"its process was lost again and again: {told(error)}"
+                yield job, f"its process was lost repeatedly: {error_text(error)}"
             except ray.exceptions.RayError as error:
-                yield job, told(error)
+                yield job, error_text(error)
             else:
                 if there is None:
                     yield job, result
@@ -236,9 +242,10 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
 
 
 def _task() -> Callable[..., Any]:
-    """A run as Ray does it: what runs on a node, or None where that is good; and the result.
+    """Return the function that does a run on a node of Ray.
 
-    It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
+    It returns the node's versions where they do not fit, else None; and the run's result. It is
+    sent to the nodes as code, so that it can report a node without Skillweave.
     """
     from skillweave.collecting.stationed import actor_class
 
@@ -253,3 +260,50 @@ def _task() -> Callable[..., Any]:
         return None, Job(*job).run(code)
 
     return task
+
+
+Result = tuple[str, int, Path, float | str]
+"""Settings, seed, directory, and the mean return or an error."""
+
+
+def summary(results: Sequence[Result], out: Path) -> tuple[dict[str, Any], str]:
+    """Return a sweep as JSON, and as a table with a line for each choice of settings."""
+    groups = list[dict[str, Any]]()
+    failed = list[dict[str, str]]()
+    runs = list[dict[str, Any]]()
+    for settings, rows in itertools.groupby(results, lambda result: result[0]):
+        returns = []
+        for _, seed, path, score in rows:
+            if isinstance(score, str):
+                failed.append({"run": str(path), "error": score})
+                continue
+            returns.append(score)
+            runs.append({"run": str(path), "settings": settings, "seed": seed, "return": score})
+        group: dict[str, Any] = {"settings": settings or "as declared", "runs": len(returns)}
+        if returns:
+            over = over_seeds(np.array(returns))
+            group |= {"iqm": float(over.mean), "median": statistics.median(returns)}
+            group |= {"least": min(returns), "most": max(returns)}
+            if over.low is not None and over.high is not None:
+                group |= {"low": float(over.low), "high": float(over.high)}
+        groups.append(group)
+    result = {"out": str(out), "groups": groups, "runs": runs, "failed": failed}
+    return result, "\n".join([*_table(groups), *_failures(failed), f"runs    {out}"])
+
+
+def _table(groups: Sequence[dict[str, Any]]) -> list[str]:
+    wide = max(len(g["settings"]) for g in groups)
+    head = f"{'settings':<{wide}} {'runs':>5} {'return':>9} {'95 % interval':>20} {'median':>9}"
+    lines = [f"{head} {'least to most':>20}"]
+    for g in groups:
+        line = f"{g['settings']:<{wide}} {g['runs']:>5}"
+        if g["runs"]:
+            interval = f"{g['low']:.1f} to {g['high']:.1f}" if "low" in g else "one seed"
+            line += f" {g['iqm']:>9.1f} {interval:>20} {g['median']:>9.1f}"
+            line += f" {g['least']:>9.1f} to {g['most']:.1f}".rjust(21)
+        lines.append(line)
+    return [*lines, "return: the interquartile mean over seeds of the runs' mean returns"]
+
+
+def _failures(failed: Sequence[dict[str, str]]) -> list[str]:
+    return [f"failed  {f['run']}: {f['error']}" for f in failed]

@@ -1,7 +1,7 @@
-"""By which code the runs of a sweep are trained, kept in a file of the sweep's directory.
+"""The checksum of a sweep's code, kept in a file of the sweep's directory; a contract of its own.
 
-A run's identity covers settings, not code. So without this file an edited recipe would go on with
-the sweep of the recipe as it was, and one table would mix both.
+A run's identity covers settings, not code. Without this file, an edited recipe would continue the
+sweep of the recipe as it was, and one table would mix both.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json, write_json
 
 MARK = ".sweep"
-"""A file in the sweep's directory, by which a machine knows that it sees it."""
+"""A file in the sweep's directory; a machine that can read it shares the directory."""
 
 
 class Mark(TypedDict):
-    """What the file holds."""
+    """Content of the file."""
 
     recipe: str
     """As it was given."""
@@ -37,7 +37,7 @@ class Mark(TypedDict):
 
 
 def must_be_same_code(out: Path, recipe: str) -> None:
-    """Write into a sweep's directory by which code its runs are trained, or compare with that.
+    """Write the checksum of the recipe's code into a sweep's directory, or compare with it.
 
     The recipe must be loaded, so that the modules that it imports are known. It may be mended where
     no run has learnt yet, for example where it failed at its first step.
@@ -46,15 +46,16 @@ def must_be_same_code(out: Path, recipe: str) -> None:
         RunError: the runs there are trained by other code; or the directory cannot be
             written.
     """
-    file, code = out / MARK, _checksum(code_files(recipes.file_of(recipe)))
+    file = out / MARK
+    code = _checksum(code_files(recipes.file_of(recipe)))
     learnt = any(out.glob("*/checkpoint*")) or any(out.glob("*/policies/*"))
     if not learnt or not file.exists():
         write_json(file, Mark(recipe=recipe, code=code), make_directories=False)
         return
-    told: Mark = fit(Mark, read_json(file), str(file))
-    if told["code"] != code:
+    mark: Mark = fit(Mark, read_json(file), str(file))
+    if mark["code"] != code:
         raise RunError(
-            f"{out} holds runs of the recipe {shown(told['recipe'], 500)}, which were not trained "
+            f"{out} holds runs of the recipe {shown(mark['recipe'], 500)}, which were not trained "
             f"by the code of {recipe} as it is now: it is another recipe, or it was edited since, "
             "or a module of yours that it imports was. One table would mix both. Choose another "
             f"directory (--out), or delete {out}. If what was edited cannot change results, as a "
@@ -63,7 +64,7 @@ def must_be_same_code(out: Path, recipe: str) -> None:
 
 
 def code_files(recipe: Path) -> dict[str, Path]:
-    """A recipe's file, and the modules that it imports by their names: files of the user's own.
+    """Return a recipe's file, and by their names the user's modules that it imports.
 
     Of a shipped recipe these are its parts.
     """
@@ -82,7 +83,7 @@ def code_files(recipe: Path) -> dict[str, Path]:
 
 
 def _checksum(files: Mapping[str, Path]) -> str:
-    """Of the names of modules and the contents of their files, wherever these lie."""
+    """Return a checksum of the names of modules and the contents of their files."""
     sums = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
     return hashlib.sha256(json.dumps(sums, sort_keys=True).encode()).hexdigest()
 
@@ -92,7 +93,7 @@ def _is_part(module: ModuleType) -> bool:
 
 
 def _imported(source: bytes, package: str) -> Iterator[str]:
-    """The modules that a file of a package names, and the packages that they are in."""
+    """Yield the modules that a file of a package names, and the packages that they are in."""
     for node in ast.walk(ast.parse(source)):
         names: list[str] = []
         if isinstance(node, ast.Import):

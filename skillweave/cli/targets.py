@@ -1,4 +1,4 @@
-"""What a command names: a run, a weights file, a shipped recipe."""
+"""Load the policy that a command names: of a run, a weights file, or a shipped recipe."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from pathlib import Path
 
 from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
-from skillweave.api.declared import ASK, declared_in
-from skillweave.api.loading import load_from
+from skillweave.api.loading import ASK, declared_in, load_from
 from skillweave.cli import commands
 from skillweave.errors import RunError
 from skillweave.hierarchy.weights import open_weights
 
 
 def target(command: commands.Watched | commands.Export) -> Run:
-    """The trained policy that a command names.
+    """Return the trained policy that a command names.
 
     Raises:
         RunError: there is none, or it needs code that was not given.
@@ -42,7 +41,7 @@ def load_run(path: Path, recipe: str | None) -> Run:
 
 
 def free(path: Path) -> Path:
-    """``path``, or the first of path-2, path-3, … that does not exist."""
+    """Return ``path``, or the first of path-2, path-3, … that does not exist."""
     number, candidate = 1, path
     while candidate.exists():
         number += 1

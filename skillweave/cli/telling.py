@@ -1,4 +1,4 @@
-"""Tells results to people or programs, and keeps scores in their runs."""
+"""Print results for people or programs, and keep scores in their runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skillweave.training.evaluation_file import save_evaluation
 
 
 def tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
-    """Print JSON where it is asked for, else the text."""
+    """Print JSON if ``--json`` is given, else the text."""
     put(as_json(data) if command.json else text)
 
 
@@ -39,7 +39,7 @@ def put(text: str = "") -> None:
 
 
 def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bool = True) -> None:
-    """Keep a score in its run for ``info``; one that cannot be written is told all the same."""
+    """Keep a score in its run for ``info``; print a warning if it cannot be written."""
     try:
         save_evaluation(RunDirectory.open(trained.path), score, seed, deterministic)
     except RunError as error:
@@ -47,7 +47,7 @@ def save_score(trained: Run, score: Evaluation, seed: int = 0, deterministic: bo
 
 
 def run_words(run: RunDirectory) -> list[str]:
-    """Return where a finished run lies, and commands that show it, as lines."""
+    """Return lines: the place of a finished run, and commands that show it."""
     names = ("evaluate", "render", "report")
     commands = [command_words(name, run) for name in names]
     return [f"run     {shown_path(run.path)}", "next    " + "\n        ".join(commands)]

@@ -1,4 +1,4 @@
-"""Trains a recipe, and the flat agent that it is held against; finishes what was stopped."""
+"""Commands that train: a recipe, its flat agent, and the end of a stopped run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
-from skillweave.api.declared import declared_by
+from skillweave.api.loading import declared_by
 from skillweave.cli import commands
 from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.overrides import apply_overrides
@@ -41,12 +41,12 @@ def train(command: commands.Train) -> None:
         hierarchy.env = replace(hierarchy.spec, workers=command.collectors)
     evolve = parse_evolve(command.evolve, hierarchy, command.flat)
     trained = _trained(command, hierarchy, command.flat, command.out, evolve)
-    result, lines = _told(command, trained, command.render)
+    result, lines = _summary(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
             put("\n".join(lines))
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
-        result["flat"], more = _told(command, flat)
+        result["flat"], more = _summary(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
     tell(command, result, "\n".join(lines))
@@ -61,7 +61,7 @@ def resume(command: commands.Resume) -> None:
         trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
     except KeyboardInterrupt as error:
         raise _interrupted(error, command.ray) from None
-    result, lines = _told(command, trained)
+    result, lines = _summary(command, trained)
     tell(command, result, "\n".join(lines))
 
 
@@ -103,41 +103,41 @@ def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:
         return None
     if len(words) == 1 and ("=" not in words[0] or Path(words[0]).exists()):
         return words[0]
-    found: dict[str, str] = {}
+    run_of: dict[str, str] = {}
     for word in words:
         name, sign, run = word.partition("=")
         if not sign or not name or not run:
             raise DeclarationError(
-                f"--start-from {word}: with several runs, write who begins with each: "
+                f"--start-from {word}: with several runs, name the learner of each: "
                 "--start-from left=RUN --start-from right=RUN"
             )
-        if name in found:
+        if name in run_of:
             raise DeclarationError(f"--start-from names {name} twice; give it one run")
-        found[name] = run
-    return found
+        run_of[name] = run
+    return run_of
 
 
 def _verdict(hierarchy: dict[str, Any], flat: dict[str, Any]) -> list[str]:
-    """In plain words, which evaluation is better, and what that means."""
+    """Return in plain words which evaluation is better, and what that means."""
     (low, high), (flat_low, flat_high) = hierarchy["ci95"], flat["ci95"]
     both = f"hierarchy {hierarchy['mean']:.1f}, flat agent {flat['mean']:.1f} with as many steps"
     if low > flat_high:
         return [f"{both}: the hierarchy is better."]
     if flat_low > high:
-        found = "the flat agent is better, as often where the reward alone leads to the goal."
+        verdict = "the flat agent is better, as often where the reward alone leads to the goal."
     else:
-        found = "there is no clear difference."
+        verdict = "there is no clear difference."
     return [
-        f"{both}: {found}",
+        f"{both}: {verdict}",
         "Skills pay where one agent cannot, and where many tasks need the same skills. Try next:",
         "  skillweave train lander-missions",
     ]
 
 
-def _told(
+def _summary(
     command: commands.Train | commands.Resume, trained: Run, render: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """What a run has come to, for programs and for people."""
+    """Return the results of a run, for programs and for people."""
     manifest = trained.info()
     result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": manifest["stages"]}
     seconds = sum(p["seconds"] for p in manifest["stages"])

@@ -1,4 +1,4 @@
-"""One agent as a file: a policy, and all that learning needs to go on."""
+"""One agent as a file: a policy, and all that further learning needs."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[s
 
 
 def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str, Any]]:
-    """The algorithm, its state, and the ``about`` that was saved with it.
+    """Return the algorithm, its state, and the ``about`` that was saved with it.
 
-    A file that holds a policy alone gives the weights; everything else begins anew.
+    A file that holds a policy alone gives the weights; everything else starts fresh.
 
     Raises:
         RunError: the file is missing, damaged, a pickle, or holds no agent.

@@ -1,4 +1,4 @@
-"""Converts checkpoints of AgileRL 0.1 and 1.0 (PPO, DQN, DDPG, TD3 with MLPs) to native agents."""
+"""Convert checkpoints of AgileRL 0.1 and 1.0 (PPO, DQN, DDPG, TD3 with MLPs) to native agents."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _LAYER = re.compile(r"(linear_layer|layer_norm)_(\d+|output)\.(weight|bias)$")
 
 
 def convert(path: Path, out: Path) -> str:
-    """Write an AgileRL checkpoint as a native agent; returns the name of the algorithm.
+    """Write an AgileRL checkpoint as a native agent; return the name of the algorithm.
 
-    The pickle is read without running code from it (see ``pickles``). The optimiser begins anew.
+    The pickle is read without running code from it (see ``pickles``). The optimiser starts fresh.
 
     Raises:
         RunError: the file is missing, names what is refused, is no checkpoint of
-            AgileRL's, or holds what no native policy computes; the message says what.
+            AgileRL's, or holds what no native policy computes; the message names it.
     """
     data = read_torch_pickle(path)
     algo: Any = data.get("algo") if isinstance(data, dict) else None
@@ -64,8 +64,8 @@ def convert(path: Path, out: Path) -> str:
     except SkillweaveError as error:
         raise RunError(f"{path}: {error}") from error
     except (LookupError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
-        told = f"{type(error).__name__}: {str(error)[:300]}"
-        raise RunError(f"{path}: its networks are not as it describes: {told}") from error
+        reason = f"{type(error).__name__}: {str(error)[:300]}"
+        raise RunError(f"{path}: its networks are not as it describes: {reason}") from error
     about = {"algo": algo, **past, "steps": steps, "index": data.get("index", 0), "mut": None}
     save_agent(out, algorithm, state, about)
     return str(algo)
@@ -115,8 +115,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     kind, actor = _KINDS[algo], data["actor_init_dict"]
     critics = [data[k] for k in ("critic_state_dict", "critic_1_state_dict") if k in data]
     critics += [data[k] for k in ("critic_2_state_dict",) if k in data]
-    own = {f.name for f in fields(kind)}
-    known = {k: v for k, v in data.items() if k in own and type(v) in (int, float, bool)}
+    names = {f.name for f in fields(kind)}
+    known = {k: v for k, v in data.items() if k in names and type(v) in (int, float, bool)}
     rate = data.get("lr", data.get("lr_critic", 1e-3))
     config: dict[str, Any] = {**known, "learning_rate": float(rate), "network": _mlp(actor)}
     if kind is PPO:
@@ -132,7 +132,8 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
     if kind is not DQN:
         config["critic"] = _mlp(data.get("critic_init_dict") or data["critic_1_init_dict"])
     algorithm: Any = make_algorithm(kind(**config), *_spaces(kind, data))
-    acting, shapes = "q" if kind is DQN else "actor", algorithm.layout.shapes
+    acting = "q" if kind is DQN else "actor"
+    shapes = algorithm.layout.shapes
     weights = _named(shapes, acting, data["actor_state_dict"])
     if kind is PPO:
         weights |= _named(shapes, "critic", critics[0])
@@ -167,8 +168,9 @@ def _mlp(init: Mapping[str, Any]) -> Network:
 def observations_of(
     size: Any, one_hot: bool | None, net_config: Mapping[str, Any] | None = None
 ) -> gym.Space[Any]:
-    """The observation space of states of this size, for a network described so."""
-    shape, described = [int(n) for n in np.atleast_1d(size)], net_config or {}
+    """Return the observation space of states of this size, for a network of this description."""
+    shape = [int(n) for n in np.atleast_1d(size)]
+    described = net_config or {}
     if one_hot:
         return gym.spaces.Discrete(shape[0])
     if described.get("arch") != "cnn":
@@ -179,7 +181,7 @@ def observations_of(
 
 
 def network_of(described: Mapping[str, Any], usual: str | None = None) -> Network:
-    """The network that a ``net_config`` of AgileRL describes.
+    """Return the network that a ``net_config`` of AgileRL describes.
 
     Raises:
         RunError: a part is missing or unknown.
@@ -192,8 +194,10 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
             f"arch be 'mlp' or 'cnn', and its activation be one of {', '.join(ACTIVATIONS)}"
         )
     sizes = [tuple(described.get(f"{k}_size", ())) for k in ("channel", "kernel", "stride")]
-    cnn, hidden = CNN("plain", *sizes) if sizes[0] else None, described["hidden_size"]
-    layer_norm, activation = bool(described.get("layer_norm")), ACTIVATIONS[str(name)]
+    cnn = CNN("plain", *sizes) if sizes[0] else None
+    hidden = described["hidden_size"]
+    layer_norm = bool(described.get("layer_norm"))
+    activation = ACTIVATIONS[str(name)]
     planes: Any = None if cnn is None else "first"  # AgileRL reads all images so
     widths = tuple(int(n) for n in hidden)
     return Network(widths, activation, layer_norm, cnn, planes=planes)  # type: ignore[arg-type]
@@ -202,7 +206,7 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
 def _named(
     shapes: Mapping[str, tuple[int, ...]], prefix: str, weights: Mapping[str, Any]
 ) -> dict[str, Tensor]:
-    """A state dict with the names and shapes of one of our networks, complete.
+    """Return a state dict with the names and shapes of one of our networks, complete.
 
     Raises:
         RunError: a weight is missing, unknown, of another shape, or not finite.
@@ -211,22 +215,22 @@ def _named(
     depth = max(int(k.split(".")[1]) for k in wanted)
     named: dict[str, Tensor] = {}
     for key, value in weights.items():
-        told = f"{prefix}_state_dict: {key[:100]}"
-        if (found := _LAYER.search(key)) is None or not isinstance(value, Tensor):
-            raise RunError(f"{told} is no weights of an MLP: unknown weights {key[:100]}")
-        layer, number, what = found.groups()
+        where = f"{prefix}_state_dict: {key[:100]}"
+        if (match := _LAYER.search(key)) is None or not isinstance(value, Tensor):
+            raise RunError(f"{where} is no weights of an MLP: unknown weights {key[:100]}")
+        layer, number, what = match.groups()
         matrix = layer == "linear_layer" and what == "weight"
         name = f"norm_{what}" if layer == "layer_norm" else what
         name = f"{prefix}.{depth if number == 'output' else int(number)}.{name}"
         if name not in wanted or name in named:
-            raise RunError(f"{told} belongs to no layer that is described")
+            raise RunError(f"{where} belongs to no layer that is described")
         # Stored as torch has it: (out, in), where ours is (in, out).
         asked = wanted[name][::-1] if matrix else wanted[name][-1:]
         if tuple(value.shape) != asked:
-            raise RunError(f"{told} has the shape {tuple(value.shape)}, but {asked} is described")
+            raise RunError(f"{where} has the shape {tuple(value.shape)}, but {asked} is described")
         value = value.to(torch.float32) if value.is_floating_point() else value
         if value.dtype != torch.float32 or not value.isfinite().all():
-            raise RunError(f"{told} holds NaN, infinity, or no real numbers")
+            raise RunError(f"{where} holds NaN, infinity, or no real numbers")
         named[name] = (value.t() if matrix else value).reshape(wanted[name])
     if left := sorted(set(wanted) - set(named)):
         raise RunError(f"there are no weights for {', '.join(left)}")

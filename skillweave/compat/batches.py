@@ -1,4 +1,4 @@
-"""Batches for algorithms, made of what a training loop of the user has recorded."""
+"""Batches for algorithms, made of the records of a user's training loop."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skillweave.experience import Rollout, Sample
 def returns_of(
     env: Any, act: Callable[[Any], Any], episodes: int, max_steps: int
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Returns (episodes,) of ``act(obs)``, each of at most ``max_steps`` steps.
+    """Play episodes of at most ``max_steps`` steps by ``act(obs)``; return their returns.
 
     In a vector environment only the first environment counts.
     """
@@ -44,9 +44,9 @@ def rollout_of(
     terminated: Any,
     next_obs: Any,
 ) -> Rollout:
-    """T steps of N environments as a rollout; each argument has T entries: (N, ...) or one value.
+    """Return T steps of N environments as a rollout; each argument has T entries (N, ...).
 
-    The successor of a step is the next entry of ``obs``; ``next_obs`` is that of the last step.
+    The successor of a step is the next entry of ``obs``; ``next_obs`` belongs to the last step.
     Actions are in policy units, and count as drawn with the log-probabilities given.
     """
     rewards = _tensor(reward, np.float32)
@@ -80,7 +80,7 @@ def sample_of(
     terminated: Any,
     weight: Any = None,
 ) -> Sample:
-    """B transitions as a sample; actions in the environment's units, γ for all their steps."""
+    """Return B transitions as a sample; environment's actions, γ for all of their steps."""
     rewards = _tensor(reward, np.float32).view(1, -1)
     size, shape = rewards.shape[1], algorithm.action_space.shape or ()
     units = algorithm.codec.from_env(np.asarray(action).reshape(size, *shape))
@@ -98,7 +98,7 @@ def sample_of(
 
 
 def _rows(algorithm: Algorithm, obs: Any) -> Tensor:
-    """Observations, however nested, as (n, *shape) with the dtype of the space."""
+    """Return observations, however nested, as (n, *shape) with the dtype of the space."""
     space = algorithm.observation_space
     return _tensor(obs, space.dtype).view(-1, *(space.shape or ()))
 

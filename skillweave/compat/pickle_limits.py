@@ -1,4 +1,4 @@
-"""What a checkpoint of ``torch.save``'s may take: looked at before any of it is read."""
+"""Limits of a checkpoint of ``torch.save``: apart, as they are checked before it is read."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.errors import RunError
 
 DEEPEST = 100
-"""How deep a pickle may nest what it builds: hashing a deeper tuple overflows Python's stack."""
+"""Deepest nesting of a pickle's objects: hashing a deeper tuple overflows Python's stack."""
 MOST_STEPS = 500_000
 """Operations of a pickle's program; each may take memory."""
 LARGEST_PROGRAM = 16 * 2**20
@@ -17,7 +17,7 @@ LARGEST_PROGRAM = 16 * 2**20
 LARGEST = 2**30
 """Bytes of everything in the file."""
 _INTO = {"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"}
-"""Operations that put something into what lies on the stack."""
+"""Operations that put something into an object on the stack."""
 _MARK = -1
 
 
@@ -31,13 +31,15 @@ def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
             f"refused: it declares {total:,} bytes in a file of {size:,}; what torch.save writes "
             "is not compressed"
         )
-    own = file.getinfo(program).file_size
-    if own > LARGEST_PROGRAM:
-        raise RunError(f"its pickle declares {own:,} bytes; at most {LARGEST_PROGRAM:,} are read")
+    size_of_program = file.getinfo(program).file_size
+    if size_of_program > LARGEST_PROGRAM:
+        raise RunError(
+            f"its pickle declares {size_of_program:,} bytes; at most {LARGEST_PROGRAM:,} are read"
+        )
 
 
 def check_program(program: bytes) -> None:
-    """Raise where a pickle's program is too long, or builds what is nested too deep.
+    """Raise where a pickle's program is too long, or its objects are nested too deep.
 
     It is run with the depth of every object in place of the object.
     """

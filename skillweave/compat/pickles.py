@@ -1,8 +1,8 @@
-"""Reads checkpoints of ``torch.save`` without running code from them.
+"""Read checkpoints of ``torch.save`` without running code from them: apart from their meaning.
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
-is known to do nothing else; everything else stops the reading.
+has no other effect; everything else stops the reading.
 """
 
 from __future__ import annotations
@@ -24,15 +24,21 @@ from skillweave.messages import short, shortened
 from skillweave.reading import check_file, shown
 
 _STORAGES = {
-    "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32,
-    "ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8,
+    "FloatStorage": torch.float32,
+    "DoubleStorage": torch.float64,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "ByteStorage": torch.uint8,
     "BoolStorage": torch.bool,
-}  # fmt: skip
+}
 
 
 class Inert:
-    """Stands for an object that holds nothing that is needed, such as a loss of torch's."""
+    """A stand-in for an object that is not needed, such as a loss of torch's."""
 
     def __setstate__(self, state: Any) -> None:
         """Ignore it."""
@@ -58,7 +64,7 @@ class _Held:
 
 
 class _Maker:
-    """A function that the pickle may call, and do nothing else with."""
+    """A function that the pickle may only call."""
 
     __slots__ = ("_function",)
 
@@ -73,7 +79,7 @@ class _Maker:
 
 
 def read_torch_pickle(path: Path) -> Any:
-    """What ``torch.save`` wrote, if it is tensors, numbers, arrays and plain containers.
+    """Return the content of a ``torch.save``: tensors, numbers, arrays and plain containers.
 
     Raises:
         RunError: the file is missing, damaged, too large or nested too deep, or names
@@ -91,25 +97,25 @@ def read_torch_pickle(path: Path) -> Any:
             prefix = name.removesuffix("data.pkl")
             return _Plain()(_Reader(io.BytesIO(program), file, prefix).load())[0]
     except zipfile.BadZipFile as error:
-        told = shortened(str(error))  # it may quote much of the file
+        reason = shortened(str(error))  # it may quote much of the file
         raise RunError(
-            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {told}"
+            f"{path} is no checkpoint of torch.save's (or one of before torch 1.6): {reason}"
         ) from error
     except SkillweaveError as error:
         raise RunError(f"{path}: {error}") from error
     except Exception as error:  # a damaged pickle can fail in any way
-        told = f"{type(error).__name__}: {shortened(str(error))}"
-        raise RunError(f"{path} is damaged: {told}") from error
+        reason = f"{type(error).__name__}: {shortened(str(error))}"
+        raise RunError(f"{path} is damaged: {reason}") from error
 
 
 class _Plain:
-    """Turns what was read into plain tensors, Python numbers and containers."""
+    """A conversion of a pickle's objects to plain tensors, Python numbers and containers."""
 
     def __init__(self) -> None:
         self._results: dict[int, tuple[Any, int]] = {}
 
     def __call__(self, data: Any, depth: int = 0) -> tuple[Any, int]:
-        """The same in plain objects, and their number if nothing were shared."""
+        """Return an object in plain objects, and their number if nothing were shared."""
         if id(data) in self._results:
             return self._results[id(data)]
         if depth > DEEPEST:  # lists and dicts can be put into one another later, even in a circle
@@ -119,11 +125,11 @@ class _Plain:
             inner = [part for item in data.items() for part in item]
         elif isinstance(data, list | tuple | set | frozenset):
             inner = list(data)
-        found = [self(part, depth + 1) for part in inner]
-        size = 1 + sum(n for _, n in found)
+        parts = [self(part, depth + 1) for part in inner]
+        size = 1 + sum(n for _, n in parts)
         if size > MOST_STEPS:
             raise RunError(f"its pickle holds more than {MOST_STEPS:,} objects")
-        self._results[id(data)] = _rebuilt(data, [value for value, _ in found]), size
+        self._results[id(data)] = _rebuilt(data, [value for value, _ in parts]), size
         return self._results[id(data)]
 
 
@@ -144,20 +150,20 @@ class _Reader(pickle.Unpickler):
         super().__init__(data, encoding="utf-8")
         self._file, self._prefix = file, prefix
         self._storages: dict[tuple[str, torch.dtype], Tensor] = {}
-        # Made anew for each file: a pickle may set attributes of a class.
+        # Made again for each file: a pickle may set attributes of a class.
         self._inert = type("Inert", (Inert,), {})
 
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy._core", "numpy.core")
         if module == "torch" and name in _STORAGES:
             return _STORAGES[name]
-        found = _ALLOWED.get((module, name))
-        if found is None:
+        allowed = _ALLOWED.get((module, name))
+        if allowed is None:
             raise RunError(
                 f"refused: the pickle names {module[:60]}.{name[:60]}, which is neither a tensor, "
                 "a number, an array, a device nor a plain container"
             )
-        return self._inert if found is Inert else _Maker(found)
+        return self._inert if allowed is Inert else _Maker(allowed)
 
     def persistent_load(self, pid: Any) -> _Held:
         kind, dtype, key, _, size = pid
@@ -167,10 +173,10 @@ class _Reader(pickle.Unpickler):
             data = bytearray(self._file.read(f"{self._prefix}data/{key}"))
             empty = torch.empty(0, dtype=dtype, device="cpu")
             self._storages[key, dtype] = torch.frombuffer(data, dtype=dtype) if data else empty
-        found = self._storages[key, dtype]
-        if len(found) != size:
+        storage = self._storages[key, dtype]
+        if len(storage) != size:
             raise RunError(f"is damaged: storage {shown(key)} does not hold {shown(size)}")
-        return _Held(found)
+        return _Held(storage)
 
 
 def _tensor(storage: _Held, offset: int, size: Any, stride: Any, *_: Any) -> _Held:
@@ -199,7 +205,7 @@ def _scalar(dtype: _DType, data: bytes) -> Any:
 
 
 class _Array(np.ndarray[Any, Any]):
-    """What arrays are rebuilt as: never more than numbers."""
+    """A rebuilt array, of numbers alone."""
 
     def __new__(cls, *_: Any) -> _Array:
         return super().__new__(cls, 0)
@@ -212,9 +218,9 @@ class _Array(np.ndarray[Any, Any]):
 def _create_array(make: Any, arguments: Any, state: Any, *_: Any) -> Any:
     if not isinstance(make, _Maker) or make._function is not _Array:  # dill writes arrays so
         raise RunError(f"refused: the pickle makes an array by {shown(make)}")
-    found = _Array(*arguments)
-    found.__setstate__(state)
-    return found
+    array = _Array(*arguments)
+    array.__setstate__(state)
+    return array
 
 
 def _encode(text: str, encoding: str) -> bytes:
@@ -223,7 +229,7 @@ def _encode(text: str, encoding: str) -> bytes:
 
 def _load_type(name: str) -> type:
     kinds: dict[str, type] = {k.__name__: k for k in (set, frozenset, dict, list, tuple)}
-    if name not in kinds:  # dill's function knows all types, that of code too
+    if name not in kinds:  # dill's function has all types, that of code too
         raise RunError(f"refused: the pickle names the type {shown(name)}")
     return kinds[name]
 

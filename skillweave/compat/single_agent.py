@@ -1,4 +1,4 @@
-"""One agent for a training loop that the user writes: it acts, learns and can be saved."""
+"""One agent for a user's training loop, part of the public API: it acts, learns and is saved."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ class SingleAgent:
     """A member of P = 1 with its spaces and its own random streams.
 
     Args:
-        member: if its ``state`` is None, it begins with fresh weights.
+        member: if its ``state`` is None, it starts with fresh weights.
         spaces: the observation space and the action space.
         seed: the root of its random streams.
     """
 
     def __init__(self, member: Member, spaces: tuple[Any, Any], seed: int) -> None:
-        self.spaces, self.seeds, self.updates = spaces, Seeds(seed), 0
+        self.spaces = spaces
+        self.seeds = Seeds(seed)
+        self.updates = 0
         self.rng, self.generator = (self.seeds / "act").numpy(), (self.seeds / "learn").torch()
         if member.state is None:
             member.state = make_algorithm(member.config, *spaces).init([self.seeds])
         self.become(member)
 
     def become(self, member: Member) -> None:
-        """Go on as another member, for example a mutated one."""
+        """Continue as another member, for example a mutated one."""
         self.member, self.learner = member, member.algorithm(self.spaces)
         self.numpy_actor = self._make_numpy_actor()
 
@@ -52,7 +54,7 @@ class SingleAgent:
         self.become(with_settings(self.member, **settings))
 
     def mutate(self, by: Mutations, rng: np.random.Generator) -> Origin:
-        """Mutate in at most one way; returns which one.
+        """Mutate in at most one way; return the name of the mutation.
 
         Raises:
             DeclarationError: ``by`` cannot change this architecture.
@@ -62,13 +64,13 @@ class SingleAgent:
         return self.member.origin
 
     def sample(self, obs: Any) -> Sampled:
-        """Actions, log-probabilities, entropies and values of PPO, for one observation or B."""
+        """Return PPO's actions, log-probabilities, entropies and values; one observation or B."""
         return cast(Sampled, self.numpy_actor.sample(self.numpy_actor.rows(obs), self.rng))
 
     def act(
         self, obs: Any, *, explore: bool = True, epsilon: float = 0.0, mask: Any = None
     ) -> Array:
-        """Actions (B, ...) in the environment's units.
+        """Return actions (B, ...) in the environment's units.
 
         Args:
             explore: whether the algorithm adds its own exploration.
@@ -85,16 +87,16 @@ class SingleAgent:
                 action = learner.random_actions([self.generator], len(rows), allowed)
             else:
                 actor = learner.acting_params(self.member.state)
-                if "epsilon" in actor.extra:  # said here at each call instead
+                if "epsilon" in actor.extra:  # the warning comes here, at each call, instead
                     actor.extra["epsilon"].zero_()
                 noise = learner.noise([self.generator], 1, len(rows))[0] if explore else None
                 obs = torch.from_numpy(rows)[None]
                 action, _, _ = learner.act(actor, obs, allowed, noise)
-        found: Array = learner.to_env(action[0].numpy())
-        return found
+        actions: Array = learner.to_env(action[0].numpy())
+        return actions
 
     def learn_steps(self, *record: Any) -> dict[str, float]:
-        """Learn from T steps, given as to ``rollout_of``; returns metrics."""
+        """Learn from T steps, given as to ``rollout_of``; return metrics."""
         rollout = rollout_of(self.learner, self.member.state, *record)
         self.updates += 1
         rng = [(self.seeds / "update" / self.updates).torch()]
@@ -103,14 +105,14 @@ class SingleAgent:
         return {k: float(v) for k, v in report.metrics.items()}
 
     def learn_sample(self, gamma: float, *record: Any) -> tuple[dict[str, float], Array]:
-        """One gradient step on B transitions, given as to ``sample_of``; metrics, errors (B,)."""
+        """Make one gradient step on B transitions of ``sample_of``; return metrics, errors (B,)."""
         sample = sample_of(self.learner, gamma, *record)
         _, report = self.learner.update(self.member.state, sample, [self.generator])
         self.numpy_actor = self._make_numpy_actor()
         return {k: float(v) for k, v in report.metrics.items()}, report.error[0].numpy()
 
     def copy(self, seed: int) -> Self:
-        """The same agent with its own copy of the weights and its own random streams."""
+        """Return the same agent with its own copy of the weights and its own random streams."""
         return type(self)(copy(self.member), self.spaces, seed)
 
     def save(self, path: str | Path, about: dict[str, Any]) -> None:
@@ -119,7 +121,7 @@ class SingleAgent:
 
     @classmethod
     def load(cls, path: str | Path, seed: int) -> tuple[Self, dict[str, Any]]:
-        """The agent in a file, and its ``about``; see ``load_agent``."""
+        """Return the agent in a file, and its ``about``; see ``load_agent``."""
         algorithm, state, about = load_agent(path, Seeds(seed))
         spaces = algorithm.observation_space, algorithm.action_space
         return cls(Member(0, algorithm.config, state), spaces, seed), about

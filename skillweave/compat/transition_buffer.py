@@ -1,4 +1,4 @@
-"""A replay buffer for a training loop that the user writes."""
+"""A replay buffer for a user's training loop, part of the public API."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ class TransitionBuffer:
     """
 
     def __init__(self, capacity: int, seed: int, gamma: float = 1.0, **how: Any) -> None:
-        self._capacity, self._gamma, self._how = capacity, torch.tensor([gamma], **FLOAT), how
-        self._rngs, self._after = [np.random.default_rng(seed)], np.empty(0)
+        self._capacity = capacity
+        self._gamma = torch.tensor([gamma], **FLOAT)
+        self._how = how
+        self._rngs = [np.random.default_rng(seed)]
+        self._after = np.empty(0)
         self._buffer: ReplayStore | None = None
 
     def __len__(self) -> int:
@@ -37,7 +40,8 @@ class TransitionBuffer:
             self._buffer = self._made(before, action)
         elif not np.array_equal(before, self._after):
             self._buffer.cut(np.arange(len(before)))
-        never, once = np.zeros((1, len(before)), bool), np.ones((1, len(before)), np.int64)
+        never = np.zeros((1, len(before)), bool)
+        once = np.ones((1, len(before)), np.int64)
         reward = reward.astype(np.float32)
         self._buffer.add(
             Batch(
@@ -53,12 +57,12 @@ class TransitionBuffer:
         self._after = after
 
     def sample(self, batch: int, beta: float = 1.0) -> Sample:
-        """B transitions at random; see ``ReplayStore.sample``."""
+        """Return B transitions at random; see ``ReplayStore.sample``."""
         assert self._buffer, "sample() before add()"
         return self._buffer.sample(batch, self._gamma, self._rngs, min(1.0, beta))
 
     def at(self, index: Array) -> Sample:
-        """The transitions (B,) at ``index`` of a sample from another buffer of equal steps."""
+        """Return the transitions (B,) at the ``index`` of a sample from another buffer."""
         assert self._buffer, "at() before add()"
         return self._buffer.at(np.asarray(index)[None], None, self._gamma)
 

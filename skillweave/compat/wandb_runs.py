@@ -15,7 +15,7 @@ _messages: list[str] = []
 
 
 def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None = None) -> Any:
-    """A new Weights & Biases run, for a training loop of the user; offline without login or key.
+    """Start a Weights & Biases run for a user's training loop; offline without login or key.
 
     Raises:
         MissingExtra: wandb is not installed.
@@ -34,7 +34,7 @@ def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None
 def stay_offline() -> None:
     """Without a login, set wandb to offline, so that it does not ask for one.
 
-    A line on stderr says so, once, when wandb is imported.
+    A line on stderr reports it, once, when wandb is imported.
     """
     if "WANDB_MODE" not in os.environ and wandb_mode() == "offline":
         os.environ["WANDB_MODE"] = "offline"

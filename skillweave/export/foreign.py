@@ -1,4 +1,4 @@
-"""Networks that were made elsewhere, as graphs like those of trained agents."""
+"""Graphs of foreign networks, like those of trained agents: apart, as they are no agents."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class _Module(nn.Module):
         self.spaces = policy.observation_space, policy.action_space
 
     def forward(self, *given: Tensor) -> Tensor:
-        """The action; inputs: leaves, mask, noise."""
+        """Return the action; inputs: leaves, mask, noise."""
         left = iter(given)
         output = self.module(_nested(self.spaces[0], left))
         mask = next(left) if self.masked else None
@@ -37,7 +37,7 @@ class _Module(nn.Module):
 
 
 def _nested(space: gym.Space[Any], leaves: Iterator[Tensor]) -> Any:
-    """An observation as the module takes it."""
+    """Return the leaves in the structure of the module's input."""
     inner = parts(space)
     if inner is None:
         return next(leaves).float()
@@ -48,8 +48,9 @@ def _nested(space: gym.Space[Any], leaves: Iterator[Tensor]) -> Any:
 def _decoded(
     output: Tensor, space: gym.Space[Any], mask: Tensor | None, noise: Tensor | None
 ) -> Tensor:
-    """``skills.outputs.decoded`` on tensors: what a network returned, (1, …), as an action."""
-    shape, dtype = (1, *(space.shape or ())), torch.from_numpy(np.empty(0, space.dtype)).dtype
+    """Convert a network's output (1, …) to an action, as ``skills.outputs.decoded`` does."""
+    shape = (1, *(space.shape or ()))
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if isinstance(space, Box):
         low, high = (torch.from_numpy(x) for x in (space.low, space.high))
         return output.reshape(shape).to(dtype).clamp(low, high)
@@ -67,12 +68,14 @@ def _decoded(
 
 
 def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
-    """A user's module; inputs and outputs as of ``agent_graph``.
+    """Return the graph of a user's module; inputs and outputs as in ``agent_graph``.
 
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    space, choices, noise = policy.observation_space, _choices(policy), _noise(policy, sampled)
+    space = policy.observation_space
+    choices = _choices(policy)
+    noise = _noise(policy, sampled)
     given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
@@ -82,22 +85,22 @@ def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
 
 
 def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
-    """An ONNX file; inputs and outputs as of ``agent_graph``.
+    """Return the graph around an ONNX file; inputs and outputs as in ``agent_graph``.
 
-    The file's own nodes stay as they are. Around them stands what turns an observation into its
-    input, and its output into an action, as ``skills.outputs.decoded`` does.
+    The file's own nodes stay as they are. Nodes before them convert an observation to the input;
+    nodes after them convert the output to an action, as ``skills.outputs.decoded`` does.
     """
     import onnx
     from onnx import helper
 
     model = onnx.compose.add_prefix(onnx.load_from_string(policy.data), "own.")
     weights = {w.name for w in model.graph.initializer}
-    own = next(i for i in model.graph.input if i.name not in weights)
+    source = next(i for i in model.graph.input if i.name not in weights)
     output = next(o for o in model.graph.output if o.name == f"own.{policy.output}")
     choices, noise = _choices(policy), _noise(policy, sampled)
     obs, space, dtype = policy.observation_space, policy.action_space, _onnx_type
     nodes = _Nodes(model.graph)
-    seen = helper.make_node("Cast", ["obs"], [own.name], to=own.type.tensor_type.elem_type)
+    seen = helper.make_node("Cast", ["obs"], [source.name], to=source.type.tensor_type.elem_type)
     real = output.type.tensor_type.elem_type in _REAL
     action = nodes.action(output.name, space, real, bool(choices), bool(noise))
     given = [("obs", dtype(obs_dtype(obs)), [1, *obs.shape])]
@@ -110,9 +113,9 @@ def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
         [helper.make_tensor_value_info(action, dtype(space.dtype), [1, *(space.shape or ())])],
         model.graph.initializer,
     )
-    made = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
-    made.ir_version = model.ir_version
-    return Graph(made.SerializeToString(deterministic=True), choices, noise=noise)
+    whole = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
+    whole.ir_version = model.ir_version
+    return Graph(whole.SerializeToString(deterministic=True), choices, noise=noise)
 
 
 _REAL = (1, 10, 11, 16)  # ONNX's numbers of float32, float16, float64 and bfloat16
@@ -131,7 +134,7 @@ class _Nodes:
         self.graph, self.added = graph, list[Any]()
 
     def then(self, kind: str, *given: str | Array, out: str = "", **attributes: Any) -> str:
-        """One operation on the results of others, and on constants; the name of its result."""
+        """Add one operation on results of others and constants; return the name of its result."""
         from onnx import helper, numpy_helper
 
         out = out or f"then.{len(self.added)}"
@@ -146,8 +149,9 @@ class _Nodes:
         return out
 
     def action(self, x: str, space: Any, real: bool, masked: bool, noisy: bool) -> str:
-        """The name of the action that an output ``x`` means."""
-        shape, dtype = np.array([1, *(space.shape or ())]), _onnx_type(space.dtype)
+        """Add the conversion of an output ``x`` to an action; return the action's name."""
+        shape = np.array([1, *(space.shape or ())])
+        dtype = _onnx_type(space.dtype)
         if isinstance(space, Box):
             x = self.then("Reshape", self.then("Cast", x, to=dtype), shape)
             x = self.then("Max", x, space.low[None])
@@ -159,7 +163,7 @@ class _Nodes:
         return self.then("Cast", self.then("Reshape", x, shape), to=dtype, out="action")
 
     def chosen(self, x: str, space: Any, masked: bool) -> str:
-        """The best choices by logits ``x``, (1, K)."""
+        """Add the choice of the best by logits ``x``; return the name of the choices (1, K)."""
         if isinstance(space, MultiBinary):
             return self.then("Greater", x, np.zeros(1, np.float32))
         if masked:
@@ -174,18 +178,18 @@ class _Nodes:
 
 
 def _start(space: Any) -> Array:
-    """The first choice of each part, in the shape of an action."""
+    """Return the first choice of each part, in the shape of an action."""
     return np.asarray(space.start, np.int64)
 
 
 def _choices(policy: Any) -> int:
-    """The width of the mask; 0: there is none."""
+    """Return the width of the mask; 0: there is none."""
     space = policy.action_space
     return 0 if isinstance(space, Box | MultiBinary) else action_codec(space).size
 
 
 def _noise(policy: Any, sampled: bool) -> tuple[tuple[str, int], ...]:
-    """What logits are sampled with."""
+    """Return the noise inputs that logits are sampled with."""
     space = policy.action_space
     if not sampled or isinstance(space, Box):
         return ()

@@ -1,6 +1,6 @@
 """Networks as ONNX graphs: one observation of the environment in, one of its actions out.
 
-The graph is traced from the very code that acts here, so it cannot say something else. Scaling of
+The graph is traced from the code that acts here, so both act alike. Scaling of
 observations, action masks, memories and the environment's units of actions are in it.
 """
 
@@ -40,13 +40,13 @@ class Leaf:
     dtype: np.dtype[Any]
 
     def example(self) -> Tensor:
-        """One observation."""
+        """Return one observation of zeros."""
         return torch.from_numpy(np.zeros((1, *self.shape), self.dtype))
 
 
 @dataclass(frozen=True)
 class Graph:
-    """A file's content, and what the runner must know of it beside."""
+    """An ONNX file's content, and its inputs for the runner."""
 
     content: bytes
     choices: int = 0
@@ -58,7 +58,7 @@ class Graph:
 
 
 def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:
-    """The inputs that observations of a space are, in the order of ``ObsCodec.leaves``."""
+    """Return the inputs that observations of a space are, in the order of ``ObsCodec.leaves``."""
     inner = parts(space)
     if inner is None:
         return [Leaf(name, obs_shape(space), obs_dtype(space))]
@@ -68,18 +68,18 @@ def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:
 class _Acting(nn.Module):
     """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
 
-    def __init__(self, policy: AgentPolicy, leaves: int, told: Graph) -> None:
+    def __init__(self, policy: AgentPolicy, leaves: int, inputs: Graph) -> None:
         super().__init__()
-        self.policy, self.leaves, self.told = policy, leaves, told
+        self.policy, self.leaves, self.inputs = policy, leaves, inputs
 
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-        """The action in the environment's units; and the memory after it, if there is one."""
+        """Return the action in the environment's units, and the new memory if there is one."""
         algorithm, left = self.policy.algorithm, list(given)
         obs: Any = [left.pop(0)[None] for _ in range(self.leaves)]
-        mask = left.pop(0)[None] if self.told.choices else None
-        memory = left.pop(0)[None] if self.told.memory else None
+        mask = left.pop(0)[None] if self.inputs.choices else None
+        memory = left.pop(0)[None] if self.inputs.memory else None
         noise: Any = left[0][None] if left else None
-        if self.told.noise and self.told.noise[0][0] == "random":
+        if self.inputs.noise and self.inputs.noise[0][0] == "random":
             noise = (noise, left[1] if len(left) > 1 else None)
         action, _, after = algorithm.act(self.policy.params, obs, mask, noise, memory)
         done = in_env_units(algorithm, action[0])
@@ -87,14 +87,14 @@ class _Acting(nn.Module):
 
 
 class _Worth(nn.Module):
-    """What a network's actions are chosen from, on one observation."""
+    """The output from which a network's actions are chosen, on one observation."""
 
     def __init__(self, policy: AgentPolicy) -> None:
         super().__init__()
         self.policy = policy
 
     def forward(self, *obs: Tensor) -> Tensor:
-        """(1, A)."""
+        """Return the values (1, A)."""
         rows: Any = [x[None] for x in obs]
         _, head, _ = self.policy.algorithm.act(self.policy.params, rows, None, None)
         assert head is not None
@@ -102,43 +102,47 @@ class _Worth(nn.Module):
 
 
 def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
-    """A trained agent.
+    """Return the graph of a trained agent.
 
     Inputs ``obs…``, ``mask``, ``memory``, ``noise.…``; outputs ``action``, ``memory.after``.
 
     Args:
-        sampled: it draws its actions, from noise that it is given; else it is greedy.
+        sampled: the graph draws actions from its noise inputs; else it is greedy.
 
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    algorithm, leaves = policy.algorithm, leaves_of(policy.observation_space)
+    algorithm = policy.algorithm
+    leaves = leaves_of(policy.observation_space)
     choices = algorithm.codec.size if algorithm.codec.discrete else 0
     noise = _noise_of(algorithm) if sampled else ()
-    told = Graph(b"", choices, algorithm.memory_size, noise)
+    graph = Graph(b"", choices, algorithm.memory_size, noise)
     given = {leaf.name: leaf.example() for leaf in leaves}
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
     outputs = ["action"]
-    if told.memory:
-        given["memory"] = torch.zeros(1, told.memory, **FLOAT)
+    if graph.memory:
+        given["memory"] = torch.zeros(1, graph.memory, **FLOAT)
         outputs.append("memory.after")
     given |= {f"noise.{i}": torch.full((1, n), 0.5, **FLOAT) for i, (_, n) in enumerate(noise)}
-    module = _Acting(policy, len(leaves), told)
-    return replace(told, content=traced(module, given, outputs, where))
+    module = _Acting(policy, len(leaves), graph)
+    return replace(graph, content=traced(module, given, outputs, where))
 
 
 def worth_graph(critic: AgentPolicy, where: str) -> Graph:
-    """A skill critic: inputs ``obs…``, output ``worth`` (1, S), or (1, S + 1) where it knows
-    what deciding anew is worth."""
+    """Return the graph of a skill critic: inputs ``obs…``, output ``worth``.
+
+    ``worth`` is (1, S), or (1, S + 1) where the critic also has the value of a new decision.
+    """
     given = {leaf.name: leaf.example() for leaf in leaves_of(critic.observation_space)}
     return Graph(traced(_Worth(critic), given, ["worth"], where))
 
 
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
-    """``Algorithm.to_env`` on tensors: an action (1, …) in policy units to the environment's."""
+    """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``."""
     codec, space = algorithm.codec, algorithm.action_space
-    shape, dtype = (1, *(space.shape or ())), torch.from_numpy(np.empty(0, space.dtype)).dtype
+    shape = (1, *(space.shape or ()))
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if getattr(getattr(algorithm, "head", None), "squash", False):
         action = action.tanh()
     if codec.discrete:
@@ -159,12 +163,12 @@ def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
 
 
 def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
-    """The noise that an algorithm's ``act`` takes, for one observation."""
-    found = algorithm.noise([torch.Generator()], 1, 1)[0]
-    if isinstance(found, Tensor):
+    """Return the noise that an algorithm's ``act`` takes, for one observation."""
+    noise = algorithm.noise([torch.Generator()], 1, 1)[0]
+    if isinstance(noise, Tensor):
         kind = "gumbel" if algorithm.codec.discrete else "standard_normal"
-        return ((kind, found.numel()),)
-    uniform, normal = found  # DQN's: of ε, and of the weights
+        return ((kind, noise.numel()),)
+    uniform, normal = noise  # DQN's: of ε, and of the weights
     more = () if normal is None else (("standard_normal", normal.numel()),)
     return (("random", uniform.numel()), *more)
 
@@ -172,7 +176,7 @@ def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
 def traced(
     module: nn.Module, given: dict[str, Tensor], outputs: Sequence[str], where: str
 ) -> bytes:
-    """A module as an ONNX file's content.
+    """Trace a module and return the content of its ONNX file.
 
     Raises:
         PolicyError: an operation of it has no counterpart; the message begins with ``where``.
@@ -186,9 +190,15 @@ def traced(
     try:
         with _quiet(), torch.no_grad():
             program = torch.onnx.export(
-                module, tuple(given.values()), None, dynamo=True, verbose=False,
-                opset_version=OPSET, input_names=list(given), output_names=list(outputs),
-            )  # fmt: skip
+                module,
+                tuple(given.values()),
+                None,
+                dynamo=True,
+                verbose=False,
+                opset_version=OPSET,
+                input_names=list(given),
+                output_names=list(outputs),
+            )
     except Exception as error:  # torch's own errors have no common class
         raise PolicyError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
     assert program is not None
@@ -211,7 +221,7 @@ def _strip(graph: Any) -> None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Torch's exporter speaks of packages that nothing here needs, and prints whole graphs."""
+    """Silence torch's exporter, which reports unneeded packages and prints whole graphs."""
     logger = logging.getLogger("torch")
     level = logger.level
     logger.setLevel(logging.CRITICAL)

@@ -1,10 +1,10 @@
-"""Acts by a policy that Skillweave exported; needs NumPy and onnxruntime, and nothing else.
+"""Act by a policy that Skillweave exported; needs NumPy and onnxruntime, and nothing else.
 
     runner = Runner("lander-onnx", code={"engines off.condition": landed})
     runner.reset()                     # at the start of every episode
     action = runner.act(observation)   # at every step
 
-What was Python code is given by name; it sees one observation as a batch of one.
+Python code is given by name; it receives one observation as a batch of one.
 """
 
 import json
@@ -17,72 +17,75 @@ from typing import Any
 import numpy as np
 import onnxruntime as ort
 
-RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = range(5)  # why a call is over
+RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = range(5)  # how a call has ended
 
 
 class Runner:
-    """The policy of one environment; ``code`` has the functions that ``policy.json`` asks for."""
+    """The policy of one environment; ``code`` has the functions that ``policy.json`` lists."""
 
     def __init__(self, path: Any, code: Any = None, seed: Any = None):
-        self.path, self.code, self.rng = Path(path), code or {}, np.random.default_rng(seed)
-        self.told = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
-        if needs := {k: v for k, v in self.told["code"].items() if k not in self.code}:
+        self.path = Path(path)
+        self.code = code or {}
+        self.rng = np.random.default_rng(seed)
+        self.entry = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
+        if needs := {k: v for k, v in self.entry["code"].items() if k not in self.code}:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
-        self.dtype, self.root = np.dtype(self.told["dtype"]), self.made(self.told["policy"])
+        self.dtype, self.root = np.dtype(self.entry["dtype"]), self.made(self.entry["policy"])
         self.reset()
 
     def reset(self) -> None:
-        """A new episode begins."""
+        """Start a new episode."""
         self.before, self.elapsed = dict[str, Any](), 0
         self.root.reset()
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
-        """The action for an observation and what came with it; ``mask`` says which are allowed."""
-        self.obs, self.feeds = np.zeros((1, *self.told["shape"]), self.dtype), {}
-        for name, fields, keys in self.told["inputs"]:
+        """Return the action for an observation; ``mask`` marks the actions that are allowed."""
+        self.obs = np.zeros((1, *self.entry["shape"]), self.dtype)
+        self.feeds = {}
+        for name, fields, keys in self.entry["inputs"]:
             self.feeds[name] = reduce(getitem, fields, self.obs)
             self.feeds[name][0] = reduce(getitem, keys, obs)
         if self.before:
             self.elapsed += 1
-            told = {k: np.array([v]) for k, v in (info or {}).items()}
-            self.latest = self.before | {"next_obs": self.obs, "info": told}
+            rows = {k: np.array([v]) for k, v in (info or {}).items()}
+            self.latest = self.before | {"next_obs": self.obs, "info": rows}
             self.latest["reward"] = np.array([reward], np.float32)
             self.root.observe(self.elapsed, False)
         if mask is None:
             mask = (info or {}).get("action_mask")
-        if mask is None and self.told["observed_mask"]:
+        if mask is None and self.entry["observed_mask"]:
             mask = np.ravel(obs["action_mask"])
         action = self.root.act(None if mask is None else np.array(mask, bool)[None])
         self.before = {"obs": self.obs, "action": np.array([action])}
         return action
 
     def step(self, elapsed: int, timed_out: bool) -> Any:
-        """The latest step, as seen by who has acted for ``elapsed`` steps: arrays of one row."""
+        """Return the latest step, in arrays of one row, for a part that began ``elapsed`` ago."""
         rows = {"elapsed": elapsed, "timed_out": timed_out, "terminated": False, "truncated": False}
         return SimpleNamespace(**self.latest, **{k: np.array([v]) for k, v in rows.items()})
 
-    def made(self, told: Any) -> Any:
-        """The part of the policy that an entry of ``policy.json`` describes."""
+    def made(self, entry: Any) -> Any:
+        """Return the part of the policy that an entry of ``policy.json`` describes."""
         kinds = (_Code, _Network, _Hierarchy, _Function, _Automaton)
-        return next(k for k in kinds if k.__name__[1:] == told["kind"])(self, told)
+        return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
     def asks(self, name: str, about: Any) -> bool:
-        """What code says of an observation or a step."""
+        """Return the result of code on an observation or a step."""
         return bool(np.asarray(self.code[name](about))[0])
 
     def action(self, value: Any) -> Any:
-        """An action that code gave, within its space."""
-        space = self.told["action"]
+        """Return an action that code gave, within its space."""
+        space = self.entry["action"]
         if space["low"] is not None:
             value = np.clip(value, space["low"], space["high"])
         return np.asarray(value, space["dtype"]).reshape(space["shape"])[()]
 
 
 class _Code:  # a skill that is a function of observations; and what all parts have
-    why = RUNNING  # nothing that it called is over
+    why = RUNNING  # no call of it has ended
 
-    def __init__(self, runner: Runner, told: Any) -> None:
-        self.runner, self.told = runner, told
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        self.runner, self.entry = runner, entry
 
     def reset(self) -> None: ...
     def observe(self, elapsed: int, timed_out: bool) -> None: ...
@@ -94,38 +97,40 @@ class _Code:  # a skill that is a function of observations; and what all parts h
         return mask[0]
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        return self.runner.action(self.runner.code[self.told["code"]](self.runner.obs)[0])
+        return self.runner.action(self.runner.code[self.entry["code"]](self.runner.obs)[0])
 
 
-class _Network(_Code):  # a graph from what is seen, perhaps a mask, a memory and noise
-    def __init__(self, runner: Runner, told: Any) -> None:
-        super().__init__(runner, told)
-        options, where = ort.SessionOptions(), {"providers": ["CPUExecutionProvider"]}
+class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory and noise
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        super().__init__(runner, entry)
+        options = ort.SessionOptions()
+        where = {"providers": ["CPUExecutionProvider"]}
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self.session = ort.InferenceSession(str(runner.path / told["file"]), options, **where)
+        self.session = ort.InferenceSession(str(runner.path / entry["file"]), options, **where)
         self.reset()
 
     def reset(self) -> None:
-        self.memory = {k: np.zeros((1, n), "f4") for k, n in self.told["memory"].items()}
+        self.memory = {k: np.zeros((1, n), "f4") for k, n in self.entry["memory"].items()}
 
     def act(self, mask: Any, last: Any = None) -> Any:
         feeds = self.runner.feeds | self.memory
-        if self.told["choices"]:
-            feeds["mask"] = np.ones((1, self.told["choices"]), bool) if mask is None else mask
-        for i, (kind, n) in enumerate(self.told["noise"]):
+        if self.entry["choices"]:
+            feeds["mask"] = np.ones((1, self.entry["choices"]), bool) if mask is None else mask
+        for i, (kind, n) in enumerate(self.entry["noise"]):
             feeds[f"noise.{i}"] = getattr(self.runner.rng, kind)(size=(1, n)).astype(np.float32)
         action, *after = self.session.run(None, feeds)
         self.memory = dict(zip(self.memory, after, strict=True))
         return action[0]
 
 
-class _Hierarchy(_Code):  # a selector and its skills; it decides where a call is over
-    def __init__(self, runner: Runner, told: Any) -> None:
-        super().__init__(runner, told)
-        self.selector, self.skills = runner.made(told["selector"]), told["skills"]
-        self.guide = runner.made(told["guide"] or {"kind": "Code"})  # or nothing: all is allowed
+class _Hierarchy(_Code):  # a selector and its skills; it decides where a call ends
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        super().__init__(runner, entry)
+        self.selector = runner.made(entry["selector"])
+        self.skills = entry["skills"]
+        self.guide = runner.made(entry["guide"] or {"kind": "Code"})  # or nothing: all is allowed
         self.policies = [runner.made(skill["policy"]) for skill in self.skills]
-        self.critic = told["critic"] and runner.made(told["critic"])
+        self.critic = entry["critic"] and runner.made(entry["critic"])
 
     def reset(self) -> None:
         self.skill, self.why, self.succeeded = -1, EPISODE, False
@@ -133,12 +138,14 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call i
         self.guide.reset()
 
     def may_start(self) -> Any:
-        asks, obs, code = self.runner.asks, self.runner.obs, [s["initiation"] for s in self.skills]
+        asks = self.runner.asks
+        obs = self.runner.obs
+        code = [s["initiation"] for s in self.skills]
         may = [name is None or asks(name, obs) for name in code]
         return may & np.array([policy.may_start().any() for policy in self.policies])
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        lengths, runner = self.told["lengths"] or [np.inf], self.runner
+        lengths, runner = self.entry["lengths"] or [np.inf], self.runner
         if self.why != RUNNING:
             may = self.guide.allowed(self.may_start()[None], self).repeat(len(lengths))
             if not may.any():
@@ -149,26 +156,30 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call i
             self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
             self.skill, self.elapsed, self.why = skill, 0, RUNNING
         action = self.policies[self.skill].act(mask)
-        for condition, code, fixed in self.told["reflexes"]:
+        for condition, code, fixed in self.entry["reflexes"]:
             if runner.asks(condition, runner.obs):
                 action = runner.action(fixed if code is None else runner.code[code](runner.obs)[0])
         return action
 
     def observe(self, elapsed: int, timed_out: bool) -> None:
-        runner, told, self.elapsed = self.runner, self.skills[self.skill], self.elapsed + 1
-        own = self.elapsed, self.elapsed >= (told["max_steps"] or np.inf)
-        (below := self.policies[self.skill]).observe(*own)
+        runner = self.runner
+        entry = self.skills[self.skill]
+        self.elapsed = self.elapsed + 1
+        when = self.elapsed, self.elapsed >= (entry["max_steps"] or np.inf)
+        (below := self.policies[self.skill]).observe(*when)
         stuck = below.why != RUNNING and not below.may_start().any()
         self.why = LIMIT if stuck or self.elapsed >= self.limit else RUNNING
-        if told["termination"] and runner.asks(told["termination"], runner.step(*own)):
+        if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
-            worth, may, margin = self.critic.act(None), self.may_start(), self.told["margin"]
+            worth = self.critic.act(None)
+            may = self.may_start()
+            margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]
             self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
-        judge, self.succeeded = told["success"], self.why == OWN
+        judge, self.succeeded = entry["success"], self.why == OWN
         if judge and self.why != RUNNING:
-            self.succeeded = runner.asks(judge, runner.step(*own))
+            self.succeeded = runner.asks(judge, runner.step(*when))
         self.selector.watch(self, elapsed, timed_out)
         self.guide.watch(self, elapsed, timed_out)
 
@@ -176,9 +187,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call i
 class _Function(_Code):  # a selector: observations, perhaps how the last call ended, to a skill
     def act(self, mask: Any, last: Any = None) -> Any:
         ended = {k: np.array([getattr(last, k)]) for k in ("skill", "why", "succeeded")}
-        more = [SimpleNamespace(**ended)] * self.told["asks_last"]
-        chosen = np.asarray(self.runner.code[self.told["code"]](self.runner.obs, *more))[0]
-        return self.told["names"].index(chosen) if isinstance(chosen, str) else chosen
+        more = [SimpleNamespace(**ended)] * self.entry["asks_last"]
+        chosen = np.asarray(self.runner.code[self.entry["code"]](self.runner.obs, *more))[0]
+        return self.entry["names"].index(chosen) if isinstance(chosen, str) else chosen
 
     def allowed(self, mask: Any, last: Any) -> Any:
         return mask[0] & (np.arange(mask.shape[1]) == self.act(mask, last))
@@ -186,18 +197,18 @@ class _Function(_Code):  # a selector: observations, perhaps how the last call e
 
 class _Automaton(_Code):  # a selector: skills of each state, best first; transitions by events
     def reset(self) -> None:
-        self.state = self.told["start"]
+        self.state = self.entry["start"]
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        return next(skill for skill in self.told["skills"][self.state] if mask[0, skill])
+        return next(skill for skill in self.entry["skills"][self.state] if mask[0, skill])
 
     def allowed(self, mask: Any, last: Any) -> Any:
-        return mask[0] & np.isin(np.arange(mask.shape[1]), self.told["skills"][self.state])
+        return mask[0] & np.isin(np.arange(mask.shape[1]), self.entry["skills"][self.state])
 
     def watch(self, last: Any, *when: Any) -> None:
         asks, step = self.runner.asks, self.runner.step
         ended = {"success": last.succeeded, "failure": not last.succeeded}
-        for origin, target, event, code in self.told["transitions"]:
+        for origin, target, event, code in self.entry["transitions"]:
             over = last.why != RUNNING and ended.get(event)
             if self.state == origin and (asks(code, step(*when)) if code else over):
                 self.state = target

@@ -1,4 +1,4 @@
-"""A policy as data: its networks as files, and its state machine as JSON for the runner."""
+"""A policy as data, apart from its folder: networks as files, and a state machine as JSON."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from skillweave.types import Policy
 
 
 class States:
-    """What is gathered while a policy is described: files, and the code that it needs.
+    """The description of a policy: its files, and the code that it needs.
 
     Args:
-        space: of the environment's actions.
+        space: the environment's space of actions.
     """
 
     def __init__(self, space: gym.Space[Any]) -> None:
         self.space = space
         self.files: dict[str, bytes] = {}
         self.code: dict[str, str] = {}
-        """By name, what the runner must be given, and what it is."""
+        """By name, a description of each function that the runner needs."""
         self.functions: dict[str, Any] = {}
 
     def policy(self, policy: Policy, name: str = "", sampled: bool = False) -> dict[str, Any]:
-        """A policy, and all below it, as JSON.
+        """Return a policy, and all below it, as JSON.
 
         Args:
-            name: where it stands: ``landing``, of a skill in a nested hierarchy ``outer/landing``;
+            name: its path: ``landing``, or ``outer/landing`` for a skill in a nested hierarchy;
                 the whole policy has none.
             sampled: it samples; else it is greedy.
 
         Raises:
-            PolicyError: it cannot be exported; the message says why, and what to do.
+            PolicyError: it cannot be exported; the message has the reason, and what to do.
         """
         where = f"the policy of {name!r}" if name else "the policy"
         match policy:
@@ -64,8 +64,8 @@ class States:
                 acts = policy
         if policy.start(1):
             raise PolicyError(
-                f"{where} is a {type(policy).__name__}, which has a memory that nothing here can "
-                "write as ONNX: train the skill, or give it an ONNX file"
+                f"{where} is a {type(policy).__name__}, whose memory cannot be written as "
+                "ONNX: train the skill, or give it an ONNX file"
             )
         what = "observations (1, ...) to actions (1, ...)"
         return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
@@ -73,16 +73,14 @@ class States:
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
         guide: Any = None if policy.guide is None else policy.guide.selector
-        told_ends = any(
+        judged = any(
             isinstance(x, Automaton) or getattr(x, "asks_last", False) for x in (selector, guide)
         )
-        told: dict[str, Any] = {
+        entry: dict[str, Any] = {
             "kind": "Hierarchy",
             "selector": self._selector(selector, f"{prefix}selector", sampled),
             "guide": None if guide is None else self._selector(guide, f"{prefix}guide", False),
-            "skills": [
-                self._skill(skills, i, prefix, told_ends) for i in range(len(skills.skills))
-            ],
+            "skills": [self._skill(skills, i, prefix, judged) for i in range(len(skills.skills))],
             "lengths": list(skills.lengths),
             "reflexes": [self._reflex(reflex, prefix) for reflex in skills.reflexes],
             "critic": None,
@@ -92,8 +90,8 @@ class States:
             if not isinstance(cuts.critic, AgentPolicy):
                 raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
             graph = worth_graph(cuts.critic, "the skill critic")
-            told |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
-        return told
+            entry |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
+        return entry
 
     def _skill(self, skills: SkillSet, i: int, prefix: str, judged: bool) -> dict[str, Any]:
         skill, name = skills.skills[i], prefix + skills.skills[i].name
@@ -114,7 +112,9 @@ class States:
         }
 
     def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
-        name, code, fixed = f"{prefix}{reflex.name}", None, None
+        name = f"{prefix}{reflex.name}"
+        code = None
+        fixed = None
         what = "observations (1, ...) to (1,) bool"
         condition = self._asks(f"{name}.condition", reflex.condition, what)
         if callable(reflex.action):
@@ -157,7 +157,7 @@ class States:
                 return self._network(agent_graph(selector, sampled, name), name)
         raise PolicyError(
             f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
-            "does not know: select by an Automaton, by a function, or train the selector"
+            "cannot run: select by an Automaton, by a function, or train the selector"
         )
 
     def _automaton(self, selector: Automaton, name: str) -> dict[str, Any]:
@@ -171,11 +171,14 @@ class States:
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
         start = selector.state_names.index(selector.start_state)
         return {
-            "kind": "Automaton", "start": start, "skills": order, "transitions": transitions,
-        }  # fmt: skip
+            "kind": "Automaton",
+            "start": start,
+            "skills": order,
+            "transitions": transitions,
+        }
 
     def _asks(self, name: str, function: Any, what: str) -> str:
-        """The name under which the runner is given a function; of two functions, a number too."""
+        """Return the runner's name of a function; a second function of a name gets a number."""
         names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
         free = next(n for n in names if self.functions.get(n, function) == function)
         self.functions[free] = function

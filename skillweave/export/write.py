@@ -21,44 +21,44 @@ from skillweave.terminal import printable
 from skillweave.types import Policy
 
 FORMAT = 1
-"""Of ``policy.json``."""
+"""Version of ``policy.json``."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """What was written."""
+    """An export: its folder, its files, and the code that its runner needs."""
 
     path: Path  # the folder
     files: tuple[str, ...]  # their names in it
     code: dict[str, str]
-    """Python code that the runner must be given, by name, and what it is."""
+    """By name, a description of each function that the runner needs."""
     functions: dict[str, Callable[..., Any]]
-    """The same code itself, for a runner in this process: ``Runner(path, code=functions)``."""
+    """These functions, for a runner in this process: ``Runner(path, code=functions)``."""
 
     def __str__(self) -> str:
-        said = f"{self.path}: {len(self.files)} files"
+        summary = f"{self.path}: {len(self.files)} files"
         if not self.code:
-            return printable(said)
+            return printable(summary)
         needs = "\n".join(f"  {name!r}: {what}" for name, what in self.code.items())
         runner = f"Runner({str(self.path)!r}, code={{name: function}})"
-        return printable(f"{said}\n{runner} needs\n{needs}")
+        return printable(f"{summary}\n{runner} needs\n{needs}")
 
 
 def write_export(path: Path, policy: Policy, env: str) -> Export:
-    """Write a policy for machines without this library; what has the same names is replaced.
+    """Write a policy for machines without this library; files of the same names are replaced.
 
     Args:
         path: the folder.
-        env: the environment's name, for who reads ``policy.json``.
+        env: the environment's name, for readers of ``policy.json``.
 
     Raises:
-        PolicyError: a part of it cannot be exported; the message says which, and what to do.
+        PolicyError: a part of it cannot be exported; the message names it, and what to do.
         MissingExtra: the packages that write ONNX are not installed.
     """
     states = States(policy.action_space)
-    found = states.policy(policy)
+    entry = states.policy(policy)
     space = policy.observation_space
-    told = {
+    content = {
         "format": FORMAT,
         "env": env,
         "code": states.code,
@@ -67,18 +67,18 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
         "inputs": _inputs(space),
         "action": _action_to_json(policy.action_space),
         "observed_mask": observes_mask(space, policy.action_space),
-        "policy": found,
+        "policy": entry,
     }
-    text = json.dumps(told, indent=1, allow_nan=False)
+    text = json.dumps(content, indent=1, allow_nan=False)
     runner = Path(__file__).with_name("runner.py").read_bytes()
     files = states.files | {"policy.json": text.encode(), "runner.py": runner}
-    for name, content in files.items():
-        write_bytes(path / name, content)
+    for name, data in files.items():
+        write_bytes(path / name, data)
     return Export(path, tuple(files), states.code, states.functions)
 
 
 def _inputs(space: gym.Space[Any]) -> list[list[Any]]:
-    """Of each leaf its name, its fields in the packed array, and its keys in an observation."""
+    """Return for each leaf its name, its fields in the packed array, and its keys."""
 
     def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
         inner = parts(space)
@@ -86,18 +86,18 @@ def _inputs(space: gym.Space[Any]) -> list[list[Any]]:
             return [[".".join(["obs", *fields]), fields, keys]]
         places = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
         return [
-            found
+            leaf
             for (name, part), key in zip(inner.items(), places, strict=True)
-            for found in within(part, [*fields, name], [*keys, key])
+            for leaf in within(part, [*fields, name], [*keys, key])
         ]
 
-    found = within(space, [], [])
-    assert [name for name, _, _ in found] == [leaf.name for leaf in leaves_of(space)]
-    return found
+    leaves = within(space, [], [])
+    assert [name for name, _, _ in leaves] == [leaf.name for leaf in leaves_of(space)]
+    return leaves
 
 
 def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
-    """What ``numpy.dtype`` makes the same of again."""
+    """Return a dtype as JSON that ``numpy.dtype`` reads."""
     if dtype.subdtype is not None:
         base, shape = dtype.subdtype
         return f"({','.join(map(str, shape))},){base.str}"
@@ -114,8 +114,8 @@ def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
 
 
 def _action_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
+    entry: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
     if not isinstance(space, gym.spaces.Box):
-        return found | {"low": None, "high": None}
+        return entry | {"low": None, "high": None}
     bounds = {"low": space.low, "high": space.high}  # infinities are no JSON
-    return found | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}
+    return entry | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}

@@ -1,4 +1,4 @@
-"""The robot's arm of the recipe ``pick-and-place``: its task, and what goes wrong."""
+"""The robot's arm of ``pick-and-place``, apart from its skills: its task and disturbances."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ CAMERA = {
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What goes wrong in an episode, each once, in a step that is drawn at its beginning."""
+    """Disturbances of an episode: each happens once, in a step that is drawn at its start."""
 
     nudge: int = 10
-    """The block is pushed in one of the first so many steps in which nobody holds it; 0: never."""
+    """The block is pushed in one of the first n steps in which it is free; 0: never."""
     slip: int = 10
-    """The fingers open for a while in one of the first so many steps in which they hold it."""
+    """The fingers open for a while in one of the first n steps in which they hold it."""
     move: int = 25
-    """The goal moves to another place in one of the first so many steps."""
+    """The goal moves to another place in one of the first n steps."""
 
 
 CALM = Disturbances(0, 0, 0)
@@ -45,7 +45,7 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: Gymnasium-Robotics' environment.
-        disturbances: what goes wrong.
+        disturbances: the events that disturb it.
     """
 
     slip_steps = 5
@@ -62,7 +62,7 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
         self.holds = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin anew."""
+        """Start a new episode."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.there = self.slipping = 0
         windows = asdict(self.disturbances)
@@ -73,7 +73,7 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
         return _flat(obs), info
 
     def step(self, action: Any) -> Any:
-        """1 where the block has been at the goal for five steps, which ends the episode; else 0."""
+        """Pay 1 and end the episode where the block has been at the goal for five steps."""
         self._disturb()
         if self.slipping:
             self.slipping -= 1
@@ -97,7 +97,7 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
             world.goal = world._sample_goal()
 
     def _happens(self, what: str) -> bool:
-        """Whether it is to happen in this step; a step nearer to it otherwise."""
+        """Count down to a disturbance; return whether it happens in this step."""
         if what not in self.due:
             return False
         self.due[what] -= 1
@@ -108,20 +108,20 @@ class Place(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def is_held(obs: Array) -> Array:
-    """The block is between the fingers, and these are closed; (..., 25 or 28) to (...) bool."""
+    """Return whether closed fingers hold the block; (..., 25 or 28) to (...) bool."""
     closed = obs[..., 9:11].sum(axis=-1) < 0.053
     held: Array = closed & (np.abs(obs[..., 6:9]).max(axis=-1) < 0.03)
     return held
 
 
 def block_place(world: Any) -> Array:
-    """Where the block is, (3,)."""
+    """Return the place of the block, (3,)."""
     place: Array = world._utils.get_site_xpos(world.model, world.data, "object0")
     return place
 
 
 def nudge_block(world: Any, place: Array, rng: np.random.Generator, speed: float) -> None:
-    """Push the block somewhere; back to the middle where it lies at the edge of what is reached."""
+    """Push the block somewhere; back to the middle where it lies at the edge of the arm's reach."""
     angle = rng.uniform(-np.pi, np.pi)
     way = np.array([np.cos(angle), np.sin(angle)])
     inwards = world.initial_gripper_xpos[:2] - place[:2]
@@ -138,7 +138,7 @@ def _flat(obs: dict[str, Array]) -> Array:
 
 
 def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The arm, with or without disturbances.
+    """Return the arm, with or without disturbances.
 
     Raises:
         MissingExtra: gymnasium-robotics is missing.
@@ -160,7 +160,7 @@ def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> g
 
 
 def spec(disturbances: Disturbances = CALM) -> EnvSpec:
-    """The task, for ``Hierarchy(env=...)``."""
+    """Return the task, for ``Hierarchy(env=...)``."""
 
     def arm(render_mode: str | None = None) -> gym.Env[Any, Any]:
         return make(disturbances, render_mode)

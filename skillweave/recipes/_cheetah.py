@@ -1,4 +1,4 @@
-"""The half-cheetah of the recipe ``shuttle``: its task, alone and in EnvPool."""
+"""The half-cheetah of ``shuttle``, apart from its skills: its task, alone and in EnvPool."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ import numpy as np
 from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, PoolWrapper, envpool
 
 ROUND = 1000.0
-"""What a finished round pays."""
+"""Reward of a finished round."""
 LEGS = 3
 """The most points that a patrol has."""
 WITH_X: Any = {"exclude_current_positions_from_observation": False}
-X, SPEED, LEG = 0, 9, slice(18, 21)
+X = 0
+SPEED = 9
+LEG = slice(18, 21)
 
 
 class Route:
-    """The points of a patrol, in their order, over and over; what is seen of them, what they pay.
+    """The points of a patrol, in their order, again and again: observations and rewards.
 
     A point is visited when it is passed, in the direction in which it lies from the point before.
 
@@ -40,43 +42,45 @@ class Route:
             )
 
     def walk(self, leg: Array, x: Array, cost: Array) -> tuple[Array, Array]:
-        """The legs (k,) after steps that have led to ``x``, and what they pay: the automaton's
-        reward, 1000 where a round is finished, else what the action costs."""
+        """Return the legs (k,) after steps to ``x``, and their rewards.
+
+        A finished round pays 1000; any other step pays the cost of its action.
+        """
         passed = self.ways[leg] * (x - self.points[leg]) > 0
         after = np.where(passed, (leg + 1) % len(self.points), leg)
         return after, np.where(passed & (after == 0), ROUND, cost)
 
     def see(self, obs: Array, leg: Array) -> Array:
-        """Observations (k, O) whose first number is x, with the legs (k,).
+        """Return observations (k, O) whose first number is x, with the legs (k,).
 
-        x is seen from the point that is run to, on a logarithmic scale.
+        x is relative to the next point, on a logarithmic scale.
         """
-        found = np.zeros((len(obs), obs.shape[1] + LEGS), np.float32)
-        found[:, : obs.shape[1]] = obs
-        found[:, X] = to_log(obs[:, X] - self.points[leg])
-        found[np.arange(len(obs)), obs.shape[1] + leg] = 1.0
-        return found
+        observed = np.zeros((len(obs), obs.shape[1] + LEGS), np.float32)
+        observed[:, : obs.shape[1]] = obs
+        observed[:, X] = to_log(obs[:, X] - self.points[leg])
+        observed[np.arange(len(obs)), obs.shape[1] + leg] = 1.0
+        return observed
 
     @staticmethod
     def space(before: Any) -> gym.spaces.Box:
-        """Of what is seen."""
+        """Return the space of the observations."""
         return gym.spaces.Box(-np.inf, np.inf, (before.shape[0] + LEGS,), np.float32)
 
 
 def to_log(metres: Array) -> Array:
-    """``metres`` x from a point on a logarithmic scale: sign(x)·log(1 + |x|).
+    """Return ``metres`` x from a point on a logarithmic scale: sign(x)·log(1 + |x|).
 
-    In metres, x varies by about 10 (its standard deviation) while skills are drawn by lot. Once
-    observations are normalised, it then hardly changes in the last two metres before the point.
+    In metres, x varies by about 10 (its standard deviation) while skills are chosen at random.
+    With normalised observations it then hardly changes in the last two metres before the point.
     """
-    found: Array = np.sign(metres) * np.log1p(np.abs(metres))
-    return found
+    scaled: Array = np.sign(metres) * np.log1p(np.abs(metres))
+    return scaled
 
 
 def from_log(seen: Array) -> Array:
-    """The inverse of ``to_log``, in metres."""
-    found: Array = np.sign(seen) * np.expm1(np.abs(seen))
-    return found
+    """Return the inverse of ``to_log``, in metres."""
+    metres: Array = np.sign(seen) * np.expm1(np.abs(seen))
+    return metres
 
 
 class Patrol(gym.Wrapper[Any, Any, Any, Any]):
@@ -98,13 +102,13 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
         return found and replace(found, reward_threshold=None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin with the first point."""
+        """Start with the first point."""
         obs, info = self.env.reset(seed=seed, options=options)
         self.leg[:] = 0
         return self.route.see(obs[None], self.leg)[0], info
 
     def step(self, action: Any) -> Any:
-        """As the route pays."""
+        """Take a step; the route pays."""
         obs, _, terminated, truncated, info = self.env.step(action)
         x, cost = np.array([info["x_position"]]), np.array([info["reward_ctrl"]])
         self.leg, reward = self.route.walk(self.leg, x, cost)
@@ -116,21 +120,22 @@ class Patrols(PoolWrapper):
     """A pool of half-cheetahs on a route, as ``Patrol`` has one."""
 
     def __init__(self, pool: Any, num_envs: int, points: tuple[float, ...]) -> None:
-        self.route, self.leg = Route(points), np.zeros(num_envs, np.int64)
+        self.route = Route(points)
+        self.leg = np.zeros(num_envs, np.int64)
         super().__init__(pool, self.route.space(pool.observation_space))
         self.action_space = gym.spaces.Box(-1.0, 1.0, pool.action_space.shape, np.float32)
 
     def see(self, obs: Any, ids: Array) -> Array:
-        """With the legs."""
+        """Return the observations with the legs."""
         return self.route.see(obs, self.leg[ids])
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """Begin with the first point."""
+        """Start with the first point."""
         self.leg[ids] = 0
         return super().reset(ids)
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """As the route pays."""
+        """Take a step; the route pays."""
         obs, _, terminated, truncated, info = self.pool.step(action, ids)
         legs = self.route.walk(self.leg[ids], info["x_position"], info["reward_ctrl"])
         self.leg[ids], reward = legs
@@ -140,7 +145,7 @@ class Patrols(PoolWrapper):
 def make(
     points: tuple[float, ...] = (2.0, -2.0), render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
-    """The half-cheetah with this patrol.
+    """Return the half-cheetah with this patrol.
 
     Raises:
         MissingExtra: mujoco is missing.
@@ -163,24 +168,24 @@ def make(
 
 
 def camera(points: tuple[float, ...]) -> dict[str, Any]:
-    """Where it stands: all points are in the picture, and some metres beyond."""
+    """Return a camera whose picture has all points, and some metres beyond."""
     near, far = min(points), max(points)
     middle = np.array([(near + far) / 2.0, 0.0, 0.3])
     return {"distance": 1.5 + (far - near) / 2.0, "lookat": middle, "elevation": -8.0}
 
 
 def many(num_envs: int, threads: int, seed: int, points: tuple[float, ...]) -> Patrols:
-    """The same in EnvPool, several times as fast; bit for bit the same dynamics."""
+    """Make the patrols in EnvPool: several times as fast, with the same dynamics bit for bit."""
     cheetahs = envpool("HalfCheetah-v5", num_envs, threads, seed, **WITH_X)
     return Patrols(cheetahs, num_envs, points)
 
 
 def spec(points: tuple[float, ...] = (2.0, -2.0)) -> EnvSpec:
-    """The half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
+    """Return the half-cheetah with a patrol of these points, for ``Hierarchy(env=...)``."""
 
     def cheetah(render_mode: str | None = None) -> gym.Env[Any, Any]:
         return make(points, render_mode)
 
-    # The name says how x is seen, so that runs with another scale are not taken for these.
+    # The name has the scale of x, so that runs with another scale are not taken for these.
     cheetah.__name__ = f"Shuttle({', '.join(f'{p:g}' for p in points)}; log x)"
     return EnvSpec(cheetah, pool=partial(many, points=points))

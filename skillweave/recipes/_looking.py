@@ -1,4 +1,4 @@
-"""A policy by hand that goes about in MiniGrid's rooms until there is something to see."""
+"""A scripted policy, apart from learnt skills: it explores rooms until it sees a task."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from skillweave.recipes._rooms import ACTIONS, FORWARD, LEFT, RIGHT, SPACE, ahea
 
 Memory = dict[str, Array]
 TURNS = 4
-"""It sees all four sides and goes on as it came; with one turn less it would walk in squares."""
+"""It sees all four sides and keeps its direction; with one turn less it would walk in squares."""
 PACES = 5
-"""After so many it looks around again."""
+"""Steps after which it looks around again."""
 ENTERING = 3
-"""After so many it looks around for the first time: from a doorway it would not see much."""
+"""Steps before it first looks around: from a doorway it would not see much."""
 
 
 class LookAround:
     """Go straight on for some cells, look to all four sides, go on, and look again.
 
-    It remembers how often it has turned, and how far it has gone since: an agent that
-    sees only what is in front of it cannot know whether it has looked behind itself.
+    Its memory counts turns, and steps since the last one: an observation shows only the cells in
+    front of the agent.
     """
 
     observation_space, action_space = SPACE, ACTIONS
     labels: tuple[str, ...] = ()
 
     def start(self, n: int) -> Memory:
-        """It goes some cells before it looks."""
+        """Start a memory: it goes some cells before it looks."""
         return {"turns": np.full(n, TURNS), "paces": np.full(n, PACES - ENTERING)}
 
     def act(
@@ -56,5 +56,5 @@ class LookAround:
         return memory
 
     def acting(self, memory: Memory) -> Any:
-        """It has no skills."""
+        """Return no skill: it has none."""
         return None

@@ -1,4 +1,4 @@
-"""The mazes of the recipe ``mazes``: PointMaze, alone and in EnvPool, seen as six numbers."""
+"""The mazes of the recipe ``mazes``, apart from its skills: PointMaze, alone and in EnvPool."""
 
 from __future__ import annotations
 
@@ -19,20 +19,25 @@ MAZES = {
     "umaze": "PointMaze_UMaze-v3",
 }
 """Mazes by name, and what Gymnasium-Robotics and EnvPool call them."""
-PLACE, SPEED, GOAL = slice(0, 2), slice(2, 4), slice(4, 6)
-"""Where these stand in an observation: metres east and north, metres a second, metres."""
+PLACE = slice(0, 2)
+SPEED = slice(2, 4)
+GOAL = slice(4, 6)
+"""Places in an observation: metres east and north, metres a second, metres."""
 REACH, BALL = 0.45, 0.1
 """Metres from the goal at which it is reached; the ball's radius."""
 PIXELS = 32
 """Of a metre in a picture."""
-WALL, FLOOR, GREEN, ORANGE = (60, 66, 80), (235, 235, 230), (120, 190, 130), (230, 110, 40)
+WALL = (60, 66, 80)
+FLOOR = (235, 235, 230)
+GREEN = (120, 190, 130)
+ORANGE = (230, 110, 40)
 SPACE = gym.spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ENDS: Any = {"continuing_task": False}
-"""The episode ends at the goal; else PointMaze goes on until its time is up."""
+"""The episode ends at the goal; else PointMaze continues until its time is up."""
 
 
 def flat(obs: Any) -> Array:
-    """Place, speed and goal, (..., 6) float32, of what PointMaze tells."""
+    """Place, speed and goal, (..., 6) float32, of PointMaze's observation."""
     return np.concatenate([obs["observation"], obs["desired_goal"]], axis=-1, dtype=np.float32)
 
 
@@ -47,7 +52,8 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any], render_mode: str | None = None) -> None:
         super().__init__(env)
         self.observation_space = SPACE
-        self._render_mode, self._seen = render_mode, np.zeros(SPACE.shape, np.float32)
+        self._render_mode = render_mode
+        self._seen = np.zeros(SPACE.shape, np.float32)
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]  # Gymnasium has it so, too
@@ -76,9 +82,9 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
 
 
 def walls_of(env: gym.Env[Any, Any]) -> Array:
-    """Which cells of a maze are walls, rows from the north, (rows, columns) bool."""
-    told: Any = env.unwrapped
-    return np.array([[cell == 1 for cell in row] for row in told.maze.maze_map])
+    """Return the walls of a maze, rows from the north, (rows, columns) bool."""
+    maze_env: Any = env.unwrapped
+    return np.array([[cell == 1 for cell in row] for row in maze_env.maze.maze_map])
 
 
 class MazePool(PoolWrapper):
@@ -94,7 +100,7 @@ class MazePool(PoolWrapper):
 
 
 def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """One ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
+    """Make one ball in a maze; 1 is paid where it reaches its goal, and the episode ends.
 
     Raises:
         MissingExtra: gymnasium-robotics is missing.
@@ -109,12 +115,12 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
 
 
 def many(maze: str, num_envs: int, threads: int, seed: int) -> MazePool:
-    """The same in EnvPool, several times as fast."""
+    """Make the mazes in EnvPool, several times as fast."""
     return MazePool(envpool(MAZES[maze], num_envs, threads, seed, **ENDS))
 
 
 def spec(maze: str = "large") -> EnvSpec:
-    """The maze of this name, for ``Hierarchy(env=...)``.
+    """Return the maze of this name, for ``Hierarchy(env=...)``.
 
     Raises:
         DeclarationError: there is none of this name.
@@ -136,7 +142,7 @@ NEAR = 0.9
 
 
 class ShortestPath:
-    """The selector of one who knows the maze: the skill that leads to the next cell.
+    """A selector with a map of the maze: it calls the skill that leads to the next cell.
 
     Args:
         maze: its name.
@@ -158,7 +164,7 @@ class ShortestPath:
         return int(row), int(column)
 
     def __call__(self, obs: Array) -> Array:
-        """The skill for each observation, (n,) by name."""
+        """Return the skill for each observation, (n,) by name."""
         return np.array([self._skill(one) for one in obs])
 
     def _skill(self, one: Array) -> str:
@@ -169,7 +175,7 @@ class ShortestPath:
 
 
 def ways_to(walls: Array, goal: tuple[int, ...]) -> dict[tuple[int, ...], str]:
-    """By cell, the direction in which the way to ``goal`` is shortest (breadth first)."""
+    """Return by cell the direction of the shortest way to ``goal`` (breadth first)."""
     found: dict[tuple[int, ...], str] = {goal: "approach"}
     queue = deque([goal])
     while queue:

@@ -1,6 +1,6 @@
-"""The lander of the recipe ``lander-missions``: missions of up to three legs, and gusts.
+"""The lander of ``lander-missions``, apart from its skills: up to three legs, and gusts.
 
-What a mission is stands in one place, ``Progress``, for one environment (``Mission``) as for many
+A mission is defined in one place, ``Progress``, for one environment (``Mission``) as for many
 side by side in EnvPool (``MissionPool``).
 """
 
@@ -40,7 +40,7 @@ SIZE = 8 + LEGS * len(KINDS) + 1
 
 
 class Progress:
-    """How far the missions of ``num_envs`` environments are done.
+    """The progress of the missions of ``num_envs`` environments.
 
     Args:
         missions: each names its legs; each episode has one of them.
@@ -68,14 +68,14 @@ class Progress:
         self._time = np.zeros(num_envs, np.int64)
 
     def begin(self, ids: Array, rngs: Sequence[np.random.Generator]) -> None:
-        """Missions begin in environments ``ids`` (k,); ``rngs`` has one generator for each."""
+        """Start missions in environments ``ids`` (k,); ``rngs`` has one generator for each."""
         which = [int(rng.integers(len(self._missions))) for rng in rngs]
         self.left[ids], self.held[ids] = self._missions[which], 0
         self.legs[ids] = (self.left[ids] >= 0).sum(axis=1)
         self._time[ids] = [int(rng.integers(2 * GUST_EVERY)) for rng in rngs]
 
     def blown(self, action: Array, ids: Array) -> Array:
-        """What the engines do, (k,), where ``action`` (k,) is wanted."""
+        """Return the engines' actions (k,) after gusts, for the wanted ``action`` (k,)."""
         if not self._gusts:
             return action
         gust = self._time[ids] % GUST_EVERY < GUST_STEPS
@@ -83,7 +83,7 @@ class Progress:
         return np.where(gust, side, action).astype(action.dtype)
 
     def advance(self, obs: Array, reward: Array, ended: Array, ids: Array) -> Array:
-        """What is paid, (k,): for a leg that this step has done, its share of the mission.
+        """Return the rewards (k,): for a leg that this step has done, its share of the mission.
 
         Args:
             obs: the lander's, after the step (k, 8).
@@ -108,12 +108,12 @@ class Progress:
         return paid
 
     def done(self, ids: Array) -> Array:
-        """The whole mission is, (k,) bool."""
+        """Return whether the whole mission is done, (k,) bool."""
         done: Array = self.left[ids, 0] < 0
         return done
 
     def seen(self, obs: Array, ids: Array) -> Array:
-        """The lander's observations (k, 8), and the mission's after them: (k, 21)."""
+        """Return the lander's observations (k, 8), and the mission's after them: (k, 21)."""
         legs = self.left[ids][:, :, None] == np.arange(len(KINDS))
         parts = (obs, legs.reshape(len(ids), -1), self.held[ids, None] / HOVER_STEPS)
         return np.concatenate(parts, axis=1, dtype=np.float32)
@@ -123,13 +123,14 @@ SPACE = gym.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
 
 
 class Mission(gym.Wrapper[Any, Any, Any, Any]):
-    """One lander with a mission; ``info["success"]`` says whether all of it is done."""
+    """One lander with a mission; ``info["success"]`` is true where all of it is done."""
 
     def __init__(
         self, env: gym.Env[Any, Any], missions: Sequence[Sequence[str]], gusts: bool = False
     ) -> None:
         super().__init__(env)
-        self.progress, self._me = Progress(1, missions, gusts), np.zeros(1, np.int64)
+        self.progress = Progress(1, missions, gusts)
+        self._me = np.zeros(1, np.int64)
         self._rng = np.random.default_rng()
         self.observation_space = SPACE
 
@@ -140,7 +141,7 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
         return found and replace(found, reward_threshold=None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """A new mission."""
+        """Start an episode with a new mission."""
         obs, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = np.random.default_rng(seed)
@@ -148,7 +149,7 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
         return self.progress.seen(obs[None], self._me)[0], info
 
     def step(self, action: Any) -> Any:
-        """Pays a share of 1 for each leg that is done."""
+        """Pay a share of 1 for each leg that is done."""
         action = self.progress.blown(np.asarray([action]), self._me)[0]
         obs, reward, terminated, truncated, info = self.env.step(int(action))
         ended = np.array([terminated or truncated])
@@ -158,7 +159,7 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
         return seen, float(paid[0]), terminated, truncated, info
 
     def render(self) -> Any:
-        """The picture, with the box of the leg that is flown now."""
+        """Return the picture, with the box of the leg that is flown now."""
         frame = self.env.render()
         leg = int(self.progress.left[0, 0])
         if isinstance(frame, np.ndarray) and 0 <= leg < LAND:
@@ -175,7 +176,7 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _pixels(point: Array, half: Array, shape: Sequence[int]) -> tuple[Any, Any]:
-    """Columns and rows that a box spans in LunarLander's picture."""
+    """Return the columns and rows of a box in LunarLander's picture."""
     x = (1.0 + point[0] + half[0] * np.array([-1.0, 1.0])) * shape[1] / 2.0
     # The pad's height is a quarter of the picture, and the legs reach 18 pixels below the middle.
     above = 0.25 * shape[0] + 18.0
@@ -188,8 +189,8 @@ class MissionPool(PoolWrapper):
 
     Args:
         pool: landers.
-        num_envs: how many.
-        seed: of the draws of missions and gusts.
+        num_envs: number of landers.
+        seed: the seed of missions and gusts.
     """
 
     def __init__(
@@ -200,13 +201,13 @@ class MissionPool(PoolWrapper):
         self._rngs = [np.random.default_rng([seed, i]) for i in range(num_envs)]
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """New missions."""
+        """Start new missions."""
         obs, info = self.pool.reset(ids)
         self.progress.begin(ids, [self._rngs[i] for i in ids])
         return self.progress.seen(obs, ids), info
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """As ``Mission.step``, for all."""
+        """Take a step as ``Mission.step`` does, for all landers."""
         action = self.progress.blown(action, ids)
         obs, reward, terminated, truncated, info = self.pool.step(action, ids)
         paid = self.progress.advance(obs, reward, terminated | truncated, ids)
@@ -217,7 +218,7 @@ class MissionPool(PoolWrapper):
 def make(
     missions: Sequence[Sequence[str]], gusts: bool = False, render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
-    """One lander whose episodes have one of these missions."""
+    """Make one lander whose episodes have one of these missions."""
     lander = gym.make(
         LANDER, max_episode_steps=EPISODE, render_mode=render_mode, disable_env_checker=True
     )
@@ -227,16 +228,16 @@ def make(
 def many(
     missions: Sequence[Sequence[str]], gusts: bool, num_envs: int, threads: int, seed: int
 ) -> MissionPool:
-    """The same landers in EnvPool."""
+    """Make these landers in EnvPool."""
     pool = envpool(LANDER, num_envs, threads, seed, max_episode_steps=EPISODE)
     return MissionPool(pool, missions, gusts, num_envs, seed)
 
 
 def spec(name: str, missions: Sequence[Sequence[str]], gusts: bool = False) -> EnvSpec:
-    """The landers with these missions, for ``Hierarchy(env=...)``.
+    """Return the landers with these missions, for ``Hierarchy(env=...)``.
 
     Args:
-        name: what runs are said to be of.
+        name: the task's name in runs.
     """
 
     def lander(render_mode: str | None = None) -> gym.Env[Any, Any]:

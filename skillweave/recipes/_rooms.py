@@ -34,54 +34,55 @@ TARGETS = {
     "key-corridor": "KeyCorridorS3R3",
     "obstructed-maze": "ObstructedMaze-1Dlh",
 }
-"""Tasks by name, and what MiniGrid calls them."""
+"""Tasks by name, with MiniGrid's names."""
 ROOMS = {"small": SMALL} | {name: (room,) for name, room in TARGETS.items()}
 EMPTY, WALL, FLOOR, DOOR, KEY, BALL, BOX, GOAL = 1, 2, 3, 4, 5, 6, 7, 8
-"""What may be in a cell: the first of its three numbers."""
+"""Kinds of a cell: the first of its three numbers."""
 OPEN, CLOSED, LOCKED = 0, 1, 2
 """A door's state: the third."""
 DISTANCE = np.abs(np.arange(7) - 3)[:, None] + np.abs(np.arange(7) - 6)[None]
-"""From where the agent stands to each cell in view, (7, 7)."""
+"""Steps from the agent to each cell in view, (7, 7)."""
 FAR = 14
 """More than to any of them."""
 LEFT, RIGHT, FORWARD, PICK_UP, DROP, TOGGLE = range(6)
 HIGHEST = np.broadcast_to(np.array([10, 5, 2], np.uint8), (7, 7, 3))
-"""Kind, colour and state of a cell are never higher. MiniGrid's own space says 255."""
-SPACE, ACTIONS = gym.spaces.Box(0, HIGHEST, dtype=np.uint8), gym.spaces.Discrete(7)
+"""Kind, colour and state of a cell are never higher. MiniGrid's own space has 255."""
+SPACE = gym.spaces.Box(0, HIGHEST, dtype=np.uint8)
+ACTIONS = gym.spaces.Discrete(7)
 
 
 def ahead(obs: Array) -> Array:
-    """The cell before the agent, (n, 3)."""
+    """Return the cell before the agent, (n, 3)."""
     found: Array = obs[:, 3, 5]
     return found
 
 
 def holds(obs: Array, *kinds: int) -> Array:
-    """One of these is in the agent's hands, (n,) bool; of none: anything."""
+    """Return whether the agent holds one of these kinds, (n,) bool; no kinds: anything."""
     found: Array = _one_of(*(kinds or (KEY, BALL, BOX)))[obs[:, 3, 6, 0]]
     return found
 
 
 def seen(obs: Array, *kinds: int, state: int | None = None) -> Array:
-    """Cells with one of these, but for what is in the agent's hands, (n, 7, 7) bool."""
+    """Return the cells with one of these kinds, without the agent's hands, (n, 7, 7) bool."""
     found: Array = _one_of(*kinds)[obs[..., 0]]
     found[:, 3, 6] = False
     return found if state is None else np.logical_and(found, obs[..., 2] == state)
 
 
 def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
-    """One of these is in view, and not in the agent's hands, (n,) bool."""
+    """Return whether one of these kinds is in view, outside the agent's hands, (n,) bool."""
     return anywhere(seen(obs, *kinds, state=state))
 
 
 def anywhere(cells: Array) -> Array:
-    """One of the cells is marked, of (n, 7, 7) bool, (n,) bool."""
+    """Return whether a cell of (n, 7, 7) bool is marked, (n,) bool."""
     found: Array = np.any(cells, axis=(1, 2))
     return found
 
 
 def steps_to(cells: Array) -> Array:
-    """Steps to the nearest of the cells marked in (n, 7, 7), if nothing were in the way, (n,).
+    """Return the steps (n,) to the nearest marked cell of (n, 7, 7), obstacles ignored.
 
     ``FAR`` where none is marked.
     """
@@ -90,20 +91,20 @@ def steps_to(cells: Array) -> Array:
 
 
 def shut(cells: Array) -> Array:
-    """A door that is closed or locked, for cells (n, 3), (n,) bool."""
+    """Return whether a cell (n, 3) is a closed or locked door, (n,) bool."""
     found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] != OPEN)
     return found
 
 
 def at_open_door(obs: Array) -> Array:
-    """The agent stands before an open door, (n,) bool."""
+    """Return whether the agent stands before an open door, (n,) bool."""
     cells = ahead(obs)
     found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
     return found
 
 
 def free(cells: Array) -> Array:
-    """An agent can go there, for cells (n, 3), (n,) bool."""
+    """Return whether an agent can enter the cells (n, 3), (n,) bool."""
     opened = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
     found: Array = _one_of(EMPTY, FLOOR, GOAL)[cells[:, 0]] | opened
     return found
@@ -111,7 +112,7 @@ def free(cells: Array) -> Array:
 
 @cache
 def _one_of(*kinds: int) -> Array:
-    """Of each number whether it is one of these, (256,) bool: much faster than ``np.isin``."""
+    """Return a table of these kinds, (256,) bool: much faster than ``np.isin``."""
     found = np.zeros(256, bool)
     found[list(kinds)] = True
     found.flags.writeable = False
@@ -119,16 +120,16 @@ def _one_of(*kinds: int) -> Array:
 
 
 def between_walls(obs: Array) -> Array:
-    """There is a wall on its left and on its right, as in a doorway, (n,) bool."""
+    """Return whether walls are on the agent's left and right, as in a doorway, (n,) bool."""
     found: Array = (obs[:, 2, 6, 0] == WALL) & (obs[:, 4, 6, 0] == WALL)
     return found
 
 
 class Rooms(gym.Env[Any, Any]):
-    """One agent that begins each episode in one of several rooms, drawn evenly.
+    """One agent that starts each episode in one of several rooms, drawn evenly.
 
     Args:
-        rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
+        rooms: MiniGrid's names, without ``MiniGrid-`` and ``-v0``.
         render_mode: of MiniGrid.
 
     Raises:
@@ -149,20 +150,20 @@ class Rooms(gym.Env[Any, Any]):
         self.render_mode, self.metadata = render_mode, self._now.metadata
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Draw a room, and begin there."""
+        """Draw a room, and start there."""
         super().reset(seed=seed)
         self._now = self._envs[int(self.np_random.integers(len(self._envs)))]
-        own = int(self.np_random.integers(2**31))
-        obs, info = self._now.reset(seed=own, options=options)
+        room_seed = int(self.np_random.integers(2**31))
+        obs, info = self._now.reset(seed=room_seed, options=options)
         return obs["image"], info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """As MiniGrid does, but it pays 1 where the task is done, however long it took."""
+        """Take MiniGrid's step, but pay 1 where the task is done, independent of its duration."""
         obs, reward, terminated, truncated, info = self._now.step(action)
         return obs["image"], float(float(reward) > 0), terminated, truncated, info
 
     def render(self) -> Any:
-        """The picture of the room."""
+        """Return the picture of the room."""
         return self._now.render()
 
     def close(self) -> None:
@@ -172,10 +173,10 @@ class Rooms(gym.Env[Any, Any]):
 
 
 class RoomPool:
-    """Many agents, in EnvPool's rooms; each begins every episode in one that is drawn evenly.
+    """Many agents, in EnvPool's rooms; each starts every episode in one that is drawn evenly.
 
     Args:
-        rooms: what MiniGrid calls them, without ``MiniGrid-`` and ``-v0``.
+        rooms: MiniGrid's names, without ``MiniGrid-`` and ``-v0``.
     """
 
     observation_space, action_space = SPACE, ACTIONS
@@ -189,7 +190,7 @@ class RoomPool:
         self._room = np.zeros(num_envs, np.int64)
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """Draw rooms, and begin there."""
+        """Draw rooms, and start there."""
         self._room[ids] = [self._rngs[i].integers(len(self._pools)) for i in ids]
         found = np.empty((len(ids), *SPACE.shape), np.uint8)
         for pool, rows in self._by_room(ids):
@@ -206,19 +207,19 @@ class RoomPool:
         for pool, rows in asked:
             pool.send(action[rows], ids[rows])
         for pool, rows in asked:  # all of them step meanwhile, none waits for another
-            obs, *told, _ = pool.recv()
+            obs, *results, _ = pool.recv()
             found[rows] = obs["image"]
-            reward[rows], terminated[rows], truncated[rows] = told
+            reward[rows], terminated[rows], truncated[rows] = results
         return found, (reward > 0).astype(np.float32), terminated, truncated, {}
 
     def _by_room(self, ids: Array) -> list[tuple[Any, Array]]:
-        """Rooms that are in use, and which rows of ``ids`` are there."""
+        """Return the rooms in use, with their rows of ``ids``."""
         room = self._room[ids]
         return [(self._pools[k], np.flatnonzero(room == k)) for k in np.unique(room)]
 
 
 def spec(name: str = "small") -> EnvSpec:
-    """The rooms of this name, for ``Hierarchy(env=...)``.
+    """Return the rooms of this name, for ``Hierarchy(env=...)``.
 
     Raises:
         DeclarationError: there are none of this name.

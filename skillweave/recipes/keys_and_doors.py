@@ -47,12 +47,12 @@ from skillweave.recipes._rooms import (
 
 
 class Errand(Skill):
-    """Do one thing, as fast as it can; subclasses say what, in ``success``."""
+    """Do one thing as fast as possible; subclasses define it in ``success``."""
 
     max_steps = 32
 
     def reward(self, step: Step) -> Array:
-        """1 where it is done; before, 0.04 for each cell that it comes nearer; less 0.02 a step.
+        """Return 1 where it is done; before, 0.04 for each cell nearer; less 0.02 a step.
 
         Nearer to what it aims at: a skill without an aim is paid for its end alone.
         """
@@ -61,19 +61,19 @@ class Errand(Skill):
         return found
 
     def aim(self, obs: Array) -> Array:
-        """The cells that it goes to, (n, 7, 7) bool; the default is none."""
+        """Return the cells of its target, (n, 7, 7) bool; the default is none."""
         return np.zeros(obs.shape[:3], bool)
 
     def initiation(self, obs: Array) -> Array:
-        """What it goes to is in view."""
+        """Return whether its target is in view."""
         return anywhere(self.aim(obs))
 
     def success(self, step: Step) -> Array:
-        """Whether it is done, (N,) bool."""
+        """Return whether it is done, (N,) bool."""
         raise NotImplementedError
 
     def termination(self, step: Step) -> Array:
-        """It is done."""
+        """Return whether it is done."""
         return self.success(step)
 
 
@@ -84,16 +84,16 @@ class Explore(Errand):
     policy = LookAround()
 
     def initiation(self, obs: Array) -> Array:
-        """There is nothing to do; but `drop` or `next_room` may start."""
+        """Return whether there is nothing to do; but `drop` or `next_room` may start."""
         return ~something_to_do(obs)
 
     def success(self, step: Step) -> Array:
-        """There is something to do."""
+        """Return whether there is something to do."""
         return something_to_do(step.next_obs)
 
 
 def something_to_do(obs: Array) -> Array:
-    """A skill may start that does something with what is in view, (n,) bool.
+    """Return whether a skill with a target in view may start, (n,) bool.
 
     Not `next_room`: an agent without memory would go to and fro through the door behind it.
     """
@@ -105,11 +105,11 @@ class GetKey(Errand):
     """Pick up a key."""
 
     def aim(self, obs: Array) -> Array:
-        """Keys, while its hands are free."""
+        """Return keys, while its hands are free."""
         return seen(obs, KEY) & ~holds(obs)[:, None, None]
 
     def success(self, step: Step) -> Array:
-        """It has the key."""
+        """Return whether it has the key."""
         return holds(step.next_obs, KEY)
 
 
@@ -117,11 +117,11 @@ class PickUp(Errand):
     """Pick up a ball or a box."""
 
     def aim(self, obs: Array) -> Array:
-        """Balls and boxes, while its hands are free."""
+        """Return balls and boxes, while its hands are free."""
         return seen(obs, BALL, BOX) & ~holds(obs)[:, None, None]
 
     def success(self, step: Step) -> Array:
-        """It has it."""
+        """Return whether it holds one."""
         return holds(step.next_obs, BALL, BOX)
 
 
@@ -129,11 +129,11 @@ class OpenBox(Errand):
     """Open a box: what is in it lies in its place then."""
 
     def aim(self, obs: Array) -> Array:
-        """Boxes, while its hands are free."""
+        """Return boxes, while its hands are free."""
         return seen(obs, BOX) & ~holds(obs)[:, None, None]
 
     def success(self, step: Step) -> Array:
-        """The box before it is gone."""
+        """Return whether the box before it is gone."""
         before, after = ahead(step.obs)[:, 0], ahead(step.next_obs)[:, 0]
         found: Array = (step.action == TOGGLE) & (before == BOX) & (after != BOX)
         return found
@@ -145,11 +145,11 @@ class Drop(Errand):
     max_steps = 8
 
     def initiation(self, obs: Array) -> Array:
-        """It holds something."""
+        """Return whether it holds something."""
         return holds(obs)
 
     def success(self, step: Step) -> Array:
-        """Its hands are free."""
+        """Return whether its hands are free."""
         found: Array = (step.action == DROP) & ~holds(step.next_obs)
         return found
 
@@ -158,18 +158,18 @@ class OpenDoor(Errand):
     """Open a door that is shut."""
 
     def aim(self, obs: Array) -> Array:
-        """Closed doors, and locked ones while it holds a key."""
+        """Return closed doors, and locked ones while it holds a key."""
         locked = seen(obs, DOOR, state=LOCKED) & holds(obs, KEY)[:, None, None]
         return seen(obs, DOOR, state=CLOSED) | locked
 
     def reward(self, step: Step) -> Array:
-        """It loses 1 where it shuts a door: else it would do so to open it again."""
+        """Take 1 off where it shuts a door: else it would do so to open it again."""
         shuts = at_open_door(step.obs) & shut(ahead(step.next_obs)) & (step.action == TOGGLE)
         found: Array = np.where(shuts, -1.02, super().reward(step))
         return found
 
     def success(self, step: Step) -> Array:
-        """The door before it is open now."""
+        """Return whether the door before it is open now."""
         now_open = shut(ahead(step.obs)) & at_open_door(step.next_obs)
         found: Array = now_open & (step.action == TOGGLE)
         return found
@@ -179,11 +179,11 @@ class NextRoom(Errand):
     """Go through an open door."""
 
     def initiation(self, obs: Array) -> Array:
-        """An open door is in view."""
+        """Return whether an open door is in view."""
         return in_view(obs, DOOR, state=OPEN)
 
     def success(self, step: Step) -> Array:
-        """It leaves a doorway straight on."""
+        """Return whether it leaves a doorway straight on."""
         on = (step.action == FORWARD) & free(ahead(step.obs))
         found: Array = on & between_walls(step.obs) & ~between_walls(step.next_obs)
         return found
@@ -193,22 +193,22 @@ class ReachGoal(Errand):
     """Go to the goal."""
 
     def aim(self, obs: Array) -> Array:
-        """The goal."""
+        """Return the goal."""
         return seen(obs, GOAL)
 
     def success(self, step: Step) -> Array:
-        """It goes there."""
+        """Return whether it enters the goal."""
         found: Array = (step.action == FORWARD) & (ahead(step.obs)[:, 0] == GOAL)
         return found
 
 
 CELLS = Network(hidden=(64,), encoder="cells")  # a cell's numbers are kinds, not brightnesses
 WORKER = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=128,
     n_steps=32,
     batch_size=256,
-    update_epochs=8,  # most rows are others', who lead to where the skill may start
+    update_epochs=8,  # most rows are of other skills, on the way to a start
     learning_rate=1e-3,
     gamma=0.98,
     gae_lambda=0.95,
@@ -216,7 +216,7 @@ WORKER = PPO(
     network=CELLS,
 )
 SELECTOR = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=256,
     batch_size=64,  # a rollout has few decisions
@@ -251,7 +251,7 @@ APART = Apart(
 
 
 def declare(rooms: str = "small", **how: Any) -> Hierarchy:
-    """The hierarchy in these rooms; ``how`` changes any of its settings."""
+    """Return the hierarchy in these rooms; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": None,
         "learn": "apart",
@@ -267,7 +267,7 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
 
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """The hierarchy in these rooms with skills that are there already, by name."""
+    """Return the hierarchy in these rooms with skills that are there already, by name."""
     found = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
     for skill in found.skills:
         skill.policy = skills[skill.name]
@@ -276,7 +276,7 @@ def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
 
 
 def going_on(rooms: str, **how: Any) -> Hierarchy:
-    """The hierarchy in these rooms, where skills and selector go on learning, together.
+    """Return the hierarchy in these rooms, where skills and selector continue to learn, together.
 
     To be trained from the run in the small rooms: ``train(..., start_from=run)``.
     """

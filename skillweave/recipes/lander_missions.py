@@ -1,8 +1,8 @@
-"""Lander missions: visit points, hover, land, in the order that a mission says.
+"""Lander missions: visit points, hover, land, in a mission's order.
 
 LunarLander-v3 with a mission of up to three legs: visit a box on the left, one on the right, hover
 in a box for two seconds, land on the pad. A leg pays its share of 1 when it is done, and nothing
-else pays. Four skills are learnt once, each by a reward of its own that knows nothing of missions;
+else pays. Four skills are learnt once, each by a reward of its own that is independent of missions;
 a selector learns for each mission when to call which.
 
 Observations: LunarLander's (0 to 7); what is still to be done, leg by leg, each one-hot of left,
@@ -35,7 +35,13 @@ from skillweave import (
 )
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
 
-X, Y, VX, VY, ANGLE, SPIN, LEGS = 0, 1, 2, 3, 4, 5, slice(6, 8)
+X = 0
+Y = 1
+VX = 2
+VY = 3
+ANGLE = 4
+SPIN = 5
+LEGS = slice(6, 8)
 TO_DO = slice(8, 20)
 """The legs that are still to be done, in their order, each one-hot."""
 MISSIONS: dict[str, tuple[tuple[str, ...], ...]] = {
@@ -53,15 +59,15 @@ OTHERS = (
     ("hover", "right", "land"),
 )
 MISSIONS["any"] = (*(m for found in MISSIONS.values() for m in found), *OTHERS)
-"""Each episode has another mission: what skills are learnt on."""
+"""Missions for skills' training: each episode has another one."""
 
 
 CRASH = -20.0
-"""What the end of an episode is worth to a flight."""
+"""Reward of the end of an episode in a flight."""
 
 
 def rested(step: Step) -> Array:
-    """It has come to rest, (N,) bool: LunarLander's physics then sets its speed to 0."""
+    """Return whether it has come to rest, (N,) bool: LunarLander's physics sets its speed to 0."""
     still: Array = (step.next_obs[:, [VX, VY]] == 0.0).all(axis=1)
     return step.terminated & still
 
@@ -71,42 +77,42 @@ class Flight(Skill):
 
     max_steps = 300
     prize = 300.0
-    """For being at the point, where a call ends there. Going on for ever is worth up to 200, as a
-    step pays up to 1 and γ is 0.995: with a smaller prize a skill puts its end off."""
+    """Reward for the point, where a call ends there. Flight forever is worth up to 200, as a step
+    pays up to 1 and γ is 0.995: with a smaller prize a skill delays its end."""
     point: Array
     half: Array
     """Half the width and height of the box around the point: the leg's own, as a call that ended
-    outside it would be called again, and end again, for ever."""
+    outside it would be called again, and end again, forever."""
 
     def wanted(self, obs: Array) -> Array:
-        """Speeds, (n, 2): towards the point, the slower the nearer."""
+        """Return speeds, (n, 2): towards the point, the slower the nearer."""
         way = (self.point - obs[:, [X, Y]]) * (2.5, 1.0)
         speed: Array = np.clip(way, (-1.0, -0.5), (1.0, 0.5))
         return speed
 
     def deviation(self, obs: Array) -> Array:
-        """How far it is from that speed, from upright and from not turning, (n,)."""
+        """Return the deviation from that speed, from upright and from not turning, (n,)."""
         speed: Array = np.hypot(*(obs[:, [VX, VY]] - self.wanted(obs)).T)
         return speed + np.abs(obs[:, ANGLE]) + 0.3 * np.abs(obs[:, SPIN])
 
     def reward(self, step: Step) -> Array:
-        """1 less the deviation; the prize; −20 for the end of an episode."""
+        """Return 1 less the deviation; the prize; −20 for the end of an episode."""
         reward = 1.0 - self.deviation(step.next_obs) + self.prize * self.success(step)
         return np.where(step.terminated, CRASH, reward)
 
     def there(self, obs: Array) -> Array:
-        """It is in the box around the point, slow and upright, (n,) bool."""
+        """Return whether it is in the box around the point, slow and upright, (n,) bool."""
         moving = np.hypot(obs[:, VX], obs[:, VY]) + np.abs(obs[:, ANGLE])
         there: Array = self.in_box(obs) & (moving < 0.5)
         return there
 
     def in_box(self, obs: Array) -> Array:
-        """It is in the box around the point, (n,) bool."""
+        """Return whether it is in the box around the point, (n,) bool."""
         inside: Array = (np.abs(obs[:, [X, Y]] - self.point) <= self.half).all(axis=1)
         return inside
 
     def success(self, step: Step) -> Array:
-        """It is there, and flies."""
+        """Return whether it is there, and flies."""
         flies: Array = self.there(step.next_obs) & ~step.terminated
         return flies
 
@@ -116,13 +122,13 @@ class Hover(Flight):
 
     call_steps = 200
     """It flies there, and stays for two seconds. With calls of 50 steps a leg took several, one
-    after the other, which a selector hardly ever drew by lot."""
+    after the other, which a selector hardly ever chose at random."""
     prize = 0.0
     point, half = POINTS[KINDS.index("hover")], HALF[KINDS.index("hover")]
 
     def reward(self, step: Step) -> Array:
-        """1 less the deviation, and 1 for each step in the box; −20 for the end of an episode."""
-        # The leg asks for a place. Where only its speed was paid, a skill stayed just beside it.
+        """Return 1 less the deviation, 1 for a step in the box, −20 for an episode's end."""
+        # The leg requires a place. Where only its speed was paid, a skill stayed just beside it.
         in_box = self.in_box(step.next_obs) & ~step.terminated
         found: Array = super().reward(step) + in_box
         return found
@@ -134,11 +140,11 @@ class GoLeft(Flight):
     point, half = POINTS[KINDS.index("left")], HALF[KINDS.index("left")]
 
     def initiation(self, obs: Array) -> Array:
-        """Where it is not there yet. There a call would end at once, and could be made again."""
+        """Return whether it is elsewhere: at the point a call would end at once."""
         return ~self.there(obs)
 
     def termination(self, step: Step) -> Array:
-        """It is there."""
+        """Return whether it is there."""
         return self.success(step)
 
 
@@ -153,34 +159,38 @@ class Land(Skill):
 
     max_steps = 400
     fuel = np.array([0.0, 0.03, 0.3, 0.03])
-    """What a step of each engine costs: none, left, main, right."""
+    """Cost of a step of each engine: none, left, main, right."""
 
     def worth(self, obs: Array) -> Array:
-        """How good it is to be there, (n,), as LunarLander's own reward has it: near the middle of
-        the pad, slow, upright, legs on the ground."""
+        """Return the worth of a state, (n,), by LunarLander's own reward.
+
+        It is best near the middle of the pad, slow, upright, legs on the ground.
+        """
         distance, speed = np.hypot(obs[:, X], obs[:, Y]), np.hypot(obs[:, VX], obs[:, VY])
         legs = (obs[:, LEGS] > 0).sum(axis=1)
         found: Array = -100.0 * (distance + speed + np.abs(obs[:, ANGLE])) + 10.0 * legs
         return found
 
     def reward(self, step: Step) -> Array:
-        """By how much it is better there now, less the fuel; 100 for rest on the pad, −100 for
-        any other end of the episode."""
+        """Return the gain in worth, less the fuel.
+
+        Rest on the pad pays 100, any other end of the episode −100.
+        """
         better = self.worth(step.next_obs) - self.worth(step.obs) - self.fuel[step.action]
         return np.where(step.terminated, np.where(self.success(step), 100.0, -100.0), better)
 
     def success(self, step: Step) -> Array:
-        """It has come to rest on the pad."""
+        """Return whether it has come to rest on the pad."""
         on_pad: Array = rested(step) & (np.abs(step.next_obs[:, X]) <= PAD)
         return on_pad
 
 
 PILOT = PPO(network=Network(sees=tuple(range(8))))
-"""Who learns a skill. It does not see the mission: it would learn to fly well on the missions that
-it meets often, and badly on the others."""
+"""The learner of a skill. It does not see the mission: it would learn to fly well on the missions
+that it meets often, and badly on the others."""
 RELU = Network(activation="relu")  # tanh costs more than all the rest of so small a network
 SELECTOR = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     n_steps=128,
     batch_size=32,  # a rollout has few decisions
     update_epochs=10,
@@ -197,7 +207,7 @@ SKILLS = (Hover, GoLeft, GoRight, Land)
 
 
 def environment(mission: str = "any", gusts: bool = False) -> Any:
-    """The landers with a mission, by its name.
+    """Return the landers with a mission, by its name.
 
     Raises:
         DeclarationError: there is none of this name.
@@ -208,7 +218,7 @@ def environment(mission: str = "any", gusts: bool = False) -> Any:
 
 
 def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
-    """The hierarchy on a mission; ``how`` changes any of its settings."""
+    """Return the hierarchy on a mission; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": None,
         "learn": "apart",
@@ -228,7 +238,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
 def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
-    """The hierarchy on a mission with skills that are there already, by name."""
+    """Return the hierarchy on a mission with skills that are there already, by name."""
     found = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
     for skill in found.skills:
         skill.policy = skills[skill.name]
@@ -237,9 +247,9 @@ def with_skills(
 
 
 def by_leg(obs: Array) -> Array:
-    """The skill of the leg that is flown now, (N,) by name: the selector as one would write it.
+    """Return the skill of the current leg, (N,) by name: a selector written by hand.
 
-    Where that skill may not start, as the lander is there already, it is that of the next leg; and
+    Where that skill may not start, as the lander is there already, it is the next leg's skill; and
     where all is done, the lander hovers.
     """
     n, skills = len(obs), [GoLeft(), GoRight(), Hover(), Land()]

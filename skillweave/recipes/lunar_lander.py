@@ -33,7 +33,7 @@ X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
 
 
 def movement(step: Step, *columns: int) -> Array:
-    """``Σ (10·Δ)²`` over the columns; 0 on the first step, which has nothing before it."""
+    """Return ``Σ (10·Δ)²`` over the columns; 0 on the first step, which has no step before it."""
     moved = step.next_obs[:, columns] - step.obs[:, columns]
     return np.where(step.elapsed > 1, np.square(10.0 * moved).sum(axis=1), 0.0)
 
@@ -44,7 +44,7 @@ class Stabilize(Skill):
     max_steps = 300
 
     def reward(self, step: Step) -> Array:
-        """1 less the movement in x, y and angle; −100 for an episode's end."""
+        """Return 1 less the movement in x, y and angle; −100 for an episode's end."""
         reward = 1.0 - movement(step, X, Y, ANGLE)
         return np.where(step.terminated | step.truncated, -100.0, reward)
 
@@ -55,7 +55,7 @@ class Center(Skill):
     max_steps = 300
 
     def reward(self, step: Step) -> Array:
-        """1 less (2x)² and the movement in y and angle; −1000 for an episode's end."""
+        """Return 1 less (2x)² and the movement in y and angle; −1000 for an episode's end."""
         reward = 1.0 - np.square(2.0 * step.next_obs[:, X]) - movement(step, Y, ANGLE)
         return np.where(step.terminated | step.truncated, -1000.0, reward)
 
@@ -68,14 +68,14 @@ class Landing(Skill):
     max_steps = 300
 
     def reward(self, step: Step) -> Array:
-        """1 less x², y² and the angle; at an episode's end the environment's own reward."""
+        """Return 1 less x², y² and the angle; at an episode's end the environment's own reward."""
         obs = step.next_obs
         reward = 1.0 - np.square(obs[:, X]) - np.square(obs[:, Y]) - np.abs(obs[:, ANGLE])
         return np.where(step.terminated | step.truncated, step.reward, reward)
 
 
 def landed(obs: Array) -> Array:
-    """A leg touches the ground."""
+    """Return whether a leg touches the ground."""
     touching: Array = (obs[:, LEFT_LEG] > 0) | (obs[:, RIGHT_LEG] > 0)
     return touching
 
@@ -91,7 +91,7 @@ HOLDING = PPO(
     network=RELU,
 )
 # A landing is worth more than hovering forever (+100 once against +1 a step) only where γ is well
-# below 0.99, and only to an agent that has found out how to touch the ground without crashing:
+# below 0.99, and only to an agent that can already touch the ground without crashing:
 # hence more exploration at first, and most of the steps that skills have to themselves.
 LANDING = PPO(
     learning_rate=3e-3,

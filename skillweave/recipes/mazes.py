@@ -50,7 +50,7 @@ class North(Skill):
     max_steps = 100
 
     def reward(self, step: Step) -> Array:
-        """Metres a second this way, less those across."""
+        """Return metres a second this way, less those across."""
         speed = step.next_obs[:, SPEED]
         along = speed @ self.way
         across = np.abs(speed @ self.way[::-1])
@@ -58,7 +58,7 @@ class North(Skill):
         return found
 
     def termination(self, step: Step) -> Array:
-        """It does not get on: slow, and no faster than before."""
+        """Return whether it is stuck: slow, and no faster than before."""
         before, after = step.obs[:, SPEED] @ self.way, step.next_obs[:, SPEED] @ self.way
         blocked: Array = (after < SLOW) & (after - before < GAIN)
         return blocked & (step.elapsed >= TRY)
@@ -83,7 +83,7 @@ class West(North):
 
 
 def distance(obs: Array) -> Array:
-    """Metres to the goal as a bird flies, (n,)."""
+    """Return metres to the goal as a bird flies, (n,)."""
     found: Array = np.hypot(*(obs[:, GOAL] - obs[:, PLACE]).T)
     return found
 
@@ -93,19 +93,22 @@ class Approach(Skill):
 
     near = 2.0
     max_steps = 50
-    steps = 100_000  # most of them look for where it may start
+    steps = 100_000  # most of them lead to a place where it may start
 
     def initiation(self, obs: Array) -> Array:
-        """Near the goal, as the bird flies: from anywhere it would be the easy way to every goal
-        that no wall hides, and selectors were found to learn no other."""
+        """Return whether the goal is near, as the bird flies.
+
+        From anywhere it would be the easy way to every goal that no wall hides, and selectors
+        learnt no other skill.
+        """
         return distance(obs) < self.near
 
     def reward(self, step: Step) -> Array:
-        """Metres by which the goal is nearer now, a hundredfold: metres a second."""
+        """Return metres by which the goal is nearer now, a hundredfold: metres a second."""
         return 100.0 * (distance(step.obs) - distance(step.next_obs)) + 100.0 * self.success(step)
 
     def success(self, step: Step) -> Array:
-        """It is there."""
+        """Return whether it is there."""
         return step.terminated
 
 
@@ -118,10 +121,10 @@ class Motion:
         self.shapes: dict[str, tuple[int, ...]] = {}
 
     def init_(self, views: Any, generators: Any) -> None:
-        """There is nothing to fill."""
+        """Fill no weights: it has none."""
 
     def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
-        """(P, B, 6) to (P, B, 4)."""
+        """Map (P, B, 6) to (P, B, 4)."""
         import torch
 
         seen = inputs["vector"]
@@ -143,19 +146,20 @@ class Map:
         self.size = 2 * (2 * self.east + 1) * (2 * self.north + 1) + Motion.size
 
     def init_(self, views: Any, generators: Any) -> None:
-        """There is nothing to fill."""
+        """Fill no weights: it has none."""
 
     def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
-        """(P, B, 6) to (P, B, size)."""
+        """Map (P, B, 6) to (P, B, size)."""
         import torch
 
         seen = inputs["vector"]
-        speed, way = seen[..., SPEED], seen[..., GOAL] - seen[..., PLACE]
+        speed = seen[..., SPEED]
+        way = seen[..., GOAL] - seen[..., PLACE]
         points = self._points(torch.stack([seen[..., PLACE], seen[..., GOAL]], -2))
         return torch.cat([points, 0.2 * speed, 0.2 * way], -1)
 
     def _points(self, places: Any) -> Any:
-        """Two places (P, B, 2, 2) to what the points say of them, one after the other."""
+        """Map two places (P, B, 2, 2) to their features on the grid, one after the other."""
         import torch
 
         east, north = (
@@ -170,7 +174,7 @@ register_encoder("map of a maze", Map)
 
 MAP = Network(hidden=(128, 128), activation="relu", encoder="map of a maze")
 BALL = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=32,
     batch_size=128,
@@ -182,7 +186,7 @@ BALL = PPO(
     network=Network(hidden=(32, 32), activation="relu", encoder="motion in a maze"),
 )
 SELECTOR = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=32,
     n_steps=256,
     batch_size=128,
@@ -205,7 +209,7 @@ SKILLS = (North, East, South, West, Approach)
 
 
 def declare(maze: str = "large", **how: Any) -> Hierarchy:
-    """The hierarchy on a maze; ``how`` changes any of its settings."""
+    """Return the hierarchy on a maze; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": 25,
         "algorithm": BALL,
@@ -219,7 +223,7 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
 
 
 def with_skills(maze: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """The hierarchy on a maze with skills that are there already, by name."""
+    """Return the hierarchy on a maze with skills that are there already, by name."""
     settings = {"selector": FURTHER_SELECTOR, "apart": Apart(selector_steps=200_000)} | how
     found = declare(maze, **settings)
     for skill in found.skills:

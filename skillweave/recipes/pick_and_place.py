@@ -6,7 +6,7 @@ line each; a fifth, ``recover``, is learnt. A selector learns when to use which;
 
 An episode pays 1 and ends when the block has been within 5 cm of the goal for five steps, so a mean
 return is the share of episodes that succeed. It lasts 50 steps at most, as Gymnasium-Robotics', or
-100 where there are disturbances: the gripper slips, somebody nudges the block, the goal moves.
+100 where there are disturbances: the gripper slips, the block is nudged, the goal moves.
 
 Observations: the gripper's place (0 to 2), the block's (3 to 5), the block as seen from the gripper
 (6 to 8), the fingers (9, 10), angles and velocities (11 to 24), the goal (25 to 27); in metres.
@@ -30,23 +30,25 @@ from skillweave import PPO, Apart, Array, Guide, Hierarchy, Network, Skill, Step
 from skillweave.recipes._arm import CALM, Disturbances, spec
 from skillweave.recipes._arm import is_held as is_grasped
 
-GRIPPER, BLOCK, OFFSET = slice(0, 3), slice(3, 6), slice(6, 9)
+GRIPPER = slice(0, 3)
+BLOCK = slice(3, 6)
+OFFSET = slice(6, 9)
 FINGERS, GOAL = slice(9, 11), slice(25, 28)
 
 
 def towards(way: Array, fingers: float) -> Array:
-    """The action (n, 4) that moves the gripper this way, (n, 3) metres; fingers: 1 opens them."""
+    """Return the action (n, 4) that moves the gripper by ``way`` (n, 3) metres; 1 opens fingers."""
     speed = np.clip(10.0 * way, -1.0, 1.0)
     return np.column_stack([speed, np.full(len(way), fingers)]).astype(np.float32)
 
 
 def above(obs: Array) -> Array:
-    """To a place above the block, with open fingers."""
+    """Go to a place above the block, with open fingers."""
     return towards(obs[:, OFFSET] + (0.0, 0.0, 0.1), 1.0)
 
 
 def descend(obs: Array) -> Array:
-    """Down around the block, with open fingers."""
+    """Go down around the block, with open fingers."""
     return towards(obs[:, OFFSET], 1.0)
 
 
@@ -56,24 +58,24 @@ def close(obs: Array) -> Array:
 
 
 def carry(obs: Array) -> Array:
-    """To the goal, with closed fingers."""
+    """Go to the goal, with closed fingers."""
     return towards(obs[:, GOAL] - obs[:, BLOCK], -1.0)
 
 
 def is_above(obs: Array) -> Array:
-    """The gripper is straight above the block, or around it, (N,) bool."""
+    """Return whether the gripper is straight above the block, or around it, (N,) bool."""
     aligned: Array = np.abs(obs[:, OFFSET][:, :2]).max(axis=1) < 0.015
     return aligned
 
 
 def is_around(obs: Array) -> Array:
-    """The block is between the fingers, (N,) bool."""
+    """Return whether the block is between the fingers, (N,) bool."""
     around: Array = is_above(obs) & (np.abs(obs[:, OFFSET][:, 2]) < 0.012)
     return around
 
 
 def rule(obs: Array) -> Array:
-    """What an engineer would write: which skill, (N,) by name."""
+    """Return the skills (N,) by name, by an engineer's rule."""
     free = np.where(is_around(obs), "close", np.where(is_above(obs), "descend", "above"))
     return np.where(is_grasped(obs), "carry", free)
 
@@ -84,15 +86,15 @@ class Above(Skill):
     policy = above
 
     def initiation(self, obs: Array) -> Array:
-        """Where the block is not grasped."""
+        """Return whether the block is not grasped."""
         return ~is_grasped(obs)
 
     def termination(self, step: Step) -> Array:
-        """It is above the block."""
+        """Return whether it is above the block."""
         return is_above(step.next_obs)
 
     def success(self, step: Step) -> Array:
-        """It is above the block."""
+        """Return whether it is above the block."""
         return is_above(step.next_obs)
 
 
@@ -102,15 +104,15 @@ class Descend(Skill):
     policy = descend
 
     def initiation(self, obs: Array) -> Array:
-        """Above the block, which is not grasped."""
+        """Return whether it is above the block, which is not grasped."""
         return is_above(obs) & ~is_grasped(obs)
 
     def termination(self, step: Step) -> Array:
-        """The block is between the fingers, or elsewhere."""
+        """Return whether the block is between the fingers, or elsewhere."""
         return is_around(step.next_obs) | ~is_above(step.next_obs)
 
     def success(self, step: Step) -> Array:
-        """The block is between the fingers."""
+        """Return whether the block is between the fingers."""
         return is_around(step.next_obs)
 
 
@@ -120,34 +122,34 @@ class Close(Skill):
     policy = close
 
     def initiation(self, obs: Array) -> Array:
-        """Around the block."""
+        """Return whether the fingers are around the block."""
         return is_around(obs) | is_grasped(obs)
 
     def termination(self, step: Step) -> Array:
-        """They hold it."""
+        """Return whether they hold it."""
         return is_grasped(step.next_obs)
 
     def success(self, step: Step) -> Array:
-        """They hold it."""
+        """Return whether they hold it."""
         return is_grasped(step.next_obs)
 
 
 class Carry(Skill):
-    """Bring what is between the fingers to the goal, until it is lost."""
+    """Bring the grasped block to the goal, until it is lost."""
 
     policy = carry
 
     def initiation(self, obs: Array) -> Array:
-        """Where the block is grasped."""
+        """Return whether the block is grasped."""
         return is_grasped(obs)
 
     def termination(self, step: Step) -> Array:
-        """It is lost."""
+        """Return whether the block is lost."""
         return ~is_grasped(step.next_obs)
 
 
 class Anywhere(Skill):
-    """One of the four functions for those who choose by hand: it may start anywhere."""
+    """One of the four functions, for selectors by hand: it may start anywhere."""
 
     def __init__(self, name: str, policy: Any) -> None:
         self.name, self.policy = name, policy
@@ -159,22 +161,22 @@ class Recover(Skill):
     max_steps = 25
 
     def initiation(self, obs: Array) -> Array:
-        """Where it is not grasped."""
+        """Return whether it is not grasped."""
         return ~is_grasped(obs)
 
     def reward(self, step: Step) -> Array:
-        """Progress of the fingers to the block, in decimetres; 1 for having it between them."""
+        """Return the fingers' progress to the block in decimetres; 1 for the block between them."""
         before = np.linalg.norm(step.obs[:, OFFSET], axis=1)
         after = np.linalg.norm(step.next_obs[:, OFFSET], axis=1)
         reward: Array = 10.0 * (before - after) + self.success(step)
         return reward
 
     def termination(self, step: Step) -> Array:
-        """It is between them."""
+        """Return whether it is between them."""
         return is_around(step.next_obs)
 
     def success(self, step: Step) -> Array:
-        """It is between them."""
+        """Return whether it is between them."""
         return is_around(step.next_obs)
 
 
@@ -197,11 +199,11 @@ behaviour_tree = sw.tree.Sequence(
     ),
     "carry",
 )
-"""The same as ``rule``, as a tree: it begins anew after each call that has not succeeded."""
+"""``rule`` as a tree: it restarts after each call without success."""
 
 RELU = Network(hidden=(64, 64), activation="relu")
 LEARNER = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=16,
     n_steps=128,
     batch_size=256,
@@ -211,7 +213,7 @@ LEARNER = PPO(
     network=RELU,
 )
 SELECTOR = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=16,
     n_steps=128,
     batch_size=64,
@@ -224,7 +226,7 @@ FUNCTIONS = {"above": above, "descend": descend, "close": close, "carry": carry}
 
 
 def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
-    """The hierarchy whose selector is learnt; ``how`` changes any of its settings."""
+    """Return the hierarchy whose selector is learnt; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": 10,
         "algorithm": LEARNER,
@@ -237,13 +239,13 @@ def declare(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
 
 
 def anchored(disturbances: Disturbances = CALM, **how: Any) -> Hierarchy:
-    """The same; while the selector learns, it is kept near the behaviour tree."""
+    """Return the hierarchy whose selector is kept near the behaviour tree while it learns."""
     near = Guide(behaviour_tree, restrict=False, target_kl=0.1)
     return declare(disturbances, **{"guide": near} | how)
 
 
 def by_hand(selector: Any, disturbances: Disturbances = CALM, call_steps: int = 1) -> Hierarchy:
-    """The four functions under ``rule``, ``script`` or ``behaviour_tree``: nothing is learnt."""
+    """Return the four functions under ``rule``, ``script`` or ``behaviour_tree``, untrained."""
     skills = [Anywhere(name, function) for name, function in FUNCTIONS.items()]
     return Hierarchy(spec(disturbances), skills, selector=selector, call_steps=call_steps)
 

@@ -34,27 +34,27 @@ from skillweave.recipes._cheetah import LEG, SPEED, spec
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
 ARRIVAL, HASTE = 400.0, 80.0
-"""What the end of a leg is worth to a skill, and what is taken off for each metre a second at which
-it is passed. A call ends there, and its value: a skill that is not paid for it learns not to
+"""A skill's reward for the end of a leg, and its deduction for each metre a second at which it is
+passed. A call ends there, and its value: a skill that is not paid for it learns not to
 arrive. At five metres a second, about the highest speed, the half-cheetah runs on for two metres
 more, and nothing is paid (beyond, it costs). With 300 and 40 skills hardly braked on seed 10: they
 finished seven rounds, not nine."""
 
 
 def moved(step: Step) -> Array:
-    """Metres a second, (N,)."""
+    """Return metres a second, (N,)."""
     speed: Array = step.next_obs[:, SPEED]
     return speed
 
 
 def effort(step: Step) -> Array:
-    """What the action costs, (N,): 0.1·‖action‖²."""
+    """Return the cost of the action, (N,): 0.1·‖action‖²."""
     cost: Array = 0.1 * np.square(step.action).sum(axis=1)
     return cost
 
 
 def arrived(step: Step) -> Array:
-    """The leg of the patrol is done, (N,) bool."""
+    """Return whether the leg of the patrol is done, (N,) bool."""
     done: Array = (step.next_obs[:, LEG] != step.obs[:, LEG]).any(axis=1)
     return done
 
@@ -65,16 +65,16 @@ class Forward(Skill):
     way = 1.0
 
     def reward(self, step: Step) -> Array:
-        """The speed, less the effort; and for the end of a leg a prize, the slower the higher."""
+        """Return the speed, less the effort, and a prize for a slow end of a leg."""
         speed = self.way * moved(step)
         return speed - effort(step) + arrived(step) * (ARRIVAL - HASTE * np.abs(speed))
 
     def termination(self, step: Step) -> Array:
-        """The leg is done."""
+        """Return whether the leg is done."""
         return arrived(step)
 
     def success(self, step: Step) -> Array:
-        """The leg is done."""
+        """Return whether the leg is done."""
         return arrived(step)
 
 
@@ -90,17 +90,17 @@ class Stop(Skill):
     max_steps = 20
 
     def initiation(self, obs: Array) -> Array:
-        """Where it moves: who stands has nothing to do."""
+        """Return whether it moves: at rest there is nothing to do."""
         return np.abs(obs[:, SPEED]) > 1.0
 
     def reward(self, step: Step) -> Array:
-        """As little speed as possible."""
+        """Return less for more speed."""
         return -np.abs(moved(step)) - effort(step)
 
 
 RELU = Network(hidden=(64, 64), activation="relu")  # tanh costs more than all the rest of it
 RUNNER = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=64,
     n_steps=64,
     batch_size=256,
@@ -111,10 +111,10 @@ RUNNER = PPO(
     ent_coef=0.0,
     network=replace(RELU, sees=tuple(range(LEG.start))),
 )
-"""Who learns a skill. It does not see the leg of the patrol, so that it serves patrols whose legs
-are others: with the leg, ``backward`` knows only legs in which the source task runs backwards."""
+"""The learner of a skill. It does not see the leg, so that it serves patrols with other legs: with
+the leg, ``backward`` would learn only those legs in which the source task runs backwards."""
 SELECTOR = PPO(
-    min_advantage_std=0.0,  # so it was measured
+    min_advantage_std=0.0,  # the figures were measured with it
     num_envs=64,
     n_steps=64,
     batch_size=128,
@@ -129,17 +129,17 @@ COLLECTORS = 2
 about four fifths of the time of a single one. What is learnt depends on their number, so it is the
 same on every machine."""
 
-# At first nearly all calls are drawn by lot: the selector knows no reward yet but what effort
-# costs, and would stand still; and skills learn to turn where others have run. In the end a few
-# are, so that skills keep knowing how to begin elsewhere than where the task asks for them. After a
-# sixth of the steps the selector knows its task. While calls are drawn by lot, points are seldom
+# At first nearly all calls are random: the selector has met no reward yet but the costs of
+# effort, and would stand still; and skills learn to turn where others have run. In the end a few
+# are, so that skills keep learning to start elsewhere than the task calls them. After a
+# sixth of the steps the selector has learnt its task. While calls are random, points are seldom
 # passed, and that is where skills learn to brake: so the share falls fast.
 TOGETHER = Together(
     steps=3_000_000, task_weight=0.0, epsilon=0.95, epsilon_final=0.05, epsilon_fraction=0.4
 )
 
 FURTHER_CALL_STEPS = 100
-"""Skills that are there already end by themselves where a leg is done. By lot, calls of 40 steps
+"""Skills that are there already end by themselves where a leg is done. Random calls of 40 steps
 hardly ever run eight metres the same way; these do half of the time."""
 FURTHER_SELECTOR = replace(
     SELECTOR,
@@ -154,7 +154,7 @@ FURTHER_SELECTOR = replace(
 
 
 def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
-    """The hierarchy on a patrol; ``how`` changes any of its settings."""
+    """Return the hierarchy on a patrol; ``how`` changes any of its settings."""
     settings: dict[str, Any] = {
         "call_steps": 40,
         "learn": "together",
@@ -167,7 +167,7 @@ def declare(points: tuple[float, ...] = (2.0, -2.0), **how: Any) -> Hierarchy:
 
 
 def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """The hierarchy on a patrol with skills that are there already, by name."""
+    """Return the hierarchy on a patrol with skills that are there already, by name."""
     settings = {
         "learn": "apart",
         "selector": FURTHER_SELECTOR,
@@ -181,8 +181,9 @@ def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any
 
 
 def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierarchy:
-    """The same skills under the task's own automaton: each leg is run in its direction."""
-    ways, legs = np.sign(np.subtract(points, np.roll(points, 1))), range(len(points))
+    """Return the skills under the task's own automaton: each leg is run in its direction."""
+    ways = np.sign(np.subtract(points, np.roll(points, 1)))
+    legs = range(len(points))
     states = {f"leg {i}": "forward" if ways[i] > 0 else "backward" for i in legs}
     transitions = {
         (f"leg {i}", f"leg {j}"): partial(on_leg, j)
@@ -193,7 +194,7 @@ def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierar
 
 
 def on_leg(leg: int, step: Step) -> Array:
-    """This leg is run now, (N,) bool."""
+    """Return whether this leg is run now, (N,) bool."""
     there: Array = step.next_obs[:, LEG][:, leg] == 1.0
     return there
 

@@ -1,1 +1,1 @@
-"""What people see: progress, captions, videos."""
+"""Output for people: progress, captions, videos, reports."""

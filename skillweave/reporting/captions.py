@@ -1,4 +1,4 @@
-"""Captions: a band under a frame that says who acts."""
+"""Captions, apart from videos: a band under a frame with the acting skill."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIN_WIDTH = 240  # pixels; smaller frames are enlarged
 def caption(
     frame: Array, text_left: str, color: RGB, text_right: str, size: int | None = None
 ) -> Array:
-    """The frame on top of a dark band: a chip with who acts on its left, text on its right.
+    """Return the frame above a dark band: the acting skill on its left, text on its right.
 
     Nothing of the frame is covered. A frame narrower than ``MIN_WIDTH`` is enlarged k times. A
     left text too long for its room is shortened; where it is empty there is no chip.
@@ -58,7 +58,7 @@ def _font(size: int) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _text(text: str, size: int, ink: RGB, ground: RGB) -> Array:
-    """One line of text, (line height, its width, 3)."""
+    """Return one line of text, (line height, its width, 3)."""
     font = _font(size)
     box = (max(1, round(font.getlength(text))), sum(font.getmetrics()))
     image = extra("PIL.Image").new("RGB", box, ground)
@@ -68,7 +68,7 @@ def _text(text: str, size: int, ink: RGB, ground: RGB) -> Array:
 
 @functools.lru_cache(maxsize=256)
 def _chip(text: str, color: RGB, size: int, width: int) -> Array:
-    """A name on its colour, at most ``width`` pixels wide."""
+    """Return a name on its colour, at most ``width`` pixels wide."""
     # Black and white contrast equally with a relative luminance of 0.18 (WCAG 2).
     luminance = (np.asarray(color) / 255) ** 2.2 @ (0.2126, 0.7152, 0.0722)
     short, pad = text, size // 2

@@ -1,4 +1,4 @@
-"""The page of a run on the hub: a model card, written from what the run's files say."""
+"""The page of a run on the hub, a text apart from its upload: a model card of the run's files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 def write_card(
     run: RunDirectory, name: str, *, films: Sequence[str], figures: Sequence[str]
 ) -> str:
-    """The card as Markdown, with a header that the hub reads.
+    """Return the card as Markdown, with a header that the hub reads.
 
     Args:
         name: ``owner/name`` on the hub.
@@ -48,10 +48,10 @@ def write_card(
 
 
 def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
-    """The YAML that the hub reads; every value is written as JSON, which is YAML too."""
+    """Return the YAML that the hub reads; every value is written as JSON, which is YAML too."""
     env = run.manifest["env"]
     kind = "hierarchical-" if run.manifest["kind"] == "hierarchy" else ""
-    told: dict[str, Any] = {
+    header: dict[str, Any] = {
         "library_name": "skillweave",
         "pipeline_tag": "reinforcement-learning",
         "tags": [f"{kind}reinforcement-learning", "skillweave", env],
@@ -62,8 +62,8 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
         task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
         metric = {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
         result = {"task": task, "dataset": {"name": env, "type": env}, "metrics": [metric]}
-        told["model-index"] = [{"name": name.partition("/")[2], "results": [result]}]
-    lines = [f"{key}: {json.dumps(value)}" for key, value in told.items()]
+        header["model-index"] = [{"name": name.partition("/")[2], "results": [result]}]
+    lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
     return "\n".join(["---", *lines, "---"])
 
 
@@ -74,7 +74,7 @@ def _about(run: RunDirectory) -> str:
 
 
 def _shown(path: str) -> str:
-    """A picture, or a link where pages show no such picture."""
+    """Return a picture, or a link where pages show no such picture."""
     link = f"[{text(PurePosixPath(path).stem)}](./{quote(path)})"
     return link if path.endswith(".mp4") else f"!{link}"
 
@@ -90,11 +90,16 @@ def _use(run: RunDirectory, name: str) -> str:
             "",
         ]
     lines += [
-        "```python", "import skillweave as sw", "", f'run = sw.from_hub("{name}"{given})',
-        "print(run.evaluate(episodes=10))", "```", "",
+        "```python",
+        "import skillweave as sw",
+        "",
+        f'run = sw.from_hub("{name}"{given})',
+        "print(run.evaluate(episodes=10))",
+        "```",
+        "",
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
-    ]  # fmt: skip
+    ]
     if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
         names = ", ".join(text(s["name"]) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
@@ -106,7 +111,7 @@ def _is_onnx(skill: Mapping[str, Any]) -> bool:
 
 
 def _measured(saved: SavedEvaluation | None) -> str:
-    """What the whole policy scored, and what each skill did."""
+    """Return the score of the whole policy, and the figures of each skill."""
     if saved is None:
         return "## Measured\n\nIt was not evaluated."
     score = saved.evaluation
@@ -114,8 +119,15 @@ def _measured(saved: SavedEvaluation | None) -> str:
     whole = str(score).partition("; skills:")[0]
     lines = ["## Measured", "", f"Return {text(whole)} ({how}, seed {saved.seed})."]
     if score.skills:
-        head = ("skill", "of all steps", "calls", "steps of a call", *(f"ends {w}" for w in
-                WHY.values()), "success", "own return of a call")  # fmt: skip
+        head = (
+            "skill",
+            "of all steps",
+            "calls",
+            "steps of a call",
+            *(f"ends {w}" for w in WHY.values()),
+            "success",
+            "own return of a call",
+        )
         lines += ["", "What each skill did:", "", _row(head), _row(["---"] * len(head))]
         for row in skill_rows(score.skills):
             cells = [row["name"], percent(row["share"]), row["calls"], row["length"], *row["ends"]]
@@ -133,7 +145,7 @@ def _training(run: RunDirectory) -> str:
 
 
 def _folded(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
-    """A table that people open where they want to see it."""
+    """Return a table that is folded until a reader opens it."""
     lines = [f"<details><summary>{title}</summary>", "", _row(head), _row(["---"] * 2)]
     return "\n".join([*lines, *(_row([k, plain(v)]) for k, v in rows.items()), "", "</details>"])
 
@@ -143,6 +155,6 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def text(value: str) -> str:
-    """A value in Markdown as it is: nothing in it is read as Markdown or HTML."""
+    """Return a value in Markdown as it is: nothing in it is read as Markdown or HTML."""
     plain_text = re.sub(r"([\\`*_{}\[\]()#|~!$])", r"\\\1", " ".join(value.split()))
     return html.escape(plain_text, quote=False)

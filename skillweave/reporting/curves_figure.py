@@ -33,7 +33,7 @@ FONT = 8.0
 """Points, at that width."""
 DPI = 300
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe & Ito (2008): colours that people with a colour deficiency tell apart."""
+"""Okabe & Ito (2008): colours that people with a colour deficiency can separate."""
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1.5, 1.5, 1.5)))
 """Styles of lines, for prints without colours."""
 BANDS = {"iqr": "interquartile range", "range": "lowest to highest", "none": ""}
@@ -49,20 +49,20 @@ AXES = {
 
 @dataclass(frozen=True)
 class Line:
-    """What is drawn of several seeds; arrays (G,)."""
+    """A line of several seeds; arrays (G,)."""
 
     label: str
     seeds: int
     steps: Array
     middle: Array
     low: Array | None
-    """None: there is no band."""
+    """None: no band."""
     high: Array | None
 
 
 @dataclass(frozen=True)
 class CurvesFigure:
-    """The files of a figure, and what stands in it."""
+    """The files of a figure, and its content."""
 
     paths: tuple[Path, ...]
     lines: tuple[Line, ...]
@@ -85,7 +85,7 @@ def plot_curves(
 ) -> CurvesFigure:
     """Draw the learning curves of several seeds: their median, and a band around it.
 
-    The curve is that of the whole policy. Its steps count from the start of the run, those in
+    The curve belongs to the whole policy. Its steps count from the start of the run, those in
     which skills learnt before included, so hierarchies and flat agents can be compared.
 
     Args:
@@ -126,7 +126,7 @@ def plot_curves(
 
 
 def _groups(runs: Paths | Mapping[str, Paths]) -> dict[str, list[RunDirectory]]:
-    """The runs of each line, by its name."""
+    """Return the runs of each line, by its name."""
     if isinstance(runs, Mapping):
         return {str(label): open_runs(_paths(own)) for label, own in runs.items()}
     return {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
@@ -150,7 +150,7 @@ def _renamed(
 
 
 def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None) -> str:
-    """The metric that is drawn; every run has it."""
+    """Return the metric that is drawn; every run has it."""
     known = [set(_curves_of(run, agent)) for run in runs]
     common = set.intersection(*known)
     if metric is None:
@@ -171,7 +171,7 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
 
 
 def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
-    """Curves by metric: of an agent, or of the whole policy over all steps of the run."""
+    """Return curves by metric: of an agent, or of the whole policy over all steps of the run."""
     all_curves = read_curves(run)
     if agent is not None:
         wanted = {c.stage: c.points for c in all_curves if c.agent == agent}
@@ -182,7 +182,7 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     for entry in run.manifest["stages"]:
         if entry["name"] in wanted:
             parts.append((before, wanted[entry["name"]]))
-        # An agent's steps are those of the stages in which it learns.
+        # An agent's steps are the steps of the stages in which it learns.
         if agent is None or entry["name"] in wanted:
             before += int(entry.get("steps", entry["budget"]))
     names = dict.fromkeys(name for _, points in parts for name in points)
@@ -190,7 +190,7 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
 
 
 def _joined(parts: Sequence[tuple[int, Curve]]) -> Curve:
-    """Curves one after another, each moved by the steps before it."""
+    """Join curves one after another, each moved by the steps before it."""
     return [(before + x, y) for before, points in parts for x, y in points]
 
 
@@ -210,7 +210,7 @@ def _line(
 
 
 def _binary(runs: Sequence[RunDirectory]) -> bool:
-    """Whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
+    """Return whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
     saved = [load_evaluation(run) for run in runs]
     returns = [r for e in saved if e is not None for r in e.evaluation.returns]
     return bool(returns) and is_binary(returns)
@@ -286,13 +286,13 @@ def _save(figure: Any, out: Path) -> tuple[Path, ...]:
 
 
 def _shortened(label: str, width: float) -> str:
-    """A name that fits into the figure."""
+    """Return a name that fits into the figure."""
     most = math.floor(width * 14)
     return label if len(label) <= most else f"{label[: most - 1]}…"
 
 
 def _steps(value: float, _: Any = None) -> str:
-    """Steps on an axis: 200k, 1.5M."""
+    """Return steps for an axis: 200k, 1.5M."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e3 else f"{value:g}"

@@ -1,4 +1,4 @@
-"""Where progress is drawn: bars on a terminal, a table in a notebook."""
+"""Displays of progress: bars on a terminal, a table in a notebook; apart from its content."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Row:
     """A line of progress."""
 
     name: str
-    """What goes on."""
+    """The activity."""
     share: float | None
-    """How much of it is done, from 0 to 1; None: it has no such share."""
+    """The share that is done, from 0 to 1; None: it has no such share."""
     steps: str = ""
     """The same in numbers."""
     result: str = ""
-    """What it has reached so far."""
+    """Its result so far."""
     speed: str = ""
     """Steps per second."""
     left: str = ""
@@ -34,12 +34,12 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What tells it from other rows."""
+        """The identity of a row."""
         return self.under, self.name
 
 
 class Display(Protocol):
-    """Shows rows, each under the ones before."""
+    """A display of rows, each under the ones before."""
 
     every: float
     """Seconds between two drawings."""
@@ -66,7 +66,7 @@ _open: list[Display] = []
 
 
 def open_display(*, transient: bool = False) -> Display | None:
-    """Return a display, or None: plain lines are to be written instead.
+    """Return a display, or None where plain lines are to be written instead.
 
     Args:
         transient: nothing is left of it when it is closed.
@@ -89,9 +89,9 @@ def open_display(*, transient: bool = False) -> Display | None:
 
 
 class Shielded:
-    """A display that shows nothing any more once it cannot be drawn: training goes on.
+    """A display that turns silent once it cannot be drawn, so that training continues.
 
-    Its reader has gone away, or the disk of a log is full.
+    Its reader has ended, or the disk of a log is full.
     """
 
     def __init__(self, display: Display) -> None:
@@ -110,15 +110,15 @@ class Shielded:
         self._try(self._display.message, text)
 
     def close(self) -> None:
-        """Draw for the last time; what was changed for the display is changed back in any case."""
+        """Draw for the last time, and undo the display's changes in any case."""
         _open.remove(self)
         self._draws = True
         self._try(self._display.close)
 
-    def _try(self, act: Callable[..., None], *told: Any) -> None:
+    def _try(self, act: Callable[..., None], *arguments: Any) -> None:
         if self._draws:
             try:
-                act(*told)
+                act(*arguments)
             except (OSError, ValueError):
                 self._draws = False
                 end_quietly()
@@ -158,7 +158,7 @@ class Bars:
 
 
 class Cell:
-    """A table in the output of a notebook's cell; what it showed last stays in the notebook."""
+    """A table in the output of a notebook's cell; its last state stays in the notebook."""
 
     every = 0.5
 
@@ -214,7 +214,7 @@ def _bar(share: float) -> Markup:
 
 
 def _may_draw() -> bool:
-    """Return whether it is worth importing rich to find out if bars can be drawn."""
+    """Return whether bars may be possible, so that importing rich is worth its time."""
     if os.environ.get("TERM") == "dumb" or any(os.environ.get(v) for v in ("NO_COLOR", "CI")):
         return False
     return _is_terminal(sys.stderr)
@@ -226,7 +226,7 @@ def _is_terminal(stream: Any) -> bool:
 
 
 def make_bars(transient: bool) -> Bars | None:
-    """Return bars that are drawn only when asked for, or None where rich sees no terminal."""
+    """Return bars that are drawn only on request, or None where rich finds no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 

@@ -1,4 +1,4 @@
-"""What a run's ``lineage.jsonl`` says: generations, and the ancestors of the winner."""
+"""The content of a run's ``lineage.jsonl``: generations, and the ancestors of the winner."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Born:
     generation: int
     member: int
     parent: int | None
-    """Its number in the generation before; itself where it went on."""
+    """Its number in the generation before; its own where it continued."""
     mutation: str
     changes: dict[str, Any]
     fitness: float | None
     best: bool
-    """Whether it was the best so far."""
+    """It was the best so far."""
     settings: dict[str, Any]
 
 
@@ -38,35 +38,35 @@ class Lineage:
         return max((b for b in self.born.values() if b.best), key=lambda b: b.generation)
 
     def parent(self, born: Born) -> Born | None:
-        """Where a member comes from; None: from the start."""
+        """Return a member's parent; None in the first generation."""
         if born.parent is None or born.generation == 0:
             return None
         return self.born.get((born.generation - 1, born.parent))
 
     def path(self, born: Born) -> list[Born]:
-        """From the first generation to a member."""
-        found: list[Born] = []
+        """Return the line from the first generation to a member."""
+        line: list[Born] = []
         at: Born | None = born
         while at is not None:
-            found.append(at)
+            line.append(at)
             at = self.parent(at)
-        return found[::-1]
+        return line[::-1]
 
 
 def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
-    """The lineage of a stage, or None where nothing evolved in it.
+    """Return the lineage of a stage, or None where nothing evolved in it.
 
     Raises:
         RunError: the file is damaged.
     """
     names, born = [f.name for f in fields(Born)], {}
     sorts: dict[str, str] = {}
-    for told in run.lineage.read():
-        if told["stage"] == stage:
-            each = Born(**{k: told[k] for k in names})
-            own = {k: _sort(v) for k, v in each.settings.items()}
-            sorts = sorts or own
-            if own != sorts:
+    for entry in run.lineage.read():
+        if entry["stage"] == stage:
+            each = Born(**{k: entry[k] for k in names})
+            its_sorts = {k: _sort(v) for k, v in each.settings.items()}
+            sorts = sorts or its_sorts
+            if its_sorts != sorts:
                 raise RunError(
                     f"{run.lineage.path} is damaged: the settings of member {each.member} in "
                     f"generation {each.generation} are not of the sorts of those before"
@@ -76,7 +76,7 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
 
 
 def _sort(value: Any) -> str:
-    """What a setting is: a number, a word, or whole numbers."""
+    """Return the sort of a setting: a number, a word, or whole numbers."""
     if isinstance(value, list):
         return "numbers" if all(type(x) is int for x in value) else "?"
     return "number" if type(value) in (int, float) else type(value).__name__

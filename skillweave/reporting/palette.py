@@ -10,9 +10,17 @@ RGB: TypeAlias = tuple[int, int, int]
 # far from these and from each other as people with a protan, deutan or tritan deficiency see them
 # (Machado et al. 2009). Each has a contrast of at least 3 to black and 1.9 to white.
 PALETTE: tuple[RGB, ...] = (
-    (230, 159, 0), (0, 114, 178), (210, 0, 60), (142, 202, 112), (120, 0, 255),
-    (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (135, 105, 255),
-)  # fmt: skip
+    (230, 159, 0),
+    (0, 114, 178),
+    (210, 0, 60),
+    (142, 202, 112),
+    (120, 0, 255),
+    (86, 180, 233),
+    (0, 158, 115),
+    (213, 94, 0),
+    (204, 121, 167),
+    (135, 105, 255),
+)
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
 BAND, LINE = (28, 28, 32), (110, 110, 118)  # a caption's ground, and what parts it from the frame
 OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
@@ -20,5 +28,5 @@ OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
 
 
 def color_of(index: int, wanted: RGB | None = None) -> RGB:
-    """The colour of skill number ``index``: the one it asks for, else the palette's."""
+    """Return the colour of skill number ``index``: its own, else the palette's."""
     return PALETTE[index % len(PALETTE)] if wanted is None else wanted

@@ -14,11 +14,11 @@ from skillweave.runs.hub import must_be_own
 
 FAINT, TEXT = "#c9c9cf", "#4a4a52"
 COMPLEMENT = ("gamma", "gae_lambda")
-"""Settings that are drawn as what they lack to one."""
+"""Settings that are drawn as their difference from one."""
 
 
 def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
-    """Draw every stage that has something to show, as PNG and SVG; returns the files.
+    """Draw every stage that has something to show, as PNG and SVG; return the files.
 
     A stage that evolved: fitness by generation with the winner's family tree, and the path of each
     setting. Any other: its return over the steps.
@@ -41,7 +41,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
         if lineage := read_lineage(run, name):
             figure = draw_lineage(Figure, lineage, name, color)
         else:
-            curve = [(m["steps"], m["return"]) for m in metrics if _tells(m, name)]
+            curve = [(m["steps"], m["return"]) for m in metrics if _has_return(m, name)]
             if not curve:
                 continue
             figure = _draw_curve(Figure, curve, name, color)
@@ -57,8 +57,9 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
 
 
 def draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
-    """Fitness by generation, and below it the path of each setting that differs."""
-    path, everyone = lineage.path(lineage.winner), list(lineage.born.values())
+    """Draw fitness by generation, and below it the path of each setting that differs."""
+    path = lineage.path(lineage.winner)
+    everyone = list(lineage.born.values())
     shown = [k for k in lineage.winner.settings if _varies(everyone, k)]
     rows = -(-len(shown) // 2)
     figure = make(figsize=(10, 4.2 + 1.9 * rows), layout="constrained")
@@ -88,16 +89,28 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
             at = born.generation, born.fitness
             what = ", ".join(_change(k, *v) for k, v in born.changes.items()) or "weights"
             axes.annotate(
-                what, at, textcoords="offset points", xytext=(4, -6), rotation=-38, fontsize=7,
-                color=TEXT, va="top",
-            )  # fmt: skip
+                what,
+                at,
+                textcoords="offset points",
+                xytext=(4, -6),
+                rotation=-38,
+                fontsize=7,
+                color=TEXT,
+                va="top",
+            )
     winner = path[-1]
     axes.plot(winner.generation, winner.fitness, "*", color=color, markersize=16, zorder=4)
     label = f"member {winner.member}: {winner.fitness:.1f}"
     axes.annotate(
-        label, (winner.generation, winner.fitness), textcoords="offset points", xytext=(-6, 9),
-        ha="right", fontsize=9, color=color, weight="bold",
-    )  # fmt: skip
+        label,
+        (winner.generation, winner.fitness),
+        textcoords="offset points",
+        xytext=(-6, 9),
+        ha="right",
+        fontsize=9,
+        color=color,
+        weight="bold",
+    )
     fitness = sorted(b.fitness for b in lineage.born.values() if b.fitness is not None)
     # One hopeless member must not squeeze all others into a line.
     low = min(fitness[len(fitness) // 20], *(b.fitness for b in path if b.fitness is not None))
@@ -114,11 +127,11 @@ def _draw_setting(
         words = sorted({b.settings[setting] for b in lineage.born.values()})
 
     def value(born: Born) -> float:
-        told = born.settings[setting]
+        setting_value = born.settings[setting]
         if words:
-            return words.index(told)
-        told = sum(told) if isinstance(told, list) else told
-        return 1.0 - told if setting in COMPLEMENT else told
+            return words.index(setting_value)
+        number = sum(setting_value) if isinstance(setting_value, list) else setting_value
+        return 1.0 - number if setting in COMPLEMENT else number
 
     values = [value(b) for b in lineage.born.values()]
     for born in lineage.born.values():
@@ -131,8 +144,8 @@ def _draw_setting(
         axes.set_yscale("log")
     label = "hidden units, all layers" if setting == "hidden" else setting
     _plain(axes, f"1 - {setting}" if setting in COMPLEMENT else label)
-    told = path[-1].settings[setting]
-    axes.set_title(f"winner: {_short(told)}", loc="right", fontsize=8, color=TEXT)
+    won = path[-1].settings[setting]
+    axes.set_title(f"winner: {_short(won)}", loc="right", fontsize=8, color=TEXT)
 
 
 def _draw_curve(make: Any, curve: list[tuple[int, float]], name: str, color: str) -> Any:
@@ -157,7 +170,7 @@ def _varies(born: Sequence[Born], setting: str) -> bool:
     return len({str(b.settings.get(setting)) for b in born}) > 1
 
 
-def _tells(metrics: dict[str, Any], stage: str) -> bool:
+def _has_return(metrics: dict[str, Any], stage: str) -> bool:
     return metrics.get("stage") == stage and {"return", "steps"} <= metrics.keys()
 
 

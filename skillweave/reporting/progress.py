@@ -1,4 +1,4 @@
-"""How training and evaluation go, for people: live on a terminal or in a notebook, else as lines.
+"""Progress of training and evaluation: live on a terminal or in a notebook, else as lines.
 
 Everything goes to stderr, so that stdout stays clean for results; in a notebook below the cell.
 """
@@ -26,7 +26,7 @@ RECENT = 10.0
 PATIENCE = 1.0
 """Seconds that an evaluation may take before its progress is shown."""
 PLAIN_PATIENCE = 30.0
-"""The same of lines, where there is no terminal; and the least seconds between two of them."""
+"""Distance of lines without a terminal, and the least seconds between two of them."""
 IN_ALL = "in all"
 LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
@@ -39,7 +39,7 @@ class Progress:
     Of several stages it shows which one this is, and the time left in all.
 
     A context manager and a listener of the training loops. Without a terminal or a notebook, in CI,
-    and with NO_COLOR or TERM=dumb, it writes a line when a stage begins, some while it goes on, and
+    and with NO_COLOR or TERM=dumb, it writes a line when a stage starts, some while it trains, and
     one when it ends. With ``quiet`` it writes nothing. Messages go to the logger "skillweave", too.
     """
 
@@ -65,7 +65,7 @@ class Progress:
             self._display = None
 
     def plan(self, stages: Iterable[Mapping[str, Any]]) -> None:
-        """All stages of the run, as its manifest lists them."""
+        """Set all stages of the run, as its manifest lists them."""
         for stage in stages:
             self._plan[stage["name"]] = int(stage["budget"])
             if stage["status"] == "done":
@@ -74,7 +74,7 @@ class Progress:
         self._several = len(self._plan) > 1
 
     def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on; ``budget`` in environment steps."""
+        """Start a stage, or continue it; ``budget`` in environment steps."""
         self._plan[name] = budget
         self._begun = self._shown = time.monotonic()
         self._recent.clear()
@@ -87,7 +87,7 @@ class Progress:
         self._display.draw()
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made after ``steps`` and ``seconds`` of training."""
+        """Report an update after ``steps`` and ``seconds`` of training."""
         self._recent.append((steps, seconds))
         self._spent[name] = steps, seconds
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
@@ -99,13 +99,13 @@ class Progress:
         if self._quiet or now - self._shown < pause:
             return
         if self._display is None and steps >= self._plan[name]:
-            return  # ``done`` says so next
+            return  # ``done`` reports it next
         self._shown = now
         left = _clock(self._left(name))
         self._show(name, steps, metrics, f"{self._speed():,.0f} steps/s", f"{left} left")
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over."""
+        """End a stage."""
         if name not in self._plan:
             self.stage(name, steps)
         self._spent[name] = steps, seconds
@@ -116,7 +116,7 @@ class Progress:
         self._show(name, steps, metrics, speed, f"done in {_clock(seconds)}")
 
     def message(self, text: str) -> None:
-        """A line of text, above the bars where there are any."""
+        """Show a line of text, above the bars where there are any."""
         text = printable(text)
         LOG.info("%s", text)
         if self._display is None:
@@ -135,8 +135,8 @@ class Progress:
             seconds = self._left_in_all(name)
             in_all = f"{_clock(seconds)} left in all" if seconds else ""
             numbers = (f"{k} {v:.4g}" for k, v in metrics.items() if k.startswith(INFO))
-            told = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
-            self._line(f"{self._numbered(name)}: {told}")
+            text = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
+            self._line(f"{self._numbered(name)}: {text}")
             if name in self._over:
                 for agent, _, acts, reward in _agents(metrics):
                     self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
@@ -190,7 +190,7 @@ class Progress:
     def _left_in_all(self, name: str) -> float | None:
         """Return the seconds that all stages still take; None: unknown, or there is one stage.
 
-        Stages that have not begun are taken to be as fast as all steps so far.
+        The speed of stages that have not started is taken from all steps so far.
         """
         if not self._several:
             return None
@@ -251,7 +251,8 @@ class EpisodeProgress:
             return
         self._shown = now
         if not self._tried:
-            self._tried, self._display = True, open_display(transient=True)
+            self._tried = True
+            self._display = open_display(transient=True)
             if self._display is None:
                 self._pause = PLAIN_PATIENCE
                 return
@@ -259,8 +260,8 @@ class EpisodeProgress:
         if self._display is not None:
             self._draw(now)
             return
-        told = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
-        say(f"{self._name}: {told}")
+        text = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
+        say(f"{self._name}: {text}")
         self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._begun))
 
     def _draw(self, now: float) -> None:
@@ -273,7 +274,7 @@ class EpisodeProgress:
 
 
 def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str, str]]:
-    """Yield who learns side by side: name, share of the steps in which it acts, both in words."""
+    """Yield the learners of a stage: name, share of the steps in which it acts, both in words."""
     for key, value in metrics.items():
         name, _, what = key.rpartition(".")
         if key.startswith(INFO):  # a key may have a dot of its own

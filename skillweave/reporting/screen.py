@@ -12,10 +12,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_screen() -> Iterator[None]:
-    """On Linux without a screen, environments draw without one: in this block, or this function.
+    """Let environments draw without a screen on Linux, in this block or this function.
 
-    pygame is told not to look for a screen. MuJoCo is told to draw with EGL, where that is
-    installed; this is taken back at the end, as the user may wish to draw with something else.
+    Set pygame to use no screen, and MuJoCo to draw with EGL where that is installed. The latter is
+    undone at the end, as the user may wish to draw with something else.
     """
     if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         yield
@@ -33,14 +33,16 @@ def without_screen() -> Iterator[None]:
 
 @functools.cache
 def _has_egl() -> bool:
-    """The library is installed."""
+    """Return whether the library is installed."""
     return ctypes.util.find_library("EGL") is not None
 
 
 def hint(error: BaseException) -> str:
-    """A sentence, after a space, on what to do where OpenGL could not draw; or nothing."""
-    told = f"{type(error).__module__} {error}".lower()
-    if sys.platform != "linux" or not any(k in told for k in ("opengl", "egl", "osmesa", "glfw")):
+    """Return advice, after a space, where OpenGL could not draw; else an empty text."""
+    message = f"{type(error).__module__} {error}".lower()
+    if sys.platform != "linux" or not any(
+        k in message for k in ("opengl", "egl", "osmesa", "glfw")
+    ):
         return ""
     now = os.environ.get("MUJOCO_GL")
     return (

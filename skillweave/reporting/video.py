@@ -1,7 +1,8 @@
-"""Videos of a policy at work: who acts is written under every frame."""
+"""Videos of a policy at work, with the acting skill's name under every frame."""
 
 from __future__ import annotations
 
+import base64
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -14,20 +15,22 @@ from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
-from skillweave.messages import told, whole_number
+from skillweave.messages import error_text, whole_number
+from skillweave.notebooks import Markup, joined, paragraph
 from skillweave.reporting.captions import caption
 from skillweave.reporting.palette import BLACK, PALETTE, RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
 from skillweave.seeding import Seeds, global_generators
+from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.types import Array, Memory, Policy
 
-__all__ = ["PALETTE", "VideoWriter", "caption", "color_of", "render_policy"]
+__all__ = ["PALETTE", "Film", "VideoWriter", "caption", "color_of", "render_policy"]
 
 MAX_WIDTH = 960  # pixels; larger frames are reduced
-HOLD = 1.0  # seconds that the last frame of an episode stands
+HOLD = 1.0  # seconds for which the last frame of an episode stays
 Label = Callable[[Memory], tuple[str, RGB]] | None
 
 
@@ -52,9 +55,9 @@ def render_policy(
     Args:
         seed: episode i starts from ``reset(seed=seed + i)``.
         max_steps: of an episode; None: the environment's own limit, at most ``LONG_EPISODE``.
-        label: from the policy's memory after ``act`` to who acted, and its colour.
-        fps: steps shown per second; None: as many as the environment says, so in real time.
-        every: one frame for so many steps, and one for the end of each episode.
+        label: from the policy's memory after ``act`` to the acting skill's name and colour.
+        fps: steps shown per second; None: the environment's own, in real time.
+        every: steps for each frame; each episode's end has a frame of its own.
         rng: for ``act``; None: derived from ``seed``.
         quiet: no progress.
 
@@ -72,7 +75,7 @@ def render_policy(
     rng = rng or (Seeds(seed) / "render").numpy()
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")
-        # Observations, infos and masks are those of an evaluation.
+        # Observations, infos and masks are as in an evaluation.
         engine = GymnasiumEngine(lambda number: env, 1, env_spec.name)
         try:
             rate = (fps or env.metadata.get("render_fps") or 30) / every
@@ -92,7 +95,7 @@ def render_policy(
 
 
 class _Film:
-    """Frames of episodes as they are played, and what is told of each."""
+    """Frames of episodes as they are played, and the facts about each."""
 
     def __init__(
         self, env: gym.Env[Any, Any], video: VideoWriter, every: int, label: Label
@@ -103,7 +106,9 @@ class _Film:
 
     def _begin(self) -> None:
         self._elapsed, self._total = 0, 0.0
-        self._who, self._color, self._skills = "", BLACK, Counter[str]()
+        self._who = ""
+        self._color = BLACK
+        self._skills = Counter[str]()
 
     def before_step(self, memory: Memory) -> None:
         """Show what the policy is about to do."""
@@ -119,10 +124,14 @@ class _Film:
         self._total += float(played.reward[0])
         if played.over[0]:
             self._show("final return", HOLD)
-            self.episodes.append({
-                "return": self._total, "length": self._elapsed, "cut": bool(played.cut[0]),
-                "skills": dict(self._skills),
-            })  # fmt: skip
+            self.episodes.append(
+                {
+                    "return": self._total,
+                    "length": self._elapsed,
+                    "cut": bool(played.cut[0]),
+                    "skills": dict(self._skills),
+                }
+            )
             self._begin()
 
     def _show(self, word: str, seconds: float | None = None) -> None:
@@ -131,15 +140,45 @@ class _Film:
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
-    """What the environment shows now, reduced to at most ``MAX_WIDTH``."""
+    """Return the environment's picture, reduced to at most ``MAX_WIDTH``."""
     name = type(env.unwrapped).__name__
     try:
         frame: Any = env.render()
     except (Exception, SystemExit) as error:
         raise EnvError(
-            f"{name} cannot be filmed: its render() raised {told(error)}.{hint(error)}"
+            f"{name} cannot be filmed: its render() raised {error_text(error)}.{hint(error)}"
         ) from error
     if not isinstance(frame, np.ndarray):
         raise EnvError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
     factor = -(-frame.shape[1] // MAX_WIDTH)
     return frame if factor == 1 else np.asarray(extra("PIL.Image").fromarray(frame).reduce(factor))
+
+
+LARGEST = 50_000_000
+"""Bytes of a film that a notebook shows: it keeps a copy inside."""
+
+
+class Film(dict[str, Any]):
+    """A film's ``path``, ``frames`` and ``episodes``. A notebook shows the film."""
+
+    def __repr__(self) -> str:
+        returns = ", ".join(f"{episode['return']:.1f}" for episode in self["episodes"])
+        return printable(f"<Film {self['path']}: {self['frames']:,} frames, return {returns}>")
+
+    def _repr_html_(self) -> str:
+        """Return the film as a part of the page."""
+        path = Path(self["path"])
+        caption = paragraph(repr(self).strip("<>"))
+        try:
+            data = path.read_bytes() if path.stat().st_size <= LARGEST else None
+        except OSError as error:
+            return joined([caption, paragraph(f"The film cannot be read: {error.strerror}.")])
+        if data is None:
+            return joined([caption, paragraph("It is too large to be shown here.")])
+        text = base64.b64encode(data).decode()
+        if path.suffix.lower() == ".gif":
+            shown = f'<img src="data:image/gif;base64,{text}" style="max-width: 100%">'
+        else:
+            source = f"data:video/mp4;base64,{text}"
+            shown = f'<video src="{source}" controls loop muted style="max-width: 100%"></video>'
+        return joined([Markup(shown), caption])

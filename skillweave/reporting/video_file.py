@@ -26,7 +26,7 @@ class VideoWriter:
         path: ends in .gif or .mp4. An existing file is replaced at the end, and stays as it is
             if the writing fails or is interrupted.
         fps: frames per second.
-        most_bits: of an MP4, at most so many bits per second; None: as many as it takes.
+        most_bits: most bits per second of an MP4; None: no limit.
 
     Raises:
         DeclarationError: the path has another suffix.
@@ -50,7 +50,7 @@ class VideoWriter:
         self._sink = kind(self._part, fps)
 
     def add(self, frame: Array, seconds: float | None = None) -> None:
-        """Append a frame (H, W, 3) uint8 that stands for ``seconds``, by default 1 / fps."""
+        """Append a frame (H, W, 3) uint8 that stays for ``seconds``, by default 1 / fps."""
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             raise EnvError(f"a frame is (H, W, 3) uint8, not {frame.shape} {frame.dtype}")
         if frame.shape != (self._shape or frame.shape):
@@ -138,7 +138,7 @@ class _Gif:
         self._file.writelines(self._codec.getdata(patch, (columns.start, rows.start), **settings))
 
     def _start(self, first: Any) -> None:
-        """One palette for all, or colours would flicker.
+        """Start a GIF with one palette for all frames, or colours would flicker.
 
         The captions' own colours, so that text stays crisp, a cube for whatever is to come, and
         the best for the first frame. ``CLEAR`` repeats the first, and so shows nothing of its own.
@@ -162,13 +162,13 @@ class _Gif:
 
 
 def _extent(changed: Array) -> slice:
-    """From the first to the last true entry; one at least, as GIF has no empty frames."""
+    """Return the range of true entries; one at least, as GIF has no empty frames."""
     at = np.flatnonzero(changed)
     return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
 
 
 def extra(module: str) -> Any:
-    """A module of the extra 'video'; MissingExtra where it is not installed."""
+    """Return a module of the extra 'video'; MissingExtra where it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Shapes with smooth edges, drawn into pictures by NumPy alone.
+"""Shapes with smooth edges by NumPy alone, for pictures of any toy.
 
 A shape is an array of signed distances: for each pixel the distance to the shape's edge, in the
 world's units and negative inside. The union of two shapes is their ``np.minimum``.

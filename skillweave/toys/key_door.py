@@ -24,9 +24,16 @@ EXIT_X, EXIT_Y = 0.8, 0.3
 """The exit is where x > 0.8 and |y| < 0.3."""
 
 PIXELS, EXTENT, MARGIN = 320, 1.15, 1.07
-FLOOR, STONE, WOOD = (247, 245, 240), (58, 66, 82), (166, 98, 47)
-GREEN, GOLD, BLUE, WHITE = (134, 206, 150), (240, 180, 20), (38, 98, 210), (255, 255, 255)
-DARK_GREEN, DARK_GOLD, DARK_BLUE = (40, 132, 72), (140, 98, 0), (20, 52, 120)
+FLOOR = (247, 245, 240)
+STONE = (58, 66, 82)
+WOOD = (166, 98, 47)
+GREEN = (134, 206, 150)
+GOLD = (240, 180, 20)
+BLUE = (38, 98, 210)
+WHITE = (255, 255, 255)
+DARK_GREEN = (40, 132, 72)
+DARK_GOLD = (140, 98, 0)
+DARK_BLUE = (20, 52, 120)
 
 
 class KeyDoor(gym.Env[Array, Array]):

@@ -609,7 +609,7 @@ def test_a_file_that_trains_as_soon_as_it_is_read_says_so(
     file.write_text(f"{PLAIN}\nfrom skillweave import train_agent\n{line}\n")
     answer = call("train", file, "-o", "run")
     assert answer.code == 1
-    assert f"{file} trains as soon as it is read" in " ".join(answer.err.split())
+    assert f"{file} starts training on import" in " ".join(answer.err.split())
     assert "__main__" in answer.err
     assert not Path("inner").exists()
     assert not Path("run").exists()
@@ -632,7 +632,7 @@ def test_a_file_that_resumes_a_run_as_soon_as_it_is_read_may_do_so_only_if_that_
         assert call("train", trained.plain, "-o", "run").code != 0
     answer = call("info", file)
     assert answer.code == 1
-    assert "trains as soon as it is read" in " ".join(answer.err.split())
+    assert "starts training on import" in " ".join(answer.err.split())
 
 
 def test_a_failed_command_with_json_prints_one_json_object_too(call: Call) -> None:

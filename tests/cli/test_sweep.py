@@ -9,8 +9,8 @@ from small_runs import interrupt_at_checkpoint
 
 from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
+from skillweave.cli.sweep import summary
 from skillweave.cli.sweep_code import code_files
-from skillweave.cli.sweep_table import summary
 from skillweave.errors import SkillweaveError
 from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory
@@ -91,7 +91,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, 
     _, whole = answer(capsys, [w.replace("runs", "whole") for w in one])
     interrupt_at_checkpoint(monkeypatch, 2)
     assert main(one) == 130
-    assert "0 of 1 runs are finished; the same command goes on" in capsys.readouterr().out
+    assert "0 of 1 runs are finished; the same command continues" in capsys.readouterr().out
     trained.clear()
     _, found = answer(capsys, one)
     assert trained == ["s3"]

@@ -190,7 +190,9 @@ def test_a_run_on_ray_goes_on_in_processes_and_ends_as_if_nothing_had_happened(
     with pytest.raises(KeyboardInterrupt):
         agent.train(tmp_path / "on", quiet=True, cluster=Ray(collectors=2))
     assert 0 < read_tensors(tmp_path / "on" / "checkpoint.safetensors")[1]["steps"] < 512
-    with pytest.raises(SkillweaveError, match="was begun with 2 collectors, and goes on with as"):
+    with pytest.raises(
+        SkillweaveError, match="was started with 2 collectors, and continues with as"
+    ):
         agent.resume(tmp_path / "on", quiet=True, cluster=Ray(collectors=4))
     agent.resume(tmp_path / "on", quiet=True)
     assert learnt(tmp_path / "on") == learnt(tmp_path / "whole")

@@ -112,22 +112,18 @@ def test_both_spellings_mean_the_same():
             assert getattr(place, old) is getattr(place, today)
 
 
-def code_lines(source: str) -> int:
-    """Lines that are neither blank, nor a comment, nor part of a docstring."""
-    lines = {i for i, line in enumerate(source.splitlines(), 1) if line.strip()}
-    lines -= {i for i in lines if source.splitlines()[i - 1].lstrip().startswith("#")}
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            first = node.body[0] if node.body else None
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                lines -= set(range(first.lineno, (first.end_lineno or 0) + 1))
-    return len(lines)
+def statements(source: str) -> int:
+    """Count statements, docstrings left out: however many lines each of them takes."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)]
+    return sum(
+        not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)) for node in nodes
+    )
 
 
 def test_the_count_leaves_out_what_is_no_code():
-    assert code_lines('"""A\n\nb."""\n\nx = 1  # one\n# two\ndef f():\n    """C."""\n') == 2
+    assert statements('"""A\n\nb."""\n\nx = 1  # one\n# two\ndef f():\n    """C."""\n') == 2
 
 
 def test_the_shim_is_thin():
     files = (ROOT / "skillweave/compat/agilerl").rglob("*.py")
-    assert sum(code_lines(path.read_text()) for path in files) <= 600
+    assert sum(statements(path.read_text()) for path in files) <= 450

@@ -15,9 +15,9 @@ from reporting.walkway import CALLS, Moody, Walkway, declare
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
 from skillweave.reporting.report import calls, charts
+from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
 from skillweave.reporting.report.film import HOLD, make_film
-from skillweave.reporting.report.group_charts import scores
 from skillweave.reporting.report.groups import grouped
 from skillweave.reporting.report.seeds import on_one_grid, over_seeds
 from skillweave.reporting.report.skills_table import transition_rows, transitions

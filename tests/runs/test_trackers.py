@@ -181,8 +181,8 @@ def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
 def test_a_film_in_the_run_itself_goes_to_its_trackers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import skillweave.api as module
     from skillweave import PPO, Network, train_agent
-    from skillweave.api import run as module
 
     small = PPO(num_envs=2, n_steps=8, batch_size=16, network=Network((4,)))
     trained = train_agent("CartPole-v1", small, 16, tmp_path / "run", quiet=True)

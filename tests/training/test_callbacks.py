@@ -317,7 +317,7 @@ def test_functions_written_in_c_and_partial_ones_are_callbacks(tmp_path: Path) -
 
 
 def test_a_run_says_that_a_callback_ended_it(tmp_path: Path) -> None:
-    from skillweave.cli.run_lines import run_lines
+    from skillweave.cli.execute import run_lines
     from skillweave.reporting.report.facts import stage_rows
 
     agent().train(tmp_path / "run", quiet=True, callback=stops_at(300))

@@ -1,4 +1,4 @@
-"""AgileRL 0.1's module paths and names on Skillweave; docs/from-agilerl.md says what differs."""
+"""AgileRL 0.1's module paths and names on Skillweave; docs/from-agilerl.md has the differences."""
 
 import functools
 import warnings
@@ -20,7 +20,7 @@ def _warn() -> None:
 
 
 stay_offline()
-# Gymnasium's own warning, at each make, says less than ours.
+# Gymnasium's own warning, at each make, is less exact than ours.
 warnings.filterwarnings("ignore", ".*LunarLander.*-v2 is out of date", DeprecationWarning)
 for _name in ("LunarLander", "LunarLanderContinuous"):
     if f"{_name}-v2" not in gym.registry and f"{_name}-v3" in gym.registry:

@@ -20,7 +20,7 @@ _PAST = ("scores", "fitness", "steps", "mut", "index", "beta", "prior_eps")
 
 
 class Setting:
-    """An attribute that stands for a field of the native config.
+    """An attribute in place of a field of the native config.
 
     ``inverse``: its value is 1 / field; ``share``: field times the field of this name.
     """
@@ -40,7 +40,7 @@ class Setting:
         agent.native.set(**self.native(value / whole if whole else value))
 
     def native(self, value: Any) -> dict[str, Any]:
-        """The native field, with the value that ``value`` stands for."""
+        """Return the native field for AgileRL's ``value``."""
         return {self.field: 1.0 / float(value) if self.inverse else plain(value)}
 
 
@@ -57,8 +57,10 @@ class Agent:
     def __init_subclass__(cls) -> None:
         cls.get_action = cls.getAction
 
-    def _start(self, given: Any, actions: gym.Space[Any], make: Any = None, **own: Any) -> None:
-        """Begin with fresh weights; ``given`` are the constructor's arguments."""
+    def _start(
+        self, given: Any, actions: gym.Space[Any], make: Any = None, **settings: Any
+    ) -> None:
+        """Start with fresh weights; ``given`` are the constructor's arguments."""
         for name, value in given.items():
             if (name == "accelerator" or "_network" in name) and value is not None:
                 raise DeclarationError(
@@ -66,21 +68,28 @@ class Agent:
                     "see register_encoder of the native API"
                 )
             if isinstance(setting := getattr(type(self), name, None), Setting):
-                own = setting.native(value) | own
+                settings = setting.native(value) | settings
         network = given["net_config"]
-        own["normalize_obs"] = False  # AgileRL does not
-        own["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
+        settings["normalize_obs"] = False  # AgileRL does not
+        settings["network"] = network_of(network, "Tanh" if self.algo == "PPO" else "ReLU")
         seen = observations_of(given["state_dim"], given["one_hot"], network)
         self._wrap(
-            SingleAgent(Member(0, (make or self.kind)(**own), None), (seen, actions), random_seed())
+            SingleAgent(
+                Member(0, (make or self.kind)(**settings), None), (seen, actions), random_seed()
+            )
         )
-        self.index, self.mut, self.device = given["index"], given["mut"], given["device"]
+        self.index = given["index"]
+        self.mut = given["mut"]
+        self.device = given["device"]
 
     def _wrap(self, native: SingleAgent) -> None:
         self.native, (seen, action_space) = native, native.spaces
         self.scores: list[float] = []
         self.fitness: list[float] = []
-        self.index, self.mut, self.steps, self.device = 0, None, [0], "cpu"
+        self.index = 0
+        self.mut = None
+        self.steps = [0]
+        self.device = "cpu"
         self.one_hot, self.discrete_actions = not seen.shape, not action_space.shape
         self.state_dim = seen.shape or (int(seen.n),)
         self.action_dim = int(action_space.shape[0] if action_space.shape else action_space.n)
@@ -88,7 +97,7 @@ class Agent:
     def test(
         self, env: Any, swap_channels: bool = False, max_steps: int = 500, loop: int = 3
     ) -> float:
-        """Mean return of ``loop`` episodes in the first environment; kept in ``fitness``."""
+        """Append to ``fitness`` and return the mean return of ``loop`` episodes."""
 
         def act(state: Any) -> Any:
             action = self.getAction(swapped(state, swap_channels))
@@ -98,12 +107,12 @@ class Agent:
         return self.fitness[-1]
 
     def clone(self, index: int | None = None, wrap: bool = True) -> Self:
-        """A copy of the agent with its own random streams."""
-        found = type(self).__new__(type(self))
-        found._wrap(self.native.copy(random_seed()))
-        found.__dict__.update(self._past(), device=self.device)
-        found.index = self.index if index is None else index
-        return found
+        """Return a copy of the agent with its own random streams."""
+        copy = type(self).__new__(type(self))
+        copy._wrap(self.native.copy(random_seed()))
+        copy.__dict__.update(self._past(), device=self.device)
+        copy.index = self.index if index is None else index
+        return copy
 
     def _past(self) -> dict[str, Any]:
         return {k: np.array(getattr(self, k)).tolist() for k in _PAST if hasattr(self, k)}
@@ -128,25 +137,25 @@ class Agent:
 
     @classmethod
     def load(cls, path: str | Path, device: Any = "cpu", accelerator: Any = None) -> Self:
-        """The agent in a checkpoint; see ``loadCheckpoint``."""
-        found = cls.__new__(cls)
-        found.loadCheckpoint(path)
-        found.device = device
-        return found
+        """Return the agent in a checkpoint; see ``loadCheckpoint``."""
+        agent = cls.__new__(cls)
+        agent.loadCheckpoint(path)
+        agent.device = device
+        return agent
 
     save_checkpoint, load_checkpoint = saveCheckpoint, loadCheckpoint
 
 
 def random_seed() -> int:
-    """A seed from torch's generator, so that ``torch.manual_seed`` makes agents repeatable."""
+    """Return a seed from torch's generator, which ``torch.manual_seed`` repeats."""
     return int(torch.randint(2**62, (), device="cpu"))
 
 
 def plain(value: Any) -> Any:
-    """NumPy numbers and arrays as Python's."""
+    """Return NumPy numbers and arrays as Python's."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def swapped(state: Any, swap: bool) -> Any:
-    """Observations, with the channels moved to the front if ``swap``."""
+    """Return observations, with the channels moved to the front if ``swap``."""
     return np.moveaxis(state, -1, -3) if swap else state

@@ -21,22 +21,39 @@ class PPO(Agent):
     action_std_init = Setting("action_std_init")
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, discrete_actions: bool,
-        index: int = 0, net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4,
-        gamma: float = 0.99, gae_lambda: float = 0.95, mut: str | None = None,
-        action_std_init: float = 0.6, clip_coef: float = 0.2, ent_coef: float = 0.01,
-        vf_coef: float = 0.5, max_grad_norm: float = 0.5, target_kl: float | None = None,
-        update_epochs: int = 4, actor_network: Any = None, critic_network: Any = None,
-        device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        discrete_actions: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        mut: str | None = None,
+        action_std_init: float = 0.6,
+        clip_coef: float = 0.2,
+        ent_coef: float = 0.01,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        target_kl: float | None = None,
+        update_epochs: int = 4,
+        actor_network: Any = None,
+        critic_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         actions: gym.Space[Any] = gym.spaces.Box(-np.inf, np.inf, (action_dim,), np.float32)
         actions = gym.spaces.Discrete(action_dim) if discrete_actions else actions
-        own = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
-        own["min_advantage_std"] = 0.0  # AgileRL has no such limit
-        self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **own)
+        settings = {"learning_rate_schedule": "constant", "adam_eps": 1e-8, "num_envs": 1}
+        settings["min_advantage_std"] = 0.0  # AgileRL has no such limit
+        self._start(locals(), actions, n_steps=2**31, normalize_obs=False, **settings)
 
     def getAction(self, state: Any, action: Any = None, grad: bool = False) -> tuple[Array, ...]:
-        """Sampled actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
+        """Sample actions int64 (B,) or float32 (B, A); log-probabilities, entropies, values."""
         if action is not None or grad:
             raise DeclarationError("getAction(action=, grad=) is a part of learning: use learn()")
         return self.native.sample(state)
@@ -47,9 +64,9 @@ class PPO(Agent):
         Last come the observations (N, ...) after the last step. Returns the loss.
         """
         *steps, _, after = experiences
-        found = self.native.learn_steps(*steps, after)
-        value_part = self.vf_coef * found["value_loss"] - self.ent_coef * found["entropy"]
-        return float(found["policy_loss"] + value_part)
+        losses = self.native.learn_steps(*steps, after)
+        value_part = self.vf_coef * losses["value_loss"] - self.ent_coef * losses["entropy"]
+        return float(losses["policy_loss"] + value_part)
 
 
 class DQN(Agent):
@@ -60,19 +77,32 @@ class DQN(Agent):
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
-        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 1e-3, mut: str | None = None, double: bool = False,
-        actor_network: Any = None, device: Any = "cpu", accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 1e-3,
+        mut: str | None = None,
+        double: bool = False,
+        actor_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         self._start(locals(), gym.spaces.Discrete(action_dim), loss="mse")
 
     def getAction(self, state: Any, epsilon: float = 0, action_mask: Any = None) -> Array:
-        """Actions (B,) int64: with probability ``epsilon`` any of those allowed, else the best."""
+        """Return actions (B,) int64: any allowed one with probability ``epsilon``, or the best."""
         return self.native.act(state, explore=False, epsilon=epsilon, mask=action_mask)
 
     def learn(self, experiences: Any) -> float:
-        """One gradient step; the loss."""
+        """Make one gradient step; return the loss."""
         return self.native.learn_sample(self.gamma, *experiences[:5])[0]["loss"]
 
 
@@ -80,27 +110,45 @@ class RainbowDQN(Agent):
     """A DQN agent with every extension of Rainbow."""
 
     algo, kind, beta, prior_eps = "Rainbow DQN", config.DQN, 0.4, 1e-6
-    lr, num_atoms, n_step = Setting("learning_rate"), Setting("n_atoms"), Setting("n_step")
+    lr = Setting("learning_rate")
+    num_atoms = Setting("n_atoms")
+    n_step = Setting("n_step")
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
     v_min, v_max = Setting("v_min"), Setting("v_max")
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, index: int = 0,
-        net_config: Any = MLP, batch_size: int = 64, lr: float = 1e-4, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 1e-3, beta: float = 0.4, prior_eps: float = 1e-6,
-        num_atoms: int = 51, v_min: float = -10, v_max: float = 10, n_step: int = 3,
-        mut: str | None = None, actor_network: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr: float = 1e-4,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 1e-3,
+        beta: float = 0.4,
+        prior_eps: float = 1e-6,
+        num_atoms: int = 51,
+        v_min: float = -10,
+        v_max: float = 10,
+        n_step: int = 3,
+        mut: str | None = None,
+        actor_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         self._start(locals(), gym.spaces.Discrete(action_dim), config.DQN.rainbow)
         self.beta, self.prior_eps = beta, prior_eps
 
     def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
-        """The best actions (B,) int64; with noise in the weights while ``training``."""
+        """Return the best actions (B,) int64; with noise in the weights while ``training``."""
         return self.native.act(state, explore=training, mask=action_mask)
 
     def learn(self, experiences: Any, n_step: bool = False, per: bool = False) -> Any:
-        """One gradient step; the loss, the samples' indices and their new priorities.
+        """Make one gradient step; return the loss, the samples' indices and their new priorities.
 
         After the five of every sample come, with ``per``, weights and indices; with ``n_step``
         the five again, summed over n steps: only these are learnt from then.
@@ -124,25 +172,46 @@ class TD3(Agent):
     tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
-        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
-        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 0.005, mut: str | None = None, policy_freq: int = 2,
-        actor_network: Any = None, critic_networks: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
-        # In place of what the Setting says of lr_actor alone: a share needs both rates.
-        own = {"actor_rate": lr_actor / lr_critic, "twin": self.twin, "n_step": 1, "action_l2": 0.0}
-        own |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        max_action: float = 1,
+        min_action: float = -1,
+        expl_noise: float = 0.1,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr_actor: float = 1e-4,
+        lr_critic: float = 1e-3,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        mut: str | None = None,
+        policy_freq: int = 2,
+        actor_network: Any = None,
+        critic_networks: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
+        # In place of the Setting of lr_actor alone: a share needs both rates.
+        settings = {
+            "actor_rate": lr_actor / lr_critic,
+            "twin": self.twin,
+            "n_step": 1,
+            "action_l2": 0.0,
+        }
+        settings |= {"exploration_noise": 2.0 * expl_noise / (max_action - min_action)}
         actions = gym.spaces.Box(min_action, max_action, (action_dim,), np.float32)
-        self._start(locals(), actions, **own)
+        self._start(locals(), actions, **settings)
 
     def getAction(self, state: Any, epsilon: float = 0) -> Array:
-        """Actions (B, A) float32: with probability ``epsilon`` any, else the actor's with noise."""
+        """Return actions (B, A) float32: random with probability ``epsilon``, or noisy."""
         return self.native.act(state, epsilon=epsilon)
 
     def learn(self, experiences: Any, noise_clip: float = 0.5, policy_noise: float = 0.2) -> Any:
-        """One gradient step; the actor's loss, None where it is not its turn, and the critics'."""
+        """Make one gradient step; return the losses of actor (or None) and critics."""
         state = self.native.member.state
         state.target_noise.fill_(policy_noise)
         state.target_noise_clip.fill_(noise_clip)
@@ -157,12 +226,28 @@ class DDPG(TD3):
     algo, twin = "DDPG", False
 
     def __init__(
-        self, state_dim: Any, action_dim: int, one_hot: bool, max_action: float = 1,
-        min_action: float = -1, expl_noise: float = 0.1, index: int = 0, net_config: Any = MLP,
-        batch_size: int = 64, lr_actor: float = 1e-4, lr_critic: float = 1e-3, learn_step: int = 5,
-        gamma: float = 0.99, tau: float = 0.001, mut: str | None = None, policy_freq: int = 2,
-        actor_network: Any = None, critic_network: Any = None, device: Any = "cpu",
-        accelerator: Any = None, wrap: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        state_dim: Any,
+        action_dim: int,
+        one_hot: bool,
+        max_action: float = 1,
+        min_action: float = -1,
+        expl_noise: float = 0.1,
+        index: int = 0,
+        net_config: Any = MLP,
+        batch_size: int = 64,
+        lr_actor: float = 1e-4,
+        lr_critic: float = 1e-3,
+        learn_step: int = 5,
+        gamma: float = 0.99,
+        tau: float = 0.001,
+        mut: str | None = None,
+        policy_freq: int = 2,
+        actor_network: Any = None,
+        critic_network: Any = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+        wrap: bool = True,
+    ) -> None:
         given = {k: v for k, v in locals().items() if k not in ("self", "__class__")}
         super().__init__(**{k.replace("c_network", "c_networks"): v for k, v in given.items()})

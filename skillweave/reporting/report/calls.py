@@ -1,4 +1,4 @@
-"""The calls of a report's episodes as plain data: timelines, transitions, choices."""
+"""The calls of a report's episodes as plain data, apart from words: timelines, choices."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_CALLS, MOST_CALLS_OF_ONE = 6_000, 1_500  # on the page: of all episodes, an
 
 
 def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
-    """The numbers of ``count`` episodes, from the one with the least return to the best."""
+    """Return the numbers of ``count`` episodes, from the one with the least return to the best."""
     order = np.argsort([e.total for e in episodes], kind="stable")
     places = np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(int)
     return [int(i) for i in order[places]]
@@ -28,7 +28,7 @@ def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
 def episode_data(
     log: CallLog, film: Film | None, named: ObsNames | None = None
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Each episode with its calls, and sentences on what is left out.
+    """Return each episode with its calls, and sentences on what is left out.
 
     Those in the film come first, in its order.
 
@@ -63,20 +63,25 @@ def _episode(
     totals = [rounded(total) for total in sums]
     calls = [
         [
-            c.skill, c.start, c.steps, c.why, rounded(c.reward),
-            None if c.own is None else rounded(c.own), c.succeeded,
+            c.skill,
+            c.start,
+            c.steps,
+            c.why,
+            rounded(c.reward),
+            None if c.own is None else rounded(c.own),
+            c.succeeded,
         ]
         for c in episode.calls[:MOST_CALLS_OF_ONE]
-    ]  # fmt: skip
-    told: dict[str, Any] = {
+    ]
+    entry: dict[str, Any] = {
         "number": number + 1,
         "seed": episode.seed,
         "return": rounded(episode.total),
     }
-    told |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
+    entry |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
     _, observed = seen(episode.calls[:MOST_CALLS_OF_ONE], named)
-    told |= {"seen": observed} if observed else {}
-    return told | {"totals": totals, "calls": calls}
+    entry |= {"seen": observed} if observed else {}
+    return entry | {"totals": totals, "calls": calls}
 
 
 def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
@@ -103,7 +108,7 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
 
 
 def decision_data(log: CallLog, named: ObsNames | None = None) -> dict[str, Any]:
-    """What was chosen at which observation: names of coordinates, and a row for each decision.
+    """Return the decisions by observation: names of coordinates, and a row for each decision.
 
     A row is the coordinates, then the skill, then whether its call succeeded (None: not known).
     Only coordinates that vary are there; the episode's step is the last one.
@@ -123,7 +128,7 @@ def decision_data(log: CallLog, named: ObsNames | None = None) -> dict[str, Any]
 
 
 def seen(calls: Sequence[Call], named: ObsNames | None) -> tuple[list[str], list[list[float]]]:
-    """Return the named numbers of what was observed when calls began, and their values of each.
+    """Return the names of the numbers observed at the starts of calls, and their values.
 
     There are none where observations have no names, or more than the page has room for.
     """
@@ -142,10 +147,10 @@ def rounded(value: float) -> float:
 
 
 def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
-    """The numbers of a batch of observations by name, (n,) each; none where they are images.
+    """Return the numbers of a batch of observations by name, (n,) each; none where they are images.
 
     Args:
-        names: what they are called, where these are as many; see ``names_misfit``.
+        names: names for the numbers, where there are as many; see ``names_misfit``.
     """
     named = names if isinstance(names, Mapping) else {}
     if obs.dtype.names is not None:
@@ -153,7 +158,7 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
         parts = [(f'obs["{key}"]', obs[key], named.get(key)) for key in keys]
     else:
         parts = [("obs", obs, None if isinstance(names, Mapping) else names)]
-    found: dict[str, Array] = {}
+    columns: dict[str, Array] = {}
     for name, part, own in parts:
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
@@ -162,6 +167,6 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
             alone = part.ndim == 1
             for i in range(flat.shape[1]):
                 usual = name if alone else f"{name}[{i}]"
-                told = own[i] if own is not None and len(own) == flat.shape[1] else usual
-                found[usual if told in found else told] = flat[:, i].astype(float)
-    return {k: v for k, v in found.items() if np.isfinite(v).all()}
+                label = own[i] if own is not None and len(own) == flat.shape[1] else usual
+                columns[usual if label in columns else label] = flat[:, i].astype(float)
+    return {k: v for k, v in columns.items() if np.isfinite(v).all()}

@@ -1,6 +1,6 @@
 """The charts of reports, as specifications in Vega-Lite; the page gives them its colours.
 
-A specification is plain data, and the data that it shows stand in it. ``vega`` in a browser draws
+A specification is plain data, and holds its data. ``vega`` in a browser draws
 it (https://vega.github.io/vega-lite/docs/).
 """
 
@@ -19,7 +19,7 @@ COMPLEMENT = ("gamma", "gae_lambda")
 
 
 def chart(description: str, height: int, **rest: Any) -> Spec:
-    """What all charts have in common; as wide as the page lets it be."""
+    """Return the specification that all charts share, as wide as its place in the page."""
     schema = "https://vega.github.io/schema/vega-lite/v6.json"
     size = {
         "width": "container",
@@ -30,79 +30,94 @@ def chart(description: str, height: int, **rest: Any) -> Spec:
 
 
 def number_axis(field: str, title: str, **rest: Any) -> dict[str, Any]:
-    """The encoding of a number that need not begin at zero."""
+    """Return the encoding of a number whose axis need not include zero."""
     scale = {"zero": False, "nice": True} | rest.pop("scale", {})
     return {"field": field, "type": "quantitative", "title": title, "scale": scale} | rest
 
 
 def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
-    """The encoding of steps: 200k, 1M."""
+    """Return the encoding of steps: 200k, 1M."""
     label = "datum.value === 0 ? '0' : format(datum.value, '~s')"
     axis = {"labelExpr": label, "tickCount": 5, "labelOverlap": True}
     return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
 
 
 def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]:
-    """Layers that show the nearest point under the pointer, with a box of its values."""
-    near = {"name": "near", "select": {"type": "point", "on": "pointerover", "nearest": True,
-            "encodings": ["x"], "clear": "pointerout"}}  # fmt: skip
+    """Return layers that show the nearest point under the pointer, with a box of its values."""
+    near = {
+        "name": "near",
+        "select": {
+            "type": "point",
+            "on": "pointerover",
+            "nearest": True,
+            "encodings": ["x"],
+            "clear": "pointerout",
+        },
+    }
     opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
     mark = {"type": "point", "filled": True, "size": 60, "aria": False}
     return [
-        {"params": [near], "mark": mark,
-         "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)}}
-    ]  # fmt: skip
+        {
+            "params": [near],
+            "mark": mark,
+            "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)},
+        }
+    ]
 
 
 def curve(label: str, color: str) -> Spec:
-    """One agent's metric over its steps; the page sets the values and the name of the metric."""
-    own = {"value": color}
-    told = [
+    """Return a chart of one agent's metric; the page sets its values and its name."""
+    hue = {"value": color}
+    tooltip = [
         {"field": "x", "type": "quantitative", "title": STEPS, "format": ",d"},
         {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~r"},
     ]
     mark = {"type": "line", "strokeWidth": 2, "strokeJoin": "round", "aria": False}
-    layers = [{"mark": mark, "encoding": {"color": own}}, *hover(told, own)]
+    layers = [{"mark": mark, "encoding": {"color": hue}}, *hover(tooltip, hue)]
     encoding = {"x": steps_axis(), "y": number_axis("y", "", axis={"tickCount": 5})}
     return chart(f"Learning curve of {label}", 190, encoding=encoding, layer=layers)
 
 
 def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
-    """Decisions over two coordinates, coloured by skill; the page sets values and names."""
+    """Return a chart of decisions over two coordinates; the page sets values and names."""
     scale = {"domain": list(skills), "range": list(colors)}
     shapes = ["circle", "square", "triangle-up", "diamond", "cross", "triangle-down"]
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
     legend = {"orient": "top", "title": None, "symbolOpacity": 1}
     encoding = {
-        "x": number_axis("x", "", axis={"tickCount": 8}), "y": number_axis("y", ""),
+        "x": number_axis("x", "", axis={"tickCount": 8}),
+        "y": number_axis("y", ""),
         "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
         "shape": {"field": "what", "type": "nominal", "scale": shape},
-        "tooltip": [{"field": "what", "title": "chosen"}, {"field": "x", "format": ",.4~r"},
-                    {"field": "y", "format": ",.4~r"}],
-    }  # fmt: skip
+        "tooltip": [
+            {"field": "what", "title": "chosen"},
+            {"field": "x", "format": ",.4~r"},
+            {"field": "y", "format": ",.4~r"},
+        ],
+    }
     mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
-    return chart("What the selector chose over two coordinates", 360, mark=mark, encoding=encoding)
+    return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
 
 def family_tree(lineage: Lineage, color: str) -> Spec:
-    """Fitness by generation, each member joined to its parent; the winner's line in colour."""
+    """Return a chart of fitness by generation, each member joined to its parent."""
     path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}
     dots, lines = [], []
     for key, born in lineage.born.items():
         if born.fitness is None:
             continue
-        told: dict[str, Any] = {
+        dot: dict[str, Any] = {
             "x": born.generation + 1,
             "y": round(born.fitness, 3),
             "won": key in path,
         }
         what = "winner's line" if key in path else "other members"
-        told |= {"member": born.member, "how": what_changed(born), "what": what}
-        dots.append(told)
+        dot |= {"member": born.member, "how": what_changed(born), "what": what}
+        dots.append(dot)
         parent = lineage.parent(born)
         if parent is not None and parent.fitness is not None:
             ends: dict[str, Any] = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
-            lines.append({k: told[k] for k in ("x", "y", "won", "what")} | ends)
+            lines.append({k: dot[k] for k in ("x", "y", "won", "what")} | ends)
     axis = {"tickMinStep": 1, "format": "d"}
     x = number_axis("x", "generation", axis=axis)
     y = number_axis("y", "fitness: mean return")
@@ -119,17 +134,22 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     thick = {"condition": {"test": "datum.won", "value": 2.5}, "value": 1}
     big = {"condition": {"test": "datum.won", "value": 70}, "value": 25}
     layer: list[Spec] = [
-        {"data": {"values": lines}, "mark": {"type": "rule", "aria": False},
-         "encoding": joined | {"strokeWidth": thick}},
-        {"data": {"values": dots},
-         "mark": {"type": "circle", "opacity": 1, "aria": False},
-         "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip}},
-    ]  # fmt: skip
+        {
+            "data": {"values": lines},
+            "mark": {"type": "rule", "aria": False},
+            "encoding": joined | {"strokeWidth": thick},
+        },
+        {
+            "data": {"values": dots},
+            "mark": {"type": "circle", "opacity": 1, "aria": False},
+            "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip},
+        },
+    ]
     return chart("Fitness by generation, and the line of the winner", 320, layer=layer)
 
 
 def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
-    """For each setting that differed: its values by generation, the winner's line in colour."""
+    """Return a chart for each setting that differed: its values by generation."""
     everyone = list(lineage.born.values())
     path = lineage.path(lineage.winner)
     shown = [k for k in lineage.winner.settings if len({str(b.settings[k]) for b in everyone}) > 1]
@@ -140,9 +160,9 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
     words = any(isinstance(b.settings[name], str) for b in everyone)
 
     def value(born: Born) -> Any:
-        told = born.settings[name]
-        told = sum(told) if isinstance(told, list) else told
-        return 1.0 - told if name in COMPLEMENT else told
+        setting_value = born.settings[name]
+        number = sum(setting_value) if isinstance(setting_value, list) else setting_value
+        return 1.0 - number if name in COMPLEMENT else number
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
     if not words:
@@ -166,14 +186,14 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
 
 
 def setting_title(name: str) -> str:
-    """What the axis of a setting is called."""
+    """Return the title of a setting's axis."""
     if name == "hidden":
         return "hidden units, all layers"
     return f"1 − {name}" if name in COMPLEMENT else name
 
 
 def what_changed(born: Born) -> str:
-    """What a member's mutation did, in words."""
+    """Return a member's mutation in words."""
     if not born.changes:
         return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
             born.mutation, born.mutation
@@ -185,18 +205,101 @@ def what_changed(born: Born) -> str:
 
 
 def short(value: Any) -> str:
-    """A setting's value in few letters."""
+    """Return a setting's value in few letters."""
     if isinstance(value, list):
         return "-".join(map(str, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def hex_of(color: RGB) -> str:
-    """A colour as the web writes it."""
+    """Return a colour as the web writes it."""
     return "#{:02x}{:02x}{:02x}".format(*color)
 
 
 def ink_on(color: RGB) -> str:
-    """Black or white, whichever is read better on a colour (WCAG 2)."""
+    """Return black or white, whichever is read better on a colour (WCAG 2)."""
     red, green, blue = ((c / 255) ** 2.2 for c in color)
     return "#000" if 0.2126 * red + 0.7152 * green + 0.0722 * blue > 0.18 else "#fff"
+
+
+def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:
+    """Return the colours of groups by their letters; the page has the legend."""
+    scale = {"domain": list(names), "range": list(colors)}
+    return {"field": field, "type": "nominal", "scale": scale, "legend": None}
+
+
+def scores(
+    names: Sequence[str], colors: Sequence[str], rows: dict[str, Any], binary: bool = False
+) -> Spec:
+    """Return a chart with a dot for each run, and each group's interquartile mean and interval.
+
+    Args:
+        binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
+    """
+    what, form = ("episodes solved", ".0%") if binary else ("mean return", ",.4~r")
+    y = {
+        "field": "group",
+        "type": "nominal",
+        "title": None,
+        "sort": list(names),
+        "axis": {"labelFontSize": 14, "labelFontWeight": "bold"},
+    }
+    color = _color("group", names, colors)
+    axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
+    x = number_axis("x", f"{what} of a run", axis=axis)
+    tooltip = [
+        {"field": "group"},
+        {"field": "x", "title": "interquartile mean", "format": form},
+        {"field": "low", "title": "from", "format": form},
+        {"field": "high", "title": "to", "format": form},
+    ]
+    run = [
+        {"field": "group"},
+        {"field": "seed"},
+        {"field": "x", "title": what, "format": form},
+    ]
+    between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
+    layer: list[Spec] = [
+        {
+            "data": {"values": rows["bars"]},
+            "transform": [{"filter": "isValid(datum.low)"}],
+            "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
+            "encoding": {**between, "y": y, "color": color, "tooltip": tooltip},
+        },
+        {
+            "data": {"values": rows["dots"]},
+            "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
+            "encoding": {"x": x, "y": y, "color": color, "tooltip": run},
+        },
+        {
+            "data": {"values": rows["bars"]},
+            "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
+            "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip},
+        },
+    ]
+    if not any("low" in bar for bar in rows["bars"]):
+        del layer[0]  # an axis over nothing is warned of
+    return chart("Scores by group", 50 + 40 * len(names), layer=layer)
+
+
+def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spec:
+    """Return a chart of an agent's metric, with a line and a band for each group."""
+    color = _color("what", names, colors)
+    tooltip = [
+        {"field": "what", "title": "group"},
+        {"field": "x", "title": STEPS, "format": ",d"},
+        {"field": "y", "title": "value", "format": ",.4~r"},
+        {"field": "lo", "title": "from", "format": ",.4~r"},
+        {"field": "hi", "title": "to", "format": ",.4~r"},
+    ]
+    band = {"type": "area", "opacity": 0.2, "aria": False, "tooltip": False}
+    line = {"type": "line", "strokeWidth": 2, "aria": False}
+    dot = {"type": "point", "opacity": 0, "size": 80, "filled": True, "aria": False}
+    low_high = {"y": number_axis("lo", ""), "y2": {"field": "hi"}}
+    encoding = {"x": steps_axis(), "color": color}
+    layer: list[Spec] = [
+        {"mark": band, "encoding": low_high},
+        {"mark": line, "encoding": {"y": number_axis("y", "")}},
+        {"mark": dot, "encoding": {"y": number_axis("y", ""), "tooltip": tooltip}},
+    ]
+    return chart(f"Learning curves of {label}", 220, encoding=encoding, layer=layer)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.reporting.palette import color_of
-from skillweave.reporting.report import charts, facts, group_charts
+from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.groups import Group, differences, grouped
 from skillweave.reporting.report.numbers import NOTHING, number, percent, scale_of
@@ -30,7 +30,7 @@ MOST_DIFFERENCES = 60
 def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]:
     """Write one HTML file that compares runs; those that differ by their seed alone are a group.
 
-    Scores and what skills did are those of the runs' saved evaluations: nothing is played.
+    Scores and skills' figures come from the runs' saved evaluations: nothing is played.
 
     Returns:
         ``path``, ``bytes``, ``seconds``, and ``missing``: sentences on what is not in it.
@@ -44,18 +44,18 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     library()
     groups = grouped(runs)
     saved = {run.path: load_evaluation(run) for run in runs}
-    told = {run.path: read_curves(run) for run in runs}
+    curves_of = {run.path: read_curves(run) for run in runs}
     colors = [charts.hex_of(color_of(i)) for i in range(len(groups))]
     keys = [group.key for group in groups]
-    curves = _curves(groups, told, colors)
-    everything = [c for own in told.values() for c in own]
+    curves = _curves(groups, curves_of, colors)
+    everything = [c for curves in curves_of.values() for c in curves]
     data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
     scores = [_scores(group, saved) for group in groups]
     say = _sayer(saved)
     if any(scores):
         rows = _score_rows(groups, saved, scores)
         binary = say is percent
-        data["charts"] = {"scores-chart": group_charts.scores(keys, colors, rows, binary)}
+        data["charts"] = {"scores-chart": charts.scores(keys, colors, rows, binary)}
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
@@ -86,7 +86,7 @@ Say = Callable[[float | None], str]
 
 
 def _sayer(saved: Saved) -> Say:
-    """Return how returns are written: as percent where all are 0 or 1, else to one scale."""
+    """Return the writer of returns: as percent where all are 0 or 1, else to one scale."""
     returns = [r for e in saved.values() if e is not None for r in e.evaluation.returns]
     if returns and is_binary(returns):
         return percent
@@ -94,14 +94,14 @@ def _sayer(saved: Saved) -> Say:
 
 
 def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
-    found = []
+    sentences = []
     for run in runs:
         if not run.finished:
-            found.append(
+            sentences.append(
                 f"{run.path} is not finished; to finish it: {command_words('resume', run)}"
             )
         elif saved[run.path] is None:
-            found.append(
+            sentences.append(
                 f"{run.path} has no evaluation; to make one: {command_words('evaluate', run)}"
             )
     played = {
@@ -110,15 +110,15 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
         if e is not None
     }
     if len(played) > 1:
-        found.append(
+        sentences.append(
             "The evaluations are not of the same episodes: their seeds, their numbers of episodes, "
             "or whether actions were sampled differ"
         )
-    return [f"{line}." for line in found]
+    return [f"{line}." for line in sentences]
 
 
 def _scores(group: Group, saved: Saved) -> list[float]:
-    """The mean returns of the group's runs that were evaluated."""
+    """Return the mean returns of the group's runs that were evaluated."""
     return [e.evaluation.mean for run in group.runs if (e := saved[run.path]) is not None]
 
 
@@ -132,19 +132,19 @@ def _group_words(group: Group, scores: list[float], say: Say) -> dict[str, Any]:
     }
     if not scores:
         return words | {"iqm": None}
-    found = over_seeds(np.array(scores))
-    return words | {"iqm": say(float(found.mean)), "interval": interval(found, say)}
+    summary = over_seeds(np.array(scores))
+    return words | {"iqm": say(float(summary.mean)), "interval": interval(summary, say)}
 
 
-def interval(found: OverSeeds, say: Say = number) -> str:
-    """An interval in words."""
-    if found.low is None or found.high is None:
+def interval(summary: OverSeeds, say: Say = number) -> str:
+    """Return an interval in words."""
+    if summary.low is None or summary.high is None:
         return "one seed: no interval"
-    return f"{say(float(found.low))} to {say(float(found.high))}"
+    return f"{say(float(summary.low))} to {say(float(summary.high))}"
 
 
 def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) -> dict[str, Any]:
-    """What the chart of scores shows: a dot for each run, a bar and a mark for each group."""
+    """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
     dots, bars = [], []
     for group, own in zip(groups, scores, strict=True):
         for run in group.runs:
@@ -152,35 +152,38 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
                 seed = run.manifest["seed"]
                 dots.append({"group": group.key, "x": e.evaluation.mean, "seed": seed})
         if own:
-            found = over_seeds(np.array(own))
-            ends = {} if found.low is None or found.high is None else {
-                "low": float(found.low), "high": float(found.high)
-            }  # fmt: skip
-            bars.append({"group": group.key, "x": float(found.mean), **ends})
+            summary = over_seeds(np.array(own))
+            bar = {"group": group.key, "x": float(summary.mean)}
+            if summary.low is not None and summary.high is not None:
+                bar |= {"low": float(summary.low), "high": float(summary.high)}
+            bars.append(bar)
     return {"dots": dots, "bars": bars}
 
 
 def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
-    """For each skill, its figures over the group's seeds, as ``mean (low to high)``."""
-    found = [e.evaluation.to_json()["skills"] for run in group.runs if (e := saved[run.path])]
+    """Return for each skill its figures over the group's seeds, as ``mean (low to high)``."""
+    reports = [e.evaluation.to_json()["skills"] for run in group.runs if (e := saved[run.path])]
     rows = []
-    for name in dict.fromkeys(k for skills in found for k in skills):
-        own = [skills[name] for skills in found if name in skills]
-        rows.append({
+    for name in dict.fromkeys(k for skills in reports for k in skills):
+        seeds = [skills[name] for skills in reports if name in skills]
+        row = {
             "name": name,
-            "share": _told([o["share"] for o in own], percent),
-            "calls": _told([o["calls"] for o in own], number),
-            "length": _told([o["length_mean"] for o in own], number),
-            "success": _told([o["success_rate"] for o in own], percent),
-            "return": _told([o["return_mean"] for o in own], number),
-        })  # fmt: skip
+            "share": _over_seeds([o["share"] for o in seeds], percent),
+            "calls": _over_seeds([o["calls"] for o in seeds], number),
+            "length": _over_seeds([o["length_mean"] for o in seeds], number),
+            "success": _over_seeds([o["success_rate"] for o in seeds], percent),
+            "return": _over_seeds([o["return_mean"] for o in seeds], number),
+        }
+        rows.append(row)
     return rows
 
 
 def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
-    """Transitions between skills, summed over the group's seeds; none where one does not know."""
-    found = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
-    reports = [levels_of(skills).get("", {}) for skills in found]  # hierarchies below: one report
+    """Return transitions between skills, summed over the group's seeds; [] where one lacks them."""
+    evaluated = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
+    reports = [
+        levels_of(skills).get("", {}) for skills in evaluated
+    ]  # hierarchies below: one report
     counts = [transitions(skills) for skills in reports]
     known = [c for c in counts if c is not None]
     if not known or len(known) < len(counts):
@@ -189,22 +192,22 @@ def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
     return transition_rows(list(reports[0]), rows)
 
 
-def _told(values: Sequence[float | None], say: Say) -> str:
+def _over_seeds(values: Sequence[float | None], say: Say) -> str:
     known = [v for v in values if v is not None]
     if not known:
         return NOTHING
     if say is number:
         say = functools.partial(number, scale=scale_of(known))
-    found = over_seeds(np.array(known))
-    if found.low is None or found.high is None:
-        return str(say(float(found.mean)))
-    return f"{say(float(found.mean))} ({say(float(found.low))} to {say(float(found.high))})"
+    summary = over_seeds(np.array(known))
+    if summary.low is None or summary.high is None:
+        return str(say(float(summary.mean)))
+    return f"{say(float(summary.mean))} ({say(float(summary.low))} to {say(float(summary.high))})"
 
 
 def _run_row(
     group: Group, run: RunDirectory, saved: SavedEvaluation | None, say: Say
 ) -> dict[str, str]:
-    told = None if saved is None else saved.evaluation.to_json()
+    score = None if saved is None else saved.evaluation.to_json()
     stages = run.manifest["stages"]
     return {
         "run": facts.name_of(run),
@@ -213,16 +216,16 @@ def _run_row(
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.get('steps', 0) for s in stages):,}",
         "seconds": f"{sum(s.get('seconds', 0.0) for s in stages):,.0f}",
-        "mean": say(None if told is None else told["mean"]),
-        "iqm": say(None if told is None else told["iqm"]),
+        "mean": say(None if score is None else score["mean"]),
+        "iqm": say(None if score is None else score["iqm"]),
         "solved": percent(_solved(saved)),
-        "length": NOTHING if told is None else f"{told['length_mean']:,.1f}",
-        "episodes": NOTHING if told is None else str(told["episodes"]),
+        "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
+        "episodes": NOTHING if score is None else str(score["episodes"]),
     }
 
 
 def _solved(saved: SavedEvaluation | None) -> float | None:
-    """The share of episodes that are solved, or else at the environment's threshold."""
+    """Return the share of episodes that are solved, or else at the environment's threshold."""
     if saved is None:
         return None
     count = solved(saved.evaluation)
@@ -232,34 +235,34 @@ def _solved(saved: SavedEvaluation | None) -> float | None:
 
 
 def _curves(
-    groups: Sequence[Group], told: dict[Path, list[Curves]], colors: Sequence[str]
+    groups: Sequence[Group], curves_of: dict[Path, list[Curves]], colors: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """A chart for each agent of any group, with a line and a band for each group."""
-    labels = list(dict.fromkeys(c.label for own in told.values() for c in own))
+    """Return a chart for each agent of any group, with a line and a band for each group."""
+    labels = list(dict.fromkeys(c.label for curves in curves_of.values() for c in curves))
     keys = [group.key for group in groups]
-    found = []
+    charts_ = []
     for label in labels:
         points: dict[str, list[list[Any]]] = {}
         for group in groups:
-            own = [c for run in group.runs for c in told[run.path] if c.label == label]
-            for metric in dict.fromkeys(k for c in own for k in c.points):
-                curves = [c.points[metric] for c in own if metric in c.points]
-                points.setdefault(metric, []).extend(_line(group.key, curves))
-        spec = group_charts.group_curves(label, keys, colors)
-        found.append({"label": label, "spec": spec, "points": points})
-    return found
+            curves = [c for run in group.runs for c in curves_of[run.path] if c.label == label]
+            for metric in dict.fromkeys(k for c in curves for k in c.points):
+                points_of = [c.points[metric] for c in curves if metric in c.points]
+                points.setdefault(metric, []).extend(_line(group.key, points_of))
+        spec = charts.group_curves(label, keys, colors)
+        charts_.append({"label": label, "spec": spec, "points": points})
+    return charts_
 
 
 def _line(name: str, curves: list[list[tuple[int, float]]]) -> list[list[Any]]:
-    """Rows of a group's line: steps, interquartile mean, low, high, and the group."""
+    """Return the rows of a group's line: steps, interquartile mean, low, high, and the group."""
     gridded = on_one_grid(curves)
     if gridded is None:
         return []
     grid, values = gridded
-    found = over_seeds(values)
-    low = found.mean if found.low is None else found.low
-    high = found.mean if found.high is None else found.high
+    summary = over_seeds(values)
+    low = summary.mean if summary.low is None else summary.low
+    high = summary.mean if summary.high is None else summary.high
     return [
-        [int(x), *(float(f"{v:.5g}") for v in told), name]
-        for x, *told in zip(grid, found.mean, low, high, strict=True)
+        [int(x), *(float(f"{v:.5g}") for v in values_at), name]
+        for x, *values_at in zip(grid, summary.mean, low, high, strict=True)
     ]

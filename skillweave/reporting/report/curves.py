@@ -1,4 +1,4 @@
-"""Learning curves: what ``metrics.jsonl`` tells of each agent."""
+"""Learning curves: the metrics of each agent in ``metrics.jsonl``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FIRST = ("return", "eval_return", "eval_success", "task_return", "length", "succ
 
 @dataclass
 class Curves:
-    """What one agent's metrics were in one stage."""
+    """One agent's metrics in one stage."""
 
     stage: str
     agent: str
@@ -28,12 +28,14 @@ class Curves:
 
     @property
     def label(self) -> str:
-        """What people call it."""
+        """Its name for people."""
         return self.stage if self.agent == self.stage else f"{self.agent} in {self.stage}"
 
 
 def read_curves(run: RunDirectory) -> list[Curves]:
-    """The curves of every agent, in the order of the schedule; stages without metrics have none.
+    """Return the curves of every agent, in the order of the schedule.
+
+    Stages without metrics have none.
 
     Raises:
         RunError: the file is damaged.
@@ -58,14 +60,14 @@ def read_curves(run: RunDirectory) -> list[Curves]:
 
 
 def reached_steps(all_curves: Sequence[Curves]) -> dict[str, int]:
-    """By stage, the steps of the last line of its metrics."""
+    """Return by stage the steps of the last line of its metrics."""
     return {
         c.stage: max(points[-1][0] for points in c.points.values()) for c in all_curves if c.points
     }
 
 
 def metrics_of(all_curves: list[Curves]) -> list[str]:
-    """The names of all metrics, those that people look at first before the others."""
+    """Return the names of all metrics, the most important ones first."""
     names = {name for curves in all_curves for name in curves.points}
     return sorted(names, key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
 

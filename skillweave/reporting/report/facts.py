@@ -1,4 +1,4 @@
-"""What a run's files say in words: what was trained and how, and what is missing."""
+"""Facts of a run's files in words: what was trained and how, and what is missing."""
 
 from __future__ import annotations
 
@@ -13,19 +13,30 @@ from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
-    "steps", "seconds", "steps_per_second", "evaluation_steps", "reached", "kept", "workers",
-    "succeeded", "compared", "greedy_judged", "stopped", "best", "continued",
-}  # fmt: skip
-"""Of a stage's entry what training wrote, or what follows from settings of the hierarchy."""
+    "steps",
+    "seconds",
+    "steps_per_second",
+    "evaluation_steps",
+    "reached",
+    "kept",
+    "workers",
+    "succeeded",
+    "compared",
+    "greedy_judged",
+    "stopped",
+    "best",
+    "continued",
+}
+"""Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
 
 
 def name_of(run: RunDirectory) -> str:
-    """What a run is called: the name of its directory."""
+    """Return the name of a run's directory."""
     return run.path.resolve().name
 
 
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
-    """What was trained, by name."""
+    """Return facts about the training, by name."""
     m = run.manifest
     found = [("Environment", m["env"])]
     if m["env_kwargs"]:
@@ -55,7 +66,7 @@ def _call_length(m: Mapping[str, Any]) -> str:
 
 
 def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
-    """A row for each stage: how long it took, and how it ended; ``steps``: how far it is."""
+    """Return a row for each stage; ``steps``: by stage, the steps of its last metrics."""
     rows = []
     for entry in run.manifest["stages"]:
         final = (entry.get("final") or {}).get("return")
@@ -74,20 +85,26 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
             notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
         done = entry["status"] == "done"
         far = f"{steps.get(entry['name'], 0):,} of {entry['budget']:,}"
-        rows.append({
-            "name": entry["name"], "kind": entry["kind"],
-            "algorithm": entry["algorithm"].get("algorithm", "?"), "status": entry["status"],
-            "steps": f"{entry['steps']:,}" if done else far,
-            "seconds": f"{entry['seconds']:,.1f}" if done else "–",
-            "speed": f"{entry['steps_per_second']:,.0f}" if "steps_per_second" in entry else "–",
-            "return": number(final),
-            "notes": "; ".join(notes),
-        })  # fmt: skip
+        rows.append(
+            {
+                "name": entry["name"],
+                "kind": entry["kind"],
+                "algorithm": entry["algorithm"].get("algorithm", "?"),
+                "status": entry["status"],
+                "steps": f"{entry['steps']:,}" if done else far,
+                "seconds": f"{entry['seconds']:,.1f}" if done else "–",
+                "speed": f"{entry['steps_per_second']:,.0f}"
+                if "steps_per_second" in entry
+                else "–",
+                "return": number(final),
+                "notes": "; ".join(notes),
+            }
+        )
     return rows
 
 
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
-    """A sentence for each stage that is not done; ``steps``: how far metrics say that it is."""
+    """Return a sentence for each unfinished stage; ``steps``: those of its last metrics."""
     found = []
     for entry in run.manifest["stages"]:
         name, budget = entry["name"], entry["budget"]
@@ -107,9 +124,9 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
 
 
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
-    """Every setting in a run's manifest by its dotted name; not its seed, nor what came of it."""
+    """Return every setting in a run's manifest by its dotted name, without seed and results."""
     found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
-    told = (
+    names = (
         "kind",
         "learn",
         "call_steps",
@@ -127,7 +144,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "eval_episodes",
         "keep",
     )
-    found |= {k: m[k] for k in told if k in m}
+    found |= {k: m[k] for k in names if k in m}
     for skill in m.get("skills", ()):
         own = {k: v for k, v in skill.items() if k != "name"}
         found |= flat(f"skills.{skill['name']}", own)
@@ -140,7 +157,7 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plain(value: Any) -> str:
-    """A value of a setting, for people."""
+    """Return a value of a setting, for people."""
     if value is None:
         return "none"
     if isinstance(value, bool):

@@ -23,7 +23,7 @@ from skillweave.types import Array
 MOST_FRAMES = 1_500
 MOST_BYTES = 2_800_000  # as text in the page a third more
 MIN_WIDTH = 240  # pixels; smaller frames are enlarged
-HOLD = 12  # frames that the end of an episode stands
+HOLD = 12  # frames for which the end of an episode stays
 USUAL_FPS = 30
 
 

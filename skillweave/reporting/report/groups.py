@@ -1,4 +1,4 @@
-"""Runs that differ by their seed alone are a group; what groups differ in, in words."""
+"""Groups of runs that differ by their seed alone, and the settings in which groups differ."""
 
 from __future__ import annotations
 
@@ -25,18 +25,19 @@ class Group:
 
 
 def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
-    """The groups, in the order of their first runs.
+    """Return the groups, in the order of their first runs.
 
     Raises:
         DeclarationError: no runs, or two that have the same seed and the same settings.
     """
     if not runs:
         raise DeclarationError("no runs were given; name at least one run's directory")
-    found: dict[str, Group] = {}
+    by_settings: dict[str, Group] = {}
     for run in runs:
-        own = facts.settings(run.manifest)
-        key = json.dumps([run.manifest.get("recipe"), own], sort_keys=True, default=str)
-        group = found.setdefault(key, Group(_letter(len(found)), _base(run), [], own))
+        settings = facts.settings(run.manifest)
+        key = json.dumps([run.manifest.get("recipe"), settings], sort_keys=True, default=str)
+        new = Group(_letter(len(by_settings)), _base(run), [], settings)
+        group = by_settings.setdefault(key, new)
         for other in group.runs:
             if other.manifest["seed"] == run.manifest["seed"]:
                 raise DeclarationError(
@@ -44,23 +45,23 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
                     f"{run.manifest['seed']}; name one of them"
                 )
         group.runs.append(run)
-    groups = list(found.values())
+    groups = list(by_settings.values())
     for group in groups:
         base = _base(group.runs[0])
         same = [g for g in groups if _base(g.runs[0]) == base]
-        told = [f"{k} {_told(group, k)}" for k in _telling(same)]
-        group.name = ", ".join([base, *told])
+        distinct = [f"{k} {_value(group, k)}" for k in _distinguishing(same)]
+        group.name = ", ".join([base, *distinct])
     return groups
 
 
 def differences(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
-    """Settings in which groups differ: the name, and the value of each group."""
+    """Return the settings in which groups differ: the name, and the value of each group."""
     names = list(dict.fromkeys(k for g in groups for k in g.settings))
-    table = [(k, [_told(g, k) for g in groups]) for k in names]
+    table = [(k, [_value(g, k) for g in groups]) for k in names]
     return [(k, values) for k, values in table if len(set(values)) > 1]
 
 
-def _told(group: Group, name: str) -> str:
+def _value(group: Group, name: str) -> str:
     return facts.plain(group.settings[name]) if name in group.settings else "–"
 
 
@@ -70,23 +71,23 @@ def _base(run: RunDirectory) -> str:
     return f"{name}, plain agent" if recipe and run.manifest["kind"] == "agent" else name
 
 
-def _telling(groups: Sequence[Group]) -> list[str]:
-    """Few settings that tell the groups apart; each the one that parts them best."""
+def _distinguishing(groups: Sequence[Group]) -> list[str]:
+    """Return few settings that distinguish the groups; each separates them best."""
     table = dict(differences(groups))
-    said: list[str] = []
+    names_: list[str] = []
 
     def parts(names: Sequence[str]) -> int:
         return len({tuple(table[k][i] for k in names) for i in range(len(groups))})
 
-    while table and parts(said) < len(groups):
-        best = max(table, key=lambda k: parts([*said, k]))  # the first of those that part as well
-        if parts([*said, best]) == parts(said):
+    while table and parts(names_) < len(groups):
+        best = max(table, key=lambda k: parts([*names_, k]))  # the first of those that part as well
+        if parts([*names_, best]) == parts(names_):
             break
-        said.append(best)
-    return said
+        names_.append(best)
+    return names_
 
 
 def _letter(number: int) -> str:
-    """A to Z, then A2, B2, …"""
+    """Return A to Z, then A2, B2, …"""
     turn, at = divmod(number, 26)
     return chr(ord("A") + at) + (str(turn + 1) if turn else "")

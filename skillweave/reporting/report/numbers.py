@@ -15,7 +15,7 @@ def number(value: float | None, scale: float | None = None) -> str:
     """Return a number with three significant digits.
 
     Args:
-        scale: of the numbers that stand beside it, which get as many decimals; None: its own.
+        scale: the scale of the numbers beside it, which get as many decimals; None: its own.
     """
     if value is None:
         return NOTHING
@@ -37,7 +37,7 @@ def decimals(size: float) -> int:
 
 
 def scale_of(values: Iterable[float | None]) -> float:
-    """Return the largest size among numbers that stand beside each other."""
+    """Return the largest size among numbers beside each other."""
     return max((abs(value) for value in values if value is not None), default=0.0)
 
 

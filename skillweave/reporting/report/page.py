@@ -57,14 +57,14 @@ def write_page(
 
 @functools.cache
 def library() -> str:
-    """Vega, Vega-Lite and Vega-Embed as one script, about 900 kB."""
+    """Return Vega, Vega-Lite and Vega-Embed as one script, about 900 kB."""
     bundle: str = need("vl_convert").javascript_bundle()
     # Within a page, a script would end at these letters.
     return bundle.replace("</script", "<\\/script").replace("<!--", "<\\!--")
 
 
 def need(module: str) -> Any:
-    """A module of the extra 'report'.
+    """Return a module of the extra 'report'.
 
     Raises:
         MissingExtra: it is not installed.

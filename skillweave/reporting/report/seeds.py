@@ -23,7 +23,7 @@ class OverSeeds:
 
     mean: Array
     low: Array | None
-    """None: one seed alone says nothing of others."""
+    """None: one seed alone has no interval."""
     high: Array | None
 
 
@@ -41,9 +41,9 @@ def over_seeds(values: Array) -> OverSeeds:
 
 
 def on_one_grid(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[Array, Array] | None:
-    """Curves of several seeds at the same steps: (G,) steps and (seeds, G) values.
+    """Return curves of several seeds at the same steps: (G,) steps and (seeds, G) values.
 
-    Between points the values are interpolated; where one curve has not begun or is over, there is
+    Between points the values are interpolated; where a curve has not started or has ended, there is
     nothing. None: they have no steps in common.
     """
     first = max(curve[0][0] for curve in curves)

@@ -71,7 +71,7 @@ class Played:
     colors: list[RGB]
     """Of each of the log's labels."""
     docs: list[str]
-    """What the docstrings of the log's skills say."""
+    """The docstrings of the log's skills."""
     named: ObsNames | None
     """Names of the numbers in an observation."""
 
@@ -138,9 +138,9 @@ def write_report(
 
     Args:
         policy, spec: what was trained, and on what; None: no episodes are played.
-        why_not: a sentence on why there is no policy, where the run itself is finished.
+        why_not: the reason why there is no policy, where the run itself is finished.
         episodes: to play, with seeds that training never used.
-        filmed: of these, so many are in the film, from the worst to the best.
+        filmed: number of these in the film, from the worst to the best.
         seed: picks the episodes, as in ``evaluate``.
         deterministic: act greedily, else sample.
         quiet: no progress.
@@ -156,7 +156,7 @@ def write_report(
     began = time.perf_counter()
     episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
     filmed = whole_number(filmed, "films", 0)
-    library()  # a missing extra is said before anything is played
+    library()  # a missing extra is reported before anything is played
     must_be_own(path.parent)
     all_curves = read_curves(run)
     reached = reached_steps(all_curves)
@@ -184,9 +184,9 @@ def write_report(
         data |= _episodes(played)
     film = None if played is None else played.film
     data |= {"why": WHY, "binary": context["binary"]}
-    told = write_page(path, "report.html", context, data, film)
-    told |= {"seconds": round(time.perf_counter() - began, 2)}
-    return told | {"verdict": context["verdict"], "missing": missing}
+    page = write_page(path, "report.html", context, data, film)
+    page |= {"seconds": round(time.perf_counter() - began, 2)}
+    return page | {"verdict": context["verdict"], "missing": missing}
 
 
 def _sentence(error: SkillweaveError) -> str:
@@ -194,7 +194,7 @@ def _sentence(error: SkillweaveError) -> str:
 
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
-    """Colours by name: skills as in timelines, then the other agents that learnt."""
+    """Return colours by name: skills as in timelines, then the other agents that learnt."""
     names = [skill["name"] for skill in run.manifest.get("skills", ())]
     found = {name: color_of(i) for i, name in enumerate(names)}
     if played is not None:
@@ -206,7 +206,7 @@ def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
 
 
 def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
-    """The curves with their charts, as plain JSON."""
+    """Return the curves with their charts, as plain JSON."""
     usual = charts.hex_of(color_of(1))
     return [
         {
@@ -240,7 +240,7 @@ def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) ->
 def _scores(
     run: RunDirectory, played: Played | None, seed: int, deterministic: bool
 ) -> dict[str, Any]:
-    """The score and the skills' table: of the saved evaluation, or of the report's episodes."""
+    """Return the score and the skills' table, of the saved evaluation or the report's episodes."""
     saved = load_evaluation(run, deterministic=deterministic)
     score = None if played is None else played.score
     words = _how("played for this report", seed, deterministic)
@@ -275,19 +275,19 @@ def _scores(
 
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
-    told = score.to_json()
+    score_json = score.to_json()
     scale = scale_of(score.returns)
-    low, high = (number(value, scale) for value in told["ci95"])
+    low, high = (number(value, scale) for value in score_json["ci95"])
     count = solved(score)
     words: dict[str, Any] = {
-        "mean": number(told["mean"], scale),
+        "mean": number(score_json["mean"], scale),
         "interval": None if len(score.returns) == 1 else f"{low} to {high}",
-        "iqm": number(told["iqm"], scale),
-        "range": f"{number(told['min'], scale)} to {number(told['max'], scale)}",
-        "reached": percent(told["solved_fraction"]),
+        "iqm": number(score_json["iqm"], scale),
+        "range": f"{number(score_json['min'], scale)} to {number(score_json['max'], scale)}",
+        "reached": percent(score_json["solved_fraction"]),
         "threshold": None if score.threshold is None else f"{score.threshold:g}",
-        "length": number(told["length_mean"], max(told["length_mean"], 10)),
-        "cut": told["cut"],
+        "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
+        "cut": score_json["cut"],
         "binary": is_binary(score.returns),
         "solved": None,
     }
@@ -303,7 +303,7 @@ def _how(whose: str, seed: int, deterministic: bool) -> str:
 
 
 def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
-    """A section for each stage whose population evolved."""
+    """Return a section for each stage whose population evolved."""
     sections, data["trees"] = [], []
     for entry in run.manifest["stages"]:
         lineage = read_lineage(run, entry["name"])
@@ -327,7 +327,7 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
 
 
 def _skills(played: Played) -> dict[str, Any]:
-    """Words and tables of the episodes that were played."""
+    """Return words and tables of the episodes that were played."""
     log = played.log
     named = zip(log.labels, played.colors, strict=True)
     legend = [(k, charts.hex_of(c), charts.ink_on(c)) for k, c in named]
@@ -340,7 +340,7 @@ def _skills(played: Played) -> dict[str, Any]:
 
 
 def _episodes(played: Played) -> dict[str, Any]:
-    """What the page's script shows of the episodes that were played."""
+    """Return the data of the played episodes for the page's script."""
     log = played.log
     colors = [charts.hex_of(c) for c in played.colors]
     found: dict[str, Any] = {

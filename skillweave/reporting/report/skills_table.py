@@ -1,4 +1,4 @@
-"""What each skill did, and which skill followed which, as rows for the page's tables."""
+"""Rows for the page's tables: the figures of each skill, and the transitions between skills."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ WHY = {
     "interrupted": "cut by the selector",
     "episode": "with the episode",
 }
-"""Why a call ended, as the page says it."""
+"""Ends of calls in the page's words."""
 
 
 def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
-    """A row for each skill."""
+    """Return a row for each skill."""
     total = all_steps(reports)
     longest = max(scale_of(report.length_mean for report in reports.values()), 10)
     rows = []
     for name, report in reports.items():
         calls = report.calls
         known = bool(report.ended and calls)
-        rows.append({
-            "name": name,
-            "share": report.steps / total if total else 0.0,
-            "percent": percent(report.steps / total if total else 0.0),
-            "calls": f"{calls:,}",
-            "length": number(report.length_mean, longest),
-            "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
-            "success": percent(report.success_rate),
-            "return": number(report.return_mean),
-        })  # fmt: skip
+        rows.append(
+            {
+                "name": name,
+                "share": report.steps / total if total else 0.0,
+                "percent": percent(report.steps / total if total else 0.0),
+                "calls": f"{calls:,}",
+                "length": number(report.length_mean, longest),
+                "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
+                "success": percent(report.success_rate),
+                "return": number(report.return_mean),
+            }
+        )
     return rows
 
 
@@ -62,7 +64,7 @@ def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]
 
 
 def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
-    """How often each skill followed another: (1 + S, S + 1); None: not known.
+    """Return how often each skill followed another: (1 + S, S + 1); None: not known.
 
     The first row is an episode's start, the last column its end.
     """
@@ -79,7 +81,7 @@ def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
 def transition_rows(
     labels: Sequence[str], counts: Sequence[Sequence[float]]
 ) -> list[dict[str, Any]]:
-    """A row for each skill and for an episode's start: what followed, as counts and shares."""
+    """Return a row for each skill and for an episode's start: counts and shares of successors."""
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)

@@ -10,7 +10,7 @@ from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
 
 FEW = 5
-"""With fewer episodes than these a mean says little."""
+"""With fewer episodes than these a mean has little meaning."""
 ALONE, SELDOM, WEAK = 0.95, 0.01, 0.5
 """Shares: of steps of a skill that does nearly all, of one that does nearly nothing; of calls."""
 
@@ -18,7 +18,7 @@ ALONE, SELDOM, WEAK = 0.95, 0.01, 0.5
 def solved(score: Evaluation) -> int | None:
     """Return how many episodes were solved; None: the task is not of this kind.
 
-    An episode is solved where the environment says so (``info["success"]``), or, where every
+    An episode is solved where ``info["success"]`` is true, or, where every
     return is 0 or 1, if its return is 1.
     """
     if score.succeeded is not None:
@@ -29,12 +29,12 @@ def solved(score: Evaluation) -> int | None:
 
 
 def is_binary(returns: Sequence[float]) -> bool:
-    """Whether every return is 0 or 1."""
+    """Return whether every return is 0 or 1."""
     return set(returns) <= {0.0, 1.0}
 
 
 def verdict(score: Evaluation, deterministic: bool) -> str:
-    """Return one sentence; names in it stand between backticks."""
+    """Return one sentence with names between backticks."""
     parts = [_outcome(score), *_skills(_leaves(score.skills), all_steps(score.skills))]
     if score.cut:
         parts.append(f"{score.cut} {'episode' if score.cut == 1 else 'episodes'} never ended")
@@ -43,7 +43,7 @@ def verdict(score: Evaluation, deterministic: bool) -> str:
 
 
 def no_verdict(stages: Sequence[Mapping[str, Any]]) -> str:
-    """Return the sentence that stands for a verdict where no episode was played."""
+    """Return the sentence in place of a verdict where no episode was played."""
     done = sum(entry["status"] == "done" for entry in stages)
     if done < len(stages):
         return f"Training is not finished: {done} of {len(stages)} stages are done."
@@ -51,7 +51,7 @@ def no_verdict(stages: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _outcome(score: Evaluation) -> str:
-    """What share of the episodes is solved, or what they return."""
+    """Return the share of episodes that are solved, or their return, in words."""
     n = len(score.returns)
     episodes = "one episode" if n == 1 else f"{n:,} episodes"
     count = solved(score)
@@ -60,7 +60,6 @@ def _outcome(score: Evaluation) -> str:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
         least, most = map(percent, share_interval(count, n))
         return f"Solves {percent(count / n)} of {episodes}, so probably {least} to {most} of all"
-    told = score.to_json()
     mean = number(score.mean, scale_of(score.returns))
     if n < FEW:
         return f"Mean return {mean} over {episodes}: too few to judge"
@@ -70,37 +69,37 @@ def _outcome(score: Evaluation) -> str:
             f"Reaches the environment's threshold of {score.threshold:g} in {reached} of "
             f"{episodes} (mean return {mean})"
         )
-    low, high = (number(value, scale_of(score.returns)) for value in told["ci95"])
+    low, high = (number(value, scale_of(score.returns)) for value in score.to_json()["ci95"])
     return f"Mean return {mean} over {episodes} (95 % interval {low} to {high})"
 
 
 def _skills(skills: Mapping[str, SkillReport], total: int) -> list[str]:
-    """Which skills are used, and which one fails."""
+    """Return words on the skills that are used, and on one that fails."""
     if not skills:
         return []
-    found = []
+    sentences = []
     never = [name for name, report in skills.items() if not report.calls]
     shares = {name: report.steps / total for name, report in skills.items() if report.calls}
     first = max(shares, key=lambda name: shares[name], default=None)
     seldom = [name for name, share in shares.items() if share < SELDOM]
     if first is not None and len(skills) > 1 and shares[first] >= ALONE:
-        found.append(f"`{first}` acts in {percent(shares[first])} of the steps")
+        sentences.append(f"`{first}` acts in {percent(shares[first])} of the steps")
     if never:
-        found.append(f"{_listed(never)} {'is' if len(never) == 1 else 'are'} never called")
+        sentences.append(f"{_listed(never)} {'is' if len(never) == 1 else 'are'} never called")
     elif seldom:
         verb = "acts" if len(seldom) == 1 else "act"
-        found.append(f"{_listed(seldom)} {verb} in less than 1 % of the steps")
-    elif not found and len(skills) > 1:
-        found.append("every skill is used")
+        sentences.append(f"{_listed(seldom)} {verb} in less than 1 % of the steps")
+    elif not sentences and len(skills) > 1:
+        sentences.append("every skill is used")
     rates = {k: rate for k, report in skills.items() if (rate := report.success_rate) is not None}
     weakest = min(rates, key=lambda name: rates[name], default=None)
     if weakest is not None and rates[weakest] < WEAK:
-        found.append(_failing(weakest, skills[weakest]))
-    return found
+        sentences.append(_failing(weakest, skills[weakest]))
+    return sentences
 
 
 def _failing(name: str, report: SkillReport) -> str:
-    """Say how seldom a skill succeeds."""
+    """Return a sentence on a skill that seldom succeeds."""
     if report.calls == 1:
         return f"`{name}` does not succeed in its only call"
     if not report.succeeded:
@@ -109,12 +108,12 @@ def _failing(name: str, report: SkillReport) -> str:
 
 
 def _leaves(skills: Mapping[str, SkillReport]) -> dict[str, SkillReport]:
-    """The skills that act themselves, by path: without those that are hierarchies."""
+    """Return the skills that act themselves, by path: without those that are hierarchies."""
     above = {name.rpartition("/")[0] for name in skills}
     return {name: report for name, report in skills.items() if name not in above}
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Names in a sentence."""
-    told = [f"`{name}`" for name in names]
-    return told[0] if len(told) == 1 else f"{', '.join(told[:-1])} and {told[-1]}"
+    """Return names for a sentence."""
+    quoted = [f"`{name}`" for name in names]
+    return quoted[0] if len(quoted) == 1 else f"{', '.join(quoted[:-1])} and {quoted[-1]}"

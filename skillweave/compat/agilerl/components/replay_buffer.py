@@ -14,9 +14,16 @@ class MultiStepReplayBuffer:
     """Transitions whose rewards are summed over ``n_step`` steps, sampled evenly."""
 
     def __init__(
-        self, action_dim: int, memory_size: int, field_names: list[str], num_envs: int,
-        n_step: int = 3, gamma: float = 0.99, device: Any = None, **how: Any,
-    ) -> None:  # fmt: skip
+        self,
+        action_dim: int,
+        memory_size: int,
+        field_names: list[str],
+        num_envs: int,
+        n_step: int = 3,
+        gamma: float = 0.99,
+        device: Any = None,
+        **how: Any,
+    ) -> None:
         self.memory_size, self.counter = memory_size, 0
         self.native = TransitionBuffer(memory_size, random_seed(), gamma, n_step=n_step, **how)
 
@@ -36,12 +43,12 @@ class MultiStepReplayBuffer:
     save2memorySingleEnv = save2memory
 
     def sample(self, batch_size: int, return_idx: bool = False) -> tuple[Any, ...]:
-        """States, actions, rewards, next states, terminations: float32 tensors (B, ...)."""
-        found = self.native.sample(batch_size)
-        return (*_parts(found), found.index[0]) if return_idx else _parts(found)
+        """Return states, actions, rewards, next states, terminations: float32 tensors (B, ...)."""
+        sample = self.native.sample(batch_size)
+        return (*_parts(sample), sample.index[0]) if return_idx else _parts(sample)
 
     def sample_from_indices(self, idxs: Array) -> tuple[Any, ...]:
-        """The same, for the indices of a sample from another buffer."""
+        """Return the transitions at the indices of a sample from another buffer."""
         return _parts(self.native.at(idxs))
 
 
@@ -58,22 +65,29 @@ class PrioritizedReplayBuffer(MultiStepReplayBuffer):
     """Transitions sampled by the size of their last error."""
 
     def __init__(
-        self, action_dim: int, memory_size: int, field_names: list[str], num_envs: int,
-        alpha: float = 0.6, n_step: int = 1, gamma: float = 0.99, device: Any = None,
-    ) -> None:  # fmt: skip
+        self,
+        action_dim: int,
+        memory_size: int,
+        field_names: list[str],
+        num_envs: int,
+        alpha: float = 0.6,
+        n_step: int = 1,
+        gamma: float = 0.99,
+        device: Any = None,
+    ) -> None:
         how: dict[str, Any] = {"prioritized": True, "alpha": alpha}
         super().__init__(action_dim, memory_size, field_names, num_envs, n_step, gamma, **how)
 
     def sample(self, batch_size: int, beta: float = 0.4) -> tuple[Any, ...]:
-        """As in the other buffers, then importance weights (B,) and indices."""
-        found = self.native.sample(batch_size, beta)
-        return (*_parts(found), found.weight[0], found.index[0])  # type: ignore[index]
+        """Return transitions as the other buffers do, then importance weights (B,) and indices."""
+        sample = self.native.sample(batch_size, beta)
+        return (*_parts(sample), sample.weight[0], sample.index[0])  # type: ignore[index]
 
     def update_priorities(self, idxs: Array, priorities: Array) -> None:
         """Set the priorities of sampled transitions."""
         self.native.update_priorities(idxs, priorities)
 
 
-def _parts(found: Sample) -> tuple[Any, ...]:
-    parts = found.obs, found.action, found.reward, found.next_obs, found.discount == 0.0
+def _parts(sample: Sample) -> tuple[Any, ...]:
+    parts = sample.obs, sample.action, sample.reward, sample.next_obs, sample.discount == 0.0
     return tuple(x[0].float().reshape(len(x[0]), *(x.shape[2:] or (1,))) for x in parts)

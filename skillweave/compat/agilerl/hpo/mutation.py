@@ -10,22 +10,43 @@ from skillweave.evolution.config import KINDS, Range
 from skillweave.evolution.config import Mutations as Native
 
 _WORDS = {
-    "none": "None", "architecture": "arch", "parameters": "param", "activation": "act",
-    "learning_rate": "lr", "batch_size": "bs", "update_ratio": "ls",
-}  # fmt: skip
+    "none": "None",
+    "architecture": "arch",
+    "parameters": "param",
+    "activation": "act",
+    "learning_rate": "lr",
+    "batch_size": "bs",
+    "update_ratio": "ls",
+}
 
 
 class Mutations:
-    """What changes from one generation to the next; probabilities are relative to their sum."""
+    """Mutations between generations; probabilities are relative to their sum."""
 
     def __init__(
-        self, algo: Any, no_mutation: float, architecture: float, new_layer_prob: float,
-        parameters: float, activation: float, rl_hp: float, rl_hp_selection: list[str],
-        mutation_sd: float, min_lr: float = 0.0001, max_lr: float = 0.01, min_learn_step: int = 1,
-        max_learn_step: int = 120, min_batch_size: int = 8, max_batch_size: int = 1024,
-        agent_ids: Any = None, arch: str = "mlp", mutate_elite: bool = True,
-        rand_seed: int | None = None, device: Any = "cpu", accelerator: Any = None,
-    ) -> None:  # fmt: skip
+        self,
+        algo: Any,
+        no_mutation: float,
+        architecture: float,
+        new_layer_prob: float,
+        parameters: float,
+        activation: float,
+        rl_hp: float,
+        rl_hp_selection: list[str],
+        mutation_sd: float,
+        min_lr: float = 0.0001,
+        max_lr: float = 0.01,
+        min_learn_step: int = 1,
+        max_learn_step: int = 120,
+        min_batch_size: int = 8,
+        max_batch_size: int = 1024,
+        agent_ids: Any = None,
+        arch: str = "mlp",
+        mutate_elite: bool = True,
+        rand_seed: int | None = None,
+        device: Any = "cpu",
+        accelerator: Any = None,
+    ) -> None:
         known = {
             "lr": ("learning_rate", Range(min_lr, max_lr)),
             "batch_size": ("batch_size", Range(min_batch_size, max_batch_size)),
@@ -40,7 +61,7 @@ class Mutations:
         self.rng = np.random.default_rng(random_seed() if rand_seed is None else rand_seed)
 
     def mutation(self, population: list[Any], pre_training_mut: bool = False) -> list[Any]:
-        """The same agents, each changed in at most one way; its ``mut`` names the change."""
+        """Return the agents, each changed in at most one way; its ``mut`` names the change."""
         kinds = self._kinds * [not pre_training_mut, 1, 1, 1, 1]
         for i, agent in enumerate(population if kinds.any() else ()):
             agent.mut = "None"

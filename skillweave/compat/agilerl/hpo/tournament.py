@@ -10,7 +10,7 @@ from skillweave.evolution.selection import Heir, select
 
 
 class TournamentSelection:
-    """Each heir's parent is the best of ``tournament_size`` agents drawn at random."""
+    """A selection: each heir's parent is the best of ``tournament_size`` random agents."""
 
     def __init__(
         self, tournament_size: int, elitism: bool, population_size: int, evo_step: int
@@ -19,16 +19,18 @@ class TournamentSelection:
         self.population_size, self.evo_step = population_size, evo_step
 
     def select(self, population: list[Any]) -> tuple[Any, list[Any]]:
-        """The best agent by its last ``evo_step`` fitnesses, and the next population."""
+        """Return the best agent by its last ``evo_step`` fitnesses, and the next population."""
         fitness = np.array([np.mean(a.fitness[-self.evo_step :]) for a in population])
-        rng, size = np.random.default_rng(random_seed()), self.tournament_size
+        rng = np.random.default_rng(random_seed())
+        size = self.tournament_size
         by = Evolution(max(2, size), selection=Tournament(size, elitism=False))
-        elite, number = population[int(fitness.argmax())], max(a.index for a in population)
+        elite = population[int(fitness.argmax())]
+        number = max(a.index for a in population)
         heirs = [Heir(population.index(elite), False)] if self.elitism else []
         while len(heirs) < self.population_size:
             heirs += select(by, fitness, rng)
-        found = []
+        clones = []
         for heir in heirs[: self.population_size]:
             number += heir.mutates
-            found.append(population[heir.parent].clone(number if heir.mutates else None))
-        return elite.clone(), found
+            clones.append(population[heir.parent].clone(number if heir.mutates else None))
+        return elite.clone(), clones

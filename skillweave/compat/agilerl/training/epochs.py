@@ -29,15 +29,16 @@ class Epochs(SimpleNamespace):
             self.env = SyncVectorEnv([lambda: one], autoreset_mode=AutoresetMode.SAME_STEP)
         if self.env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise DeclarationError("env must reset in the same step: make it with makeVectEnvs")
-        name, found = f"{self.env_name}-EvoHPO-{self.algo}", []
-        settings, key = {**(self.INIT_HP or {}), **(self.MUT_P or {})}, self.wandb_api_key
+        name, scores = f"{self.env_name}-EvoHPO-{self.algo}", []
+        settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
+        key = self.wandb_api_key
         self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
         for number in range(1, self.n_episodes + 1):
             losses = [self._scored(agent, episode(agent, number - 1)) for agent in self.pop]
             if number % self.evo_epochs == 0:
                 how = self.swap_channels, self.max_steps, self.evo_loop
-                found.append([agent.test(self.env, *how) for agent in self.pop])
-                self._tell(number, found[-1], losses)
+                scores.append([agent.test(self.env, *how) for agent in self.pop])
+                self._report(number, scores[-1], losses)
                 means = [np.mean(agent.fitness[-100:]) for agent in self.pop]
                 if self.target is not None and number > 100 and min(means) > self.target:
                     break
@@ -51,10 +52,10 @@ class Epochs(SimpleNamespace):
                     agent.saveCheckpoint(f"{_stem(self.checkpoint_path, name)}_{i}_{number}.pt")
         if self.tracked:
             self.tracked.finish()
-        return self.pop, found
+        return self.pop, scores
 
     def steps(self, act: Callable[[Any], Any]) -> Iterator[tuple[Any, ...]]:
-        """The steps of an episode: state, result of ``act``, rewards, next state, terminations."""
+        """Yield the steps of an episode: state, ``act``'s result, rewards, next state, ends."""
         self.rewards, self.ended = [], []
         state = swapped(self.env.reset()[0], self.swap_channels)
         for _ in range(self.max_steps):
@@ -75,13 +76,13 @@ class Epochs(SimpleNamespace):
         agent.steps[-1] += self.max_steps
         return loss
 
-    def _tell(self, number: int, tested: list[float], losses: list[Any]) -> None:
+    def _report(self, number: int, tested: list[float], losses: list[Any]) -> None:
         scores = [float(np.mean(agent.scores[-self.evo_epochs :])) for agent in self.pop]
         if self.tracked:
-            told = {"train/mean_score": np.mean(scores), "eval/mean_fitness": np.mean(tested)}
-            told |= {f"train/agent_{i}_loss": loss for i, loss in enumerate(losses)}
+            metrics = {"train/mean_score": np.mean(scores), "eval/mean_fitness": np.mean(tested)}
+            metrics |= {f"train/agent_{i}_loss": loss for i, loss in enumerate(losses)}
             steps = sum(agent.steps[-1] for agent in self.pop)
-            self.tracked.log({"global_step": steps, "eval/best_fitness": max(tested), **told})
+            self.tracked.log({"global_step": steps, "eval/best_fitness": max(tested), **metrics})
         for agent, score, fitness in zip(self.pop, scores, tested, strict=True):
             if self.verbose:
                 print(

@@ -6,13 +6,29 @@ from skillweave.compat.agilerl.training.epochs import Epochs, Result
 
 
 def train_on_policy(
-    env: Any, env_name: str, algo: str, pop: list[Any], INIT_HP: Any = None, MUT_P: Any = None,
-    swap_channels: bool = False, n_episodes: int = 2000, max_steps: int = 500, evo_epochs: int = 5,
-    evo_loop: int = 1, target: float | None = 200.0, tournament: Any = None, mutation: Any = None,
-    checkpoint: int | None = None, checkpoint_path: str | None = None, save_elite: bool = False,
-    elite_path: str | None = None, wb: bool = False, verbose: bool = True, accelerator: Any = None,
+    env: Any,
+    env_name: str,
+    algo: str,
+    pop: list[Any],
+    INIT_HP: Any = None,
+    MUT_P: Any = None,
+    swap_channels: bool = False,
+    n_episodes: int = 2000,
+    max_steps: int = 500,
+    evo_epochs: int = 5,
+    evo_loop: int = 1,
+    target: float | None = 200.0,
+    tournament: Any = None,
+    mutation: Any = None,
+    checkpoint: int | None = None,
+    checkpoint_path: str | None = None,
+    save_elite: bool = False,
+    elite_path: str | None = None,
+    wb: bool = False,
+    verbose: bool = True,
+    accelerator: Any = None,
     wandb_api_key: str | None = None,
-) -> Result:  # fmt: skip
+) -> Result:
     """Train agents by ``max_steps`` steps and one ``learn`` per episode; agents and fitnesses."""
     epochs = Epochs(**locals())
 

@@ -13,12 +13,12 @@ _KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDP
 
 
 def makeVectEnvs(env_name: str, num_envs: int = 1) -> SyncVectorEnv:
-    """Environments side by side, in this process; each starts anew in the step that ends it."""
+    """Make environments in this process; each restarts in the step that ends its episode."""
     return _vector(EnvSpec(env_name), num_envs)
 
 
 def makeSkillVectEnvs(env_name: str, skill: Any, num_envs: int = 1) -> SyncVectorEnv:
-    """``makeVectEnvs`` with a ``Skill`` around each environment."""
+    """Return ``makeVectEnvs`` with a ``Skill`` around each environment."""
     return _vector(EnvSpec(env_name, wrappers=(skill,)), num_envs)
 
 
@@ -28,11 +28,19 @@ def _vector(spec: EnvSpec, num_envs: int) -> SyncVectorEnv:
 
 
 def initialPopulation(
-    algo: str, state_dim: Any, action_dim: int, one_hot: bool, net_config: dict[str, Any],
-    INIT_HP: dict[str, Any], actor_network: Any = None, critic_network: Any = None,
-    population_size: int = 1, device: Any = "cpu", accelerator: Any = None,
-) -> list[Any]:  # fmt: skip
-    """Fresh agents of one kind; settings by their names in capitals from ``INIT_HP``.
+    algo: str,
+    state_dim: Any,
+    action_dim: int,
+    one_hot: bool,
+    net_config: dict[str, Any],
+    INIT_HP: dict[str, Any],
+    actor_network: Any = None,
+    critic_network: Any = None,
+    population_size: int = 1,
+    device: Any = "cpu",
+    accelerator: Any = None,
+) -> list[Any]:
+    """Make agents of one kind; settings by their names in capitals from ``INIT_HP``.
 
     Raises:
         DeclarationError: no such algorithm, or a setting without a default is missing.
