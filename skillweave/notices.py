@@ -31,7 +31,7 @@ class Notices:
 
     @property
     def any(self) -> bool:
-        """True if notices wait."""
+        """Return True if notices wait."""
         return bool(self._waiting)
 
     def take(self) -> list[str]:

@@ -28,7 +28,7 @@ _SHOWN = 60
 
 
 def shown(value: object, most: int = _SHOWN) -> str:
-    """A value for a message: its ``repr``, shortened."""
+    """Return a value for a message: its ``repr``, shortened."""
     try:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
@@ -61,7 +61,7 @@ def check_file(path: Path, most: int | None = None) -> None:
 
 
 def read_file(path: Path, most: int | None = None) -> bytes:
-    """The content of a plain file.
+    """Return the content of a plain file.
 
     Raises:
         RunError: it is missing, no plain file, too large, or cannot be read.

@@ -44,7 +44,7 @@ class Seeds:
         return np.random.SeedSequence(self.root, spawn_key=self.path)
 
     def integer(self) -> int:
-        """A 31-bit seed for engines that take one number."""
+        """Return a 31-bit seed for engines that take one number."""
         return int(self._sequence().generate_state(1, np.uint32)[0] >> 1)
 
     def integers(self, n: int) -> list[int]:
@@ -52,11 +52,11 @@ class Seeds:
         return [int(s >> 1) for s in self._sequence().generate_state(n, np.uint32)]
 
     def numpy(self) -> np.random.Generator:
-        """A NumPy generator at this node."""
+        """Yield a NumPy generator at this node."""
         return np.random.Generator(np.random.PCG64(self._sequence()))
 
     def torch(self) -> torch.Generator:
-        """A torch CPU generator at this node."""
+        """Yield a torch CPU generator at this node."""
         import torch
 
         state = self._sequence().generate_state(1, np.uint64)

@@ -41,7 +41,7 @@ def flat(prefix: str, value: Any) -> dict[str, Any]:
 
 
 def read_only(array: Array) -> Array:
-    """A view that cannot be written to."""
+    """Return a view that cannot be written to."""
     view = array.view()
     view.setflags(False)  # type: ignore[call-arg]  # by name it takes three times as long
     return view
@@ -52,7 +52,7 @@ LARGEST_REWARD = 1e15
 
 
 def wrong_reward(rewards: Array) -> int | None:
-    """The first that is not finite or larger than ``LARGEST_REWARD``: its row; None: all fit."""
+    """Return the first that is not finite or larger than ``LARGEST_REWARD``: its row; None: all fit."""
     fit = np.abs(rewards) <= LARGEST_REWARD
     return int(np.flatnonzero(~fit)[0]) if b"\0" in fit.tobytes() else None
 
@@ -132,7 +132,7 @@ class Policy(Protocol):
         ...
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """The memory after the environments answered.
+        """Return the memory after the environments answered.
 
         Args:
             memory: of the n environments, after ``act``.

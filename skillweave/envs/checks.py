@@ -258,7 +258,7 @@ def _takes_nothing(method: Any) -> bool:
 
 
 def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """The wrappers of an environment, outermost first."""
+    """Yield the wrappers of an environment, outermost first."""
     while isinstance(env, gym.Wrapper):
         yield env
         env = env.env
@@ -319,7 +319,7 @@ class Watch:
         self._bounds = ImageBounds(name, space) if first == 0 else None
 
     def begun(self, obs: Array, ids: Array | None = None) -> Array:
-        """The first observations of environments ``ids`` (None: all), unchanged.
+        """Return the first observations of environments ``ids`` (None: all), unchanged.
 
         Raises:
             EnvError: one is not finite; the message names the environment.
@@ -329,7 +329,7 @@ class Watch:
         return obs
 
     def stepped(self, raw: Any, ids: Array | None = None) -> Any:
-        """The answer (a ``RawStep``) of environments ``ids`` to a step, unchanged.
+        """Return the answer (a ``RawStep``) of environments ``ids`` to a step, unchanged.
 
         Raises:
             EnvError: an observation or a reward is not finite; the message names the
@@ -418,7 +418,7 @@ def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[
 
 
 def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
-    """Whether an observation has a space's shape and kind, and is a choice that exists.
+    """Return whether an observation has a space's shape and kind, and is a choice that exists.
 
     The bounds of a Box are not asked for: many good environments step beyond them.
     """

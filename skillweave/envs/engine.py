@@ -224,7 +224,7 @@ def episode_seed(root: int, row: int, episode: int) -> int:
 
 
 def checksums(obs: Array) -> Array:
-    """A number for each row of observations (n, *obs_shape), (n,) int64; equal rows, equal ones."""
+    """Return a number for each row of observations (n, *obs_shape), (n,) int64; equal rows, equal ones."""
     found = [0] * len(obs)
     for part in _parts(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)

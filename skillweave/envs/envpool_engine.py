@@ -56,7 +56,7 @@ class EnvPoolEngine:
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
-        """Whether EnvPool is installed and has this environment with the same spaces and limit."""
+        """Return whether EnvPool is installed and has this environment with the same spaces and limit."""
         try:
             envpool = installed()
         except MissingExtra:
@@ -85,7 +85,7 @@ class EnvPoolEngine:
         )
 
     def make_pool(self, seed: int) -> Any:
-        """A bare pool."""
+        """Return a bare pool."""
         return self._make(self.num_envs, self._threads, seed)
 
     def reset(self, seed: int) -> Array:

@@ -51,7 +51,7 @@ class History:
             self._begins = np.concatenate([self._begins, np.zeros_like(self._begins)])
 
     def play(self) -> Iterator[tuple[Array, Array, Array]]:
-        """The history of all at once, action by action.
+        """Yield the history of all at once, action by action.
 
         Yields:
             ids (b,) of environments in which an episode begins first, ids (n,) of those that act

@@ -47,12 +47,12 @@ class _Image:
 
     @property
     def is_beyond(self) -> bool:
-        """Whether values lie far beyond the bounds."""
+        """Return whether values lie far beyond the bounds."""
         return self.scaled[0] < -BEYOND or self.scaled[1] > 1.0 + BEYOND
 
     @property
     def is_narrow(self) -> bool:
-        """Whether the values differ, and use a small part of the range."""
+        """Return whether the values differ, and use a small part of the range."""
         return 0.0 < self.scaled[1] - self.scaled[0] <= NARROW
 
 

@@ -133,7 +133,7 @@ def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
 
 
 def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
-    """The part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
+    """Return the part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
 
     What is no array over the n environments is returned as it is.
     """
@@ -268,7 +268,7 @@ class ActionMasks:
 
 
 def told_success(info: Mapping[str, Any], n: int) -> Array | None:
-    """Whether the episodes of n environments have succeeded, by ``info["success"]``.
+    """Return whether the episodes of n environments have succeeded, by ``info["success"]``.
 
     Returns:
         (n,) float64, NaN where an environment says nothing; None: none of them does.

@@ -124,7 +124,7 @@ class EnvSpec:
 
     @property
     def spaces(self) -> Spaces:
-        """The environment's spaces; one is made to read them, the first time."""
+        """Return the environment's spaces; one is made to read them, the first time."""
         known: Spaces | None = vars(self).get("_spaces")
         return self.read_spaces() if known is None else known
 
@@ -227,7 +227,7 @@ class EnvSpec:
 
     @property
     def name(self) -> str:
-        """The id, or the name of the function."""
+        """Return the id, or the name of the function."""
         if isinstance(self.env, str):
             return self.env
         return str(getattr(self.env, "__name__", type(self.env).__name__))
@@ -259,7 +259,7 @@ class EnvSpec:
 
     @property
     def is_data(self) -> bool:
-        """Whether an id and plain settings say it all, without any code of the user's."""
+        """Return whether an id and plain settings say it all, without any code of the user's."""
         plain = not self.wrappers and self.pool is None
         return isinstance(self.env, str) and ":" not in self.env and plain
 
@@ -275,7 +275,7 @@ def spec_of(declared: Any) -> EnvSpec:
 
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
-    """The engine for ``num_envs`` environments of this kind.
+    """Return the engine for ``num_envs`` environments of this kind.
 
     Args:
         threads: of EnvPool's pool; None: one for each core.
@@ -323,7 +323,7 @@ def workers_for(spec: EnvSpec) -> int:
 
 
 def in_pool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
-    """Whether ``make_engine`` makes a pool of this environment."""
+    """Return whether ``make_engine`` makes a pool of this environment."""
     return spec.engine != "sync" and _pool_of(spec, reference) is not None
 
 
@@ -338,7 +338,7 @@ def _pool_of(spec: EnvSpec, reference: gym.Env[Any, Any]) -> MakePool | None:
 
 
 def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
-    """Whether the user's pool can be made here.
+    """Return whether the user's pool can be made here.
 
     Raises:
         EnvError: it can, but is of another environment.

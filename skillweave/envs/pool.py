@@ -47,7 +47,7 @@ class MakePool(Protocol):
     """Makes a pool; the same again for the same arguments."""
 
     def __call__(self, num_envs: int, threads: int, seed: int) -> Pool:
-        """A pool of ``num_envs`` environments.
+        """Return a pool of ``num_envs`` environments.
 
         Raises:
             MissingExtra: what it needs is not installed.
@@ -110,7 +110,7 @@ class PoolWrapper:
 
 @checked_names
 def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) -> Any:
-    """A pool of EnvPool's environments.
+    """Return a pool of EnvPool's environments.
 
     Args:
         env_id: EnvPool's name of it.
@@ -147,7 +147,7 @@ def no_precision_warnings() -> Iterator[None]:
 
 
 def installed() -> Any:
-    """The package ``envpool``.
+    """Return the package ``envpool``.
 
     Raises:
         MissingExtra: it is not there.

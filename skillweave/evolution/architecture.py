@@ -68,7 +68,7 @@ def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str
 
 
 def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> Change | None:
-    """A change that fits the limits, or None where there is none."""
+    """Return a change that fits the limits, or None where there is none."""
     config = member.config
     network: Network = config.network
     units = [
@@ -117,7 +117,7 @@ def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
 
 
 def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
-    """Whether a layer can be added or taken away."""
+    """Return whether a layer can be added or taken away."""
     network, fewest = config.network, mutations.layers[0]
     behind = len(network.hidden) - getattr(config, "dueling", False)
     if by < 0:
@@ -137,7 +137,7 @@ def _cnn(member: Member, spaces: Any) -> CNN | None:
 
 
 def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) -> Network:
-    """The network after a change; ``cnn`` is what encodes its images now."""
+    """Return the network after a change; ``cnn`` is what encodes its images now."""
     if change.kind == "channels":
         assert cnn is not None
         new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
@@ -159,7 +159,7 @@ def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) ->
 
 
 def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generator) -> Member:
-    """The member after a change: settings, weights and moments."""
+    """Return the member after a change: settings, weights and moments."""
     old = member.algorithm(spaces)
     cnn, dueling = _cnn(member, spaces), bool(getattr(old.config, "dueling", False))
     networks: dict[str, Any] = {
@@ -182,7 +182,7 @@ def _carried(
     change: Change,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """A family's fields in the new layout."""
+    """Return a family's fields in the new layout."""
     names = (*before.weights, *before.moments, before.count)
     lead = state[names[0]].shape[:-1]
     # What is new begins with moments of 0 after 0 steps; the others' go on.

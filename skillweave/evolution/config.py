@@ -146,7 +146,7 @@ class Mutations:
             )
 
     def ranges_of(self, config: AlgorithmConfig, *, start: bool = True) -> dict[str, Range]:
-        """The ranges of an algorithm's settings.
+        """Return the ranges of an algorithm's settings.
 
         Args:
             config: the algorithm's settings.

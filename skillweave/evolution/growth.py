@@ -59,7 +59,7 @@ def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[s
 
 
 def most_read(named: Views, units: Units, count: int) -> Tensor:
-    """The ``count`` units with the largest outgoing weights, (R, count), in order."""
+    """Return the ``count`` units with the largest outgoing weights, (R, count), in order."""
     total: Tensor | None = None
     for part in units.onward:
         weight = named[part.name].abs().movedim(part.axis, 1)
@@ -158,7 +158,7 @@ def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
 
 
 def _moved(name: str, joint: Joint, by: int) -> str:
-    """A head counts as the layer behind the hidden ones: its number moves with their depth."""
+    """Return a head counts as the layer behind the hidden ones: its number moves with their depth."""
     head = f"{joint.prefix}.{joint.depth}."
     if not name.startswith(head):
         return name

@@ -22,7 +22,7 @@ def lineage_of(
     evolution: Evolution,
     best: int | None,
 ) -> list[dict[str, Any]]:
-    """A generation's lines; ``best``: the number of the best so far, if it is one of these."""
+    """Return a generation's lines; ``best``: the number of the best so far, if it is one of these."""
     return [
         {
             "stage": stage,

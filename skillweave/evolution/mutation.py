@@ -23,7 +23,7 @@ Spaces = tuple[Any, Any]
 def mutate(
     member: Member, mutations: Mutations, spaces: Spaces, rng: np.random.Generator
 ) -> Member:
-    """A child of the member, which says what mutation it has; "none" where none is possible."""
+    """Return a child of the member, which says what mutation it has; "none" where none is possible."""
     kind = str(rng.choice(KINDS, p=np.array([getattr(mutations, k) for k in KINDS])))
     if kind == "hyperparameters":
         changed = _move_setting(member, mutations, rng)
@@ -58,7 +58,7 @@ def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[An
 
 
 def with_settings(member: Member, **settings: Any) -> Member:
-    """A copy of the member with other settings, in its state too where they stand there."""
+    """Return a copy of the member with other settings, in its state too where they stand there."""
     found = copy(member)
     found.config = replace(member.config, **settings)
     for name, value in settings.items():
@@ -133,7 +133,7 @@ def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Me
 
 
 def _valued(config: AlgorithmConfig, name: str, value: float) -> Any:
-    """A number of the kind that the setting has."""
+    """Return a number of the kind that the setting has."""
     return round(value) if isinstance(getattr(config, name), int) else float(value)
 
 

@@ -160,7 +160,7 @@ class Part:
         split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
 
     def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
-        """The places as one collector, in which the stacks act."""
+        """Return the places as one collector, in which the stacks act."""
         engine: Any = JoinedEngines([place.engine for place in places])
         acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
         return joined_from(places, engine, acting)
@@ -253,5 +253,5 @@ def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
 
 
 def has_diverged(member: Member) -> bool:
-    """Whether a number that it has learnt is not finite."""
+    """Return whether a number that it has learnt is not finite."""
     return not all(bool(torch.isfinite(v).all()) for v in vars(member.state).values())

@@ -84,7 +84,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HE
 
 
 def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:
-    """The stages that are to evolve."""
+    """Return the stages that are to evolve."""
     if evolve is None:
         return {}
     if isinstance(evolve, Evolution):

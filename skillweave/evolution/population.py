@@ -57,7 +57,7 @@ class Population:
         seeds: Seeds,
         part: Part | Parts | None = None,
     ) -> Population:
-        """The first generation, each member with weights of its own."""
+        """Return the first generation, each member with weights of its own."""
         members, spaces = [], spaces_of(scene)
         for i in range(evolution.population):
             own = config

@@ -39,7 +39,7 @@ class ParentSelection(Protocol):
 
 
 def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> list[Heir]:
-    """The next generation, by the selection asked for; nobody is heir to a diverged member.
+    """Return the next generation, by the selection asked for; nobody is heir to a diverged member.
 
     Raises:
         TrainingError: all members have diverged, or a selection of the user's own is wrong.

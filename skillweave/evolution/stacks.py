@@ -47,12 +47,12 @@ class Member:
     origin: Origin = field(default_factory=lambda: Origin())
 
     def algorithm(self, spaces: tuple[Any, Any]) -> Algorithm:
-        """The algorithm it learns by, on (observation space, action space)."""
+        """Return the algorithm it learns by, on (observation space, action space)."""
         return make_algorithm(self.config, *spaces)
 
 
 def networks_of(config: AlgorithmConfig) -> dict[str, Network]:
-    """The architectures that settings hold, by field."""
+    """Return the architectures that settings hold, by field."""
     found = {name: getattr(config, name, None) for name in ("network", "critic")}
     return {name: network for name, network in found.items() if isinstance(network, Network)}
 
@@ -92,7 +92,7 @@ def join(
     spaces: tuple[Any, Any],
     made: dict[AlgorithmConfig, Algorithm] | None = None,
 ) -> tuple[Algorithm, Any]:
-    """The algorithm of the widest of all, and one state of P members; copies.
+    """Return the algorithm of the widest of all, and one state of P members; copies.
 
     Algorithms are kept in ``made``: what one of them has compiled need not be compiled again.
     """
@@ -181,7 +181,7 @@ def crop(flat: Tensor, wide: Layout, own: Layout) -> Tensor:
 
 
 def _corner(view: Tensor) -> tuple[slice, ...]:
-    """The first entries along each axis, as many as ``view`` has."""
+    """Return the first entries along each axis, as many as ``view`` has."""
     return tuple(slice(n) for n in view.shape)
 
 

@@ -128,7 +128,7 @@ class EvolvingPopulation:
 
     @property
     def over(self) -> bool:
-        """Whether all generations are complete, or it ends before.
+        """Return whether all generations are complete, or it ends before.
 
         The target is reached, the budget is spent, or a callback has asked for it.
         """
@@ -138,7 +138,7 @@ class EvolvingPopulation:
 
     @property
     def _good(self) -> bool:
-        """Whether the target is reached."""
+        """Return whether the target is reached."""
         target, best = self.target, self.best
         return target is not None and best is not None and best.fitness >= target.at_least
 
@@ -175,7 +175,7 @@ class EvolvingPopulation:
         return self.arena.steps_made + self.population.part.steps_elsewhere
 
     def _finish(self) -> AgentPolicy:
-        """The policy that the stage ends with."""
+        """Return the policy that the stage ends with."""
         assert self.best is not None
         asked = self.evolution.generations
         if self._good:
@@ -282,7 +282,7 @@ class EvolvingPopulation:
         self.population.next_number = at["next_number"]
 
     def _restored(self, told: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
-        """A member of a checkpoint.
+        """Return a member of a checkpoint.
 
         Heirs have parents that had not diverged. The last generation has no heirs.
         """

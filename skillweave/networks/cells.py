@@ -27,7 +27,7 @@ FEWEST_ROWS = 32
 
 
 def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
-    """The sums of rows of a table, one table for each member.
+    """Return the sums of rows of a table, one table for each member.
 
     Args:
         rows: (P, B, K) int64, which rows are added. On a CPU the gradient is wrong where one sum
@@ -57,14 +57,14 @@ class _SumOfRows(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, table: Tensor) -> Tensor:
-        """The sums."""
+        """Return the sums."""
         ctx.save_for_backward(rows)
         ctx.shape = table.shape
         return _sums(rows, table)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
-        """The gradient by the table: one-hot rows, transposed, times the gradient of the sums."""
+        """Return the gradient by the table: one-hot rows, transposed, times the gradient of the sums."""
         (rows,) = ctx.saved_tensors
         members, size, _ = ctx.shape
         found = grad.new_zeros(ctx.shape)

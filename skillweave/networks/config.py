@@ -65,7 +65,7 @@ class CNN:
 
     @classmethod
     def impala(cls, channels: tuple[int, ...] = (16, 32, 32)) -> CNN:
-        """The residual network of IMPALA (Espeholt et al. 2018, fig. 3).
+        """Return the residual network of IMPALA (Espeholt et al. 2018, fig. 3).
 
         Args:
             channels: of each of its blocks.

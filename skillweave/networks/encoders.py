@@ -64,7 +64,7 @@ def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
 
 
 def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
-    """A registered encoder, or one of a module of the user, on one observation space.
+    """Return a registered encoder, or one of a module of the user, on one observation space.
 
     Raises:
         DeclarationError: it was not registered, or is a function that was not given.
@@ -172,7 +172,7 @@ def _conv(views: Views, name: str, x: Tensor, stride: int = 1, padding: int = 0)
 
 
 def part(views: Views, prefix: str) -> dict[str, Tensor]:
-    """The parameters under a prefix, by their names within it."""
+    """Return the parameters under a prefix, by their names within it."""
     cut = len(prefix) + 1
     return {k[cut:]: v for k, v in views.items() if k.startswith(prefix + ".")}
 

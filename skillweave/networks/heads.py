@@ -70,7 +70,7 @@ class ActionHead:
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are discrete."""
+        """Return whether actions are discrete."""
         return self.codec.discrete
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
@@ -92,7 +92,7 @@ class ActionHead:
         return torch.stack(drawn, dim=1)
 
     def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
-        """The actions that a head means.
+        """Return the actions that a head means.
 
         Args:
             head: (..., width), logits masked already.
@@ -188,7 +188,7 @@ class ActionHead:
         return categorical_kl(self._parts(head), self._parts(other)).sum(-1)
 
     def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
-        """A head under which Discrete or Box actions have exactly these log-probabilities (...).
+        """Return a head under which Discrete or Box actions have exactly these log-probabilities (...).
 
         For a caller who knows what was done and how likely it was, but not the distribution.
 
@@ -222,7 +222,7 @@ class ActionHead:
         return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
-        """An ``action`` (n, …) in policy units as the environment's."""
+        """Return an ``action`` (n, …) in policy units as the environment's."""
         return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
 
     def _parts(self, logits: Tensor) -> Tensor:

@@ -132,7 +132,7 @@ class Net:
         return torch.baddbmm(bias, x, weight)
 
     def _seen(self, vector: Tensor) -> Tensor:
-        """The numbers (P, B, O) that this network is given."""
+        """Return the numbers (P, B, O) that this network is given."""
         return (
             vector if self._sees is None else vector.index_select(-1, self._sees.on(vector.device))
         )

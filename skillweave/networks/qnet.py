@@ -83,7 +83,7 @@ class QNet:
         return value[..., None, :] + (advantage - advantage.mean(2, keepdim=True))
 
     def perturbed(self, views: Views, noise: Tensor) -> dict[str, Tensor]:
-        """The views with noise (P, K), standard normal: factorised, ``f(x) = sgn(x)·√|x|``."""
+        """Return the views with noise (P, K), standard normal: factorised, ``f(x) = sgn(x)·√|x|``."""
         scaled = noise.sign() * noise.abs().sqrt()
         found, at = dict(views), 0
         for layer in self._noisy:

@@ -36,7 +36,7 @@ def rnn_init_(views: Views, prefix: str, generators: list[torch.Generator]) -> N
 
 
 def project(views: Views, prefix: str, x: Tensor) -> Tensor:
-    """The inputs' share of the gates, (P, B, in) to (P, B, gates·H): all steps at once."""
+    """Return the inputs' share of the gates, (P, B, in) to (P, B, gates·H): all steps at once."""
     return torch.baddbmm(views[f"{prefix}.bias"], x, views[f"{prefix}.input"])
 
 

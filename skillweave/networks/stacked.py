@@ -52,7 +52,7 @@ class Layout:
         return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
 
     def gradient(self, loss: Tensor, leaves: Views) -> Tensor:
-        """The gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for what it does not depend on."""
+        """Return the gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for what it does not depend on."""
         # Members do not mix: the gradient of the sum is each member's own.
         found = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
         flat = [

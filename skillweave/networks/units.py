@@ -35,7 +35,7 @@ class Units:
 def units_of(
     shapes: Mapping[str, tuple[int, ...]], count: int, layer: str, readers: Sequence[str]
 ) -> Units:
-    """The units of a layer of weights (in, out), read by the weights named; noise goes along."""
+    """Return the units of a layer of weights (in, out), read by the weights named; noise goes along."""
     names = (f"{name}{sigma}" for name in readers for sigma in ("", "_sigma"))
     return Units(
         count,
@@ -55,7 +55,7 @@ class Joint:
 
 
 def hidden_units(net: Net | QNet, layer: int) -> list[Units]:
-    """The units of a hidden layer; of the last of a dueling network, one group per stream."""
+    """Return the units of a hidden layer; of the last of a dueling network, one group per stream."""
     trunk = net.trunk if isinstance(net, QNet) else net
     if layer < len(trunk.network.hidden):
         prefix = f"{trunk.name}.{layer}"
@@ -69,7 +69,7 @@ def hidden_units(net: Net | QNet, layer: int) -> list[Units]:
 
 
 def channels_of(net: Net | QNet, layer: int) -> list[Units]:
-    """The channels of a convolution, or of a stage, of every image; several groups."""
+    """Return the channels of a convolution, or of a stage, of every image; several groups."""
     trunk = net.trunk if isinstance(net, QNet) else net
     found, start = [], trunk.features
     for prefix, encoder in net.encoders.items():
@@ -110,7 +110,7 @@ def _readers_of(net: Net | QNet, layer: int) -> tuple[str, ...]:
 def _encoder_units(
     encoder: ImageEncoder, layer: int, prefix: str, onward: Sequence[tuple[str, int]]
 ) -> list[Units]:
-    """The channels of a convolution or of a stage, in groups that have filters of their own.
+    """Return the channels of a convolution or of a stage, in groups that have filters of their own.
 
     Args:
         prefix: of the encoder's parameters, in the network.

@@ -23,7 +23,7 @@ DEVICES = ("cpu", "cuda", "auto")
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of this name; "auto" is a GPU where there is one, else the CPU.
+    """Return the device of this name; "auto" is a GPU where there is one, else the CPU.
 
     Raises:
         DeclarationError: the name is unknown, or PyTorch finds no such device here.
@@ -47,7 +47,7 @@ class Constant:
         self._copies: dict[torch.device, Tensor] = {}
 
     def on(self, device: torch.device) -> Tensor:
-        """The tensor on this device."""
+        """Return the tensor on this device."""
         if device == self._value.device:
             return self._value
         if device not in self._copies:
@@ -64,7 +64,7 @@ def on_host(*numbers: Tensor) -> list[int]:
 
 
 def all_false(flags: Tensor) -> bool:
-    """Whether all are False, as far as that is known without waiting for an accelerator.
+    """Return whether all are False, as far as that is known without waiting for an accelerator.
 
     On the CPU, where looking costs nothing, it is the answer; elsewhere it is always False.
     """

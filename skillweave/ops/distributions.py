@@ -69,7 +69,7 @@ def gumbel(uniform: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def categorical_sample(
     logits: Float[Tensor, "*#batch A"], noise: Float[Tensor, "*#batch A"]
 ) -> Int[Tensor, "*batch"]:
-    """A sample by the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
+    """Return a sample by the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
     return torch.argmax(logits + noise, dim=-1)
 
 
@@ -150,7 +150,7 @@ def squashed_sample(mean: Tensor, log_std: Tensor, z: Tensor) -> tuple[Tensor, T
 
 
 def squashed_entropy(mean: Tensor, log_std: Tensor) -> Tensor:
-    """The entropy of ``tanh`` of normals, about: (..., A) to (...).
+    """Return the entropy of ``tanh`` of normals, about: (..., A) to (...).
 
     The entropy of the normals plus ``log(1 − tanh²)`` at their means. Exact is its expectation,
     which has no closed form.
@@ -159,7 +159,7 @@ def squashed_entropy(mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def smoothed_action(action: Tensor, noise: Tensor, std: Tensor, bound: Tensor) -> Tensor:
-    """An action in [−1, 1] moved by clipped noise: target policy smoothing (TD3, eq. 14).
+    """Return an action in [−1, 1] moved by clipped noise: target policy smoothing (TD3, eq. 14).
 
     Args:
         action, noise: (P, B, A), noise standard normal.

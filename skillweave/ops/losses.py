@@ -21,7 +21,7 @@ action of an older one can be so unlikely that the ratio is not finite."""
 def likelihood_ratio(
     log_prob: Float[Tensor, "P B"], other: Float[Tensor, "P B"]
 ) -> Float[Tensor, "P B"]:
-    """The probability of actions ÷ that by another policy, at most e²⁰; log-probabilities (P, B).
+    """Return the probability of actions ÷ that by another policy, at most e²⁰; log-probabilities (P, B).
 
     Beyond, it has no gradient.
     """
@@ -140,7 +140,7 @@ def expected_soft_value(log_p: Tensor, q: Tensor, alpha: Tensor) -> Tensor:
 
 
 def masked_entropy_target(target: float, mask: Tensor | None) -> Tensor | float:
-    """An entropy to aim at where masks (P, B, A) allow only some of A discrete actions.
+    """Return an entropy to aim at where masks (P, B, A) allow only some of A discrete actions.
 
     Of m actions it is ``target·log m / log A``, here the mean over the batch, (P,).
     """
@@ -151,7 +151,7 @@ def masked_entropy_target(target: float, mask: Tensor | None) -> Tensor | float:
 
 
 def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
-    """The distribution of ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
+    """Return the distribution of ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
 
     Args:
         p: (P, B, N), probabilities of ``atoms`` (N,), which are evenly spaced.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
-    """The mean of the valid samples of each member.
+    """Return the mean of the valid samples of each member.
 
     Args:
         x: (P, ...).

@@ -70,7 +70,7 @@ class Checkpoints:
         return None
 
     def told(self) -> dict[str, Any]:
-        """The header of the one that a resumed run goes on from; empty where there is none."""
+        """Return the header of the one that a resumed run goes on from; empty where there is none."""
         fresh, latest, before = self._files
         for path in (latest, fresh, before):  # as ``clear`` and ``load`` take them
             with suppress(RunError):

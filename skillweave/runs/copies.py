@@ -23,7 +23,7 @@ def keep_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
 
 
 def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
-    """A skill's ready policy as it was when the run began.
+    """Return a skill's ready policy as it was when the run began.
 
     Raises:
         RunError: the policy is another one, and the run holds no copy of its own.

@@ -90,7 +90,7 @@ def _policy_file(stage: str, name: str | None) -> str:
 
 
 def file_name(path: str) -> str:
-    """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
+    """Return the name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
     return path.replace("/", ".")
 
 
@@ -189,7 +189,7 @@ class RunDirectory:
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
-        """An existing run, to read or to train.
+        """Return an existing run, to read or to train.
 
         Raises:
             RunError: there is none, or it is damaged or newer than this Skillweave.
@@ -241,7 +241,7 @@ class RunDirectory:
             self._lock.check()
 
     def stage(self, name: str) -> dict[str, Any]:
-        """The manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
+        """Return the manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
         entries: list[dict[str, Any]] = self.manifest["stages"]
         for entry in entries:
             if entry["name"] == name:
@@ -251,20 +251,20 @@ class RunDirectory:
 
     @property
     def finished(self) -> bool:
-        """Whether every stage is done, and judged where it is to be."""
+        """Return whether every stage is done, and judged where it is to be."""
         done = all(p["status"] == "done" for p in self.manifest["stages"])
         return done and not self.unjudged
 
     @property
     def has_learnt(self) -> bool:
-        """Whether a new run in its place would lose something that was learnt."""
+        """Return whether a new run in its place would lose something that was learnt."""
         stages = self.manifest["stages"]
         done = any(s["status"] == "done" or s.get("continued") for s in stages)
         return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
 
     @property
     def unjudged(self) -> bool:
-        """Whether nobody has found out yet which hierarchy is the best that was learnt."""
+        """Return whether nobody has found out yet which hierarchy is the best that was learnt."""
         stages = self.manifest["stages"]
         return any("kept" not in s and to_be_judged(s) for s in stages)
 
@@ -418,7 +418,7 @@ class RunDirectory:
         return {name: self.load_policy(stage, name) for name in names}
 
     def load_policy(self, stage: str, name: str | None = None) -> AgentPolicy:
-        """The policy of a finished stage, or of one who learnt in it.
+        """Return the policy of a finished stage, or of one who learnt in it.
 
         Raises:
             RunError: the stage is not finished, or its file is damaged.
@@ -477,7 +477,7 @@ class RunDirectory:
         return resume_words(self)
 
     def metrics(self) -> Iterator[dict[str, Any]]:
-        """The lines of ``metrics.jsonl``; a half-written last line is left out."""
+        """Yield the lines of ``metrics.jsonl``; a half-written last line is left out."""
         return self._metrics.read()
 
     def close(self) -> None:

@@ -147,7 +147,7 @@ def _whole_text(text: str) -> str:
 def read_json(
     path: Path, check: Callable[[dict[str, Any]], object] | None = None
 ) -> dict[str, Any]:
-    """A JSON file written by ``write_json``, without its checksum.
+    """Return a JSON file written by ``write_json``, without its checksum.
 
     Args:
         check: looks at the content before the checksum does, for an error that says more.
@@ -235,7 +235,7 @@ def check_unchanged(path: Path, found: str, written: str) -> None:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """The header alone, quickly: its checksum is not compared.
+    """Return the header alone, quickly: its checksum is not compared.
 
     Raises:
         RunError: as ``read_tensors``.

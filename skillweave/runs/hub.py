@@ -35,7 +35,7 @@ SECONDS = 20.0
 
 
 def hub() -> Any:
-    """The hub's library.
+    """Return the hub's library.
 
     Raises:
         MissingExtra: it is not installed.
@@ -91,7 +91,7 @@ def check_whole(run: RunDirectory) -> None:
 
 
 def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of ``run.json`` without what is its owner's alone; its id stays what it is.
+    """Return the content of ``run.json`` without what is its owner's alone; its id stays what it is.
 
     That is where files lie on the owner's machine, and which trackers are told of the run: who
     loads it must not tell theirs.
@@ -107,7 +107,7 @@ def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def run_files(run: RunDirectory) -> tuple[dict[str, Path | bytes], list[str]]:
-    """The files of a run that go up, by their names there; and files that must stay here.
+    """Return the files of a run that go up, by their names there; and files that must stay here.
 
     What stays are copies of policies that are neither safetensors nor JSON.
     """
@@ -179,7 +179,7 @@ def _may_be_replaced(name: str, there: Sequence[str]) -> None:
 
 
 def _of_a_run(path: str) -> bool:
-    """Whether it is a file that ``push`` writes, and so may delete."""
+    """Return whether it is a file that ``push`` writes, and so may delete."""
     found = PurePosixPath(path)
     if str(found.parent) in ("policies", FIGURES):
         return True
@@ -220,7 +220,7 @@ def _copied_from(folder: Path) -> str | None:
 
 
 def download(name: str, revision: str | None = None) -> Path:
-    """The folder, in the cache of the hub's library, with a run's files.
+    """Return the folder, in the cache of the hub's library, with a run's files.
 
     Where the hub does not answer, what was downloaded before is taken.
 
@@ -263,7 +263,7 @@ def _info(api: Any, name: str, revision: str | None) -> Any:
 
 
 def _downloaded_before(api: Any, name: str, how: Mapping[str, Any], error: Exception) -> Path:
-    """The folder of an earlier download; where there is none, ``error`` is raised."""
+    """Return the folder of an earlier download; where there is none, ``error`` is raised."""
     try:
         return Path(api.snapshot_download(name, local_files_only=True, **how))
     except Exception:
@@ -282,7 +282,7 @@ def _check_kinds(name: str, files: Sequence[str]) -> None:
 
 
 def _refused(files: Sequence[str]) -> str:
-    """The files that are of no known kind, as words; empty: there are none."""
+    """Return the files that are of no known kind, as words; empty: there are none."""
     others = [short(f) for f in files if not _is_data(f)]
     more = f" and {len(others) - 3} more" if len(others) > 3 else ""
     return ", ".join(others[:3]) + more

@@ -12,7 +12,7 @@ from skillweave.messages import short, shortened
 
 
 def status_of(error: BaseException | None) -> Any:
-    """The number of the hub's answer; None: there was no answer."""
+    """Return the number of the hub's answer; None: there was no answer."""
     while error is not None:
         if (response := getattr(error, "response", None)) is not None:
             return response.status_code

@@ -31,7 +31,7 @@ class JsonLines:
 
     @property
     def size(self) -> int:
-        """The size of the file in bytes."""
+        """Return the size of the file in bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     def append(self, records: Iterable[Mapping[str, Any]]) -> None:
@@ -72,7 +72,7 @@ class JsonLines:
             raise RunError(f"could not write {self.path}: {error.strerror}") from error
 
     def read(self) -> Iterator[dict[str, Any]]:
-        """The records, without a last line that is incomplete.
+        """Yield the records, without a last line that is incomplete.
 
         Raises:
             RunError: a line is damaged, or the path is not a plain file.

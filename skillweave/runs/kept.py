@@ -55,5 +55,5 @@ def best_words(best: Mapping[str, Any]) -> str:
 
 
 def to_be_judged(entry: Mapping[str, Any]) -> bool:
-    """Whether a stage of a run is to end with the best of several hierarchies."""
+    """Return whether a stage of a run is to end with the best of several hierarchies."""
     return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

@@ -264,7 +264,7 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
 
 
 def read_manifest(run: Path) -> dict[str, Any]:
-    """The content of a run's ``run.json``, checked."""
+    """Return the content of a run's ``run.json``, checked."""
     file = run / "run.json"
     return read_json(file, lambda data: check_manifest(data, str(file)))
 

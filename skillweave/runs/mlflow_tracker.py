@@ -55,7 +55,7 @@ class MLflow:
         self._told = {s: found.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
 
     def _found(self, identifier: str) -> Any:
-        """The run of MLflow's that this one goes on with; None: it begins."""
+        """Return the run of MLflow's that this one goes on with; None: it begins."""
         experiment = self._client.get_experiment_by_name(EXPERIMENT)
         if experiment is None:
             self._client.create_experiment(EXPERIMENT)
@@ -68,7 +68,7 @@ class MLflow:
         return found[0]
 
     def _begun(self, identifier: str) -> Any:
-        """A new run of MLflow's, with the settings."""
+        """Return a new run of MLflow's, with the settings."""
         experiment = self._client.get_experiment_by_name(EXPERIMENT)
         manifest, name = self._run.manifest, self._run.path.resolve().name
         tags = {TAG: identifier}

@@ -27,7 +27,7 @@ def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:
 
 
 def _runs_in(path: Path) -> list[Path]:
-    """The runs directly below a directory: s2 before s10."""
+    """Return the runs directly below a directory: s2 before s10."""
     if not path.is_dir():
         return []
     runs = [each.parent for each in path.glob("*/run.json")]
@@ -35,6 +35,6 @@ def _runs_in(path: Path) -> list[Path]:
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts numbers in names by their size."""
+    """Return a key that sorts numbers in names by their size."""
     parts = re.split(r"(\d+)", name)
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]

@@ -119,7 +119,7 @@ def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where
 
 
 def same_shapes(one: Algorithm, other: Algorithm) -> bool:
-    """Whether the weights of both have the same names and shapes."""
+    """Return whether the weights of both have the same names and shapes."""
     return one.weight_shapes() == other.weight_shapes()
 
 

@@ -15,7 +15,7 @@ S = TypeVar("S")
 
 
 def learns_again(run: RunDirectory, stage: str, name: str) -> bool:
-    """Whether ``name`` learns in a stage after this one, too."""
+    """Return whether ``name`` learns in a stage after this one, too."""
     stages = run.manifest["stages"]
     at = [entry["name"] for entry in stages].index(stage)
     return any(name in entry["learns"] for entry in stages[at + 1 :])
@@ -31,7 +31,7 @@ def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
 
 
 def load_state(run: RunDirectory, name: str, like: S) -> S | None:
-    """The state that ``name`` ended its latest stage with; None: none was written.
+    """Return the state that ``name`` ended its latest stage with; None: none was written.
 
     A population writes none. Where what was learnt in that stage was
     not kept, its state is none of who goes on.

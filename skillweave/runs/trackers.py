@@ -149,7 +149,7 @@ def identifier(run: RunDirectory) -> str:
 
 
 def make_mlflow(run: RunDirectory) -> Tracker:
-    """A run of MLflow's."""
+    """Return a run of MLflow's."""
     return MLflow(run, identifier(run))
 
 
@@ -163,7 +163,7 @@ TRACKERS = tuple(MAKE)
 
 
 def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Tracker, ...]:
-    """The trackers with these names; if ``run`` is None, only check that they can be made.
+    """Return the trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
         DeclarationError: there is no such tracker.
@@ -207,7 +207,7 @@ def steps_of(run: RunDirectory) -> int:
 
 
 def wandb_mode() -> Any:
-    """The value of WANDB_MODE if it is set; else online if there is a login, else offline."""
+    """Return the value of WANDB_MODE if it is set; else online if there is a login, else offline."""
     login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
     return os.environ.get("WANDB_MODE") or ("online" if login else "offline")
 

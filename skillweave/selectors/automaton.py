@@ -94,7 +94,7 @@ class Automaton(ReadySelector):
         self.ranks = np.zeros((len(states), 0))
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the ``skills`` of these names."""
+        """Return a copy that chooses among the ``skills`` of these names."""
         found = super().among(skills)
         # The larger, the earlier: 0 where the skill is none of the state's.
         found.ranks = np.zeros((len(self.states), len(skills)), np.int64)
@@ -128,7 +128,7 @@ class Automaton(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """A skill of each environment's state, (n,)."""
+        """Return a skill of each environment's state, (n,)."""
         allowed = self._startable(memory, obs, mask)
         score = self.ranks[memory["state"]]
         if not deterministic:
@@ -145,7 +145,7 @@ class Automaton(ReadySelector):
         return found, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """The ``memory`` after a ``step``: take the transitions whose events have happened.
+        """Return the ``memory`` after a ``step``: take the transitions whose events have happened.
 
         ``last`` says how the last calls ended.
         """
@@ -161,7 +161,7 @@ class Automaton(ReadySelector):
         return {"state": after}
 
     def source(self) -> dict[str, Any]:
-        """The checksum of its states and transitions; of functions the names alone are in it."""
+        """Return the checksum of its states and transitions; of functions the names alone are in it."""
         arrows = [
             [*pair, event if isinstance(event, str) else [function_name(event)]]
             for pair, event in self.transitions.items()
@@ -174,7 +174,7 @@ class Automaton(ReadySelector):
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
     def _startable(self, memory: Memory, obs: Array, mask: Array | None) -> Array:
-        """The skills of the state that may start, (n, S) bool: at least one."""
+        """Return the skills of the state that may start, (n, S) bool: at least one."""
         allowed = self.allowed(memory)
         if mask is not None:
             allowed = allowed & mask
@@ -183,7 +183,7 @@ class Automaton(ReadySelector):
         return allowed
 
     def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
-        """Whether an event has happened in this step, (n,) bool."""
+        """Return whether an event has happened in this step, (n,) bool."""
         if isinstance(event, str):
             wanted = last.succeeded if event == "success" else ~last.succeeded
             happened: Array = (last.why != CallEnd.RUNNING) & wanted
@@ -192,7 +192,7 @@ class Automaton(ReadySelector):
         return answer(event, step, n, bool, self._who, name, step.elapsed)
 
     def _ends_of(self, pair: Any, event: Any) -> tuple[int, int]:
-        """The states that a transition is between, after a check of both and of its event."""
+        """Return the states that a transition is between, after a check of both and of its event."""
         if not isinstance(pair, tuple) or len(pair) != 2:
             raise DeclarationError(
                 f"an Automaton's transition is from {short(pair)}; write ('from', 'to'): event"
@@ -230,7 +230,7 @@ def _name(state: Any) -> str:
 
 
 def _skills(state: str, skills: Any) -> tuple[str, ...] | frozenset[str]:
-    """The names of a state's skills: in order, or as a set."""
+    """Return the names of a state's skills: in order, or as a set."""
     if isinstance(skills, str):
         return (skills,)
     where = f"automaton: state {short(state)}"

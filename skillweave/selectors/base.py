@@ -31,7 +31,7 @@ class ReadySelector(Foreign):
         return {}
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the skills of these names, in the hierarchy's order.
+        """Return a copy that chooses among the skills of these names, in the hierarchy's order.
 
         Raises:
             DeclarationError: it names a skill that is none of them.
@@ -54,7 +54,7 @@ class ReadySelector(Foreign):
         return None
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """The memory after a step of n environments; called after every step.
+        """Return the memory after a step of n environments; called after every step.
 
         Args:
             step: as the environments answered; its ``elapsed`` counts as for any policy.

@@ -83,7 +83,7 @@ class FunctionSelector(ReadySelector):
         }  # fmt: skip
 
     def source(self) -> dict[str, Any]:
-        """The function's name."""
+        """Return the function's name."""
         return {"kind": self.kind, "name": qualified(self.function)}
 
     def _check_starts(self, chosen: Array, obs: Array, mask: Array | None) -> None:

@@ -16,7 +16,7 @@ ReadyValue = Callable[..., Any] | Automaton | tree.Composite
 
 
 def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
-    """The selector that ``value`` means among skills of these names; None: it is none.
+    """Return the selector that ``value`` means among skills of these names; None: it is none.
 
     Raises:
         DeclarationError: it names a skill that is not among them.

@@ -43,7 +43,7 @@ class TreeSelector(ReadySelector):
             )
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the skills of these names."""
+        """Return a copy that chooses among the skills of these names."""
         found = super().among(skills)
         found._plan = _Plan()
         found._top = found._plan.add(self.root, lambda name: found._number(name, "tree: a leaf"))
@@ -71,7 +71,7 @@ class TreeSelector(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The skill of the leaf that each environment's tree comes to, (n,)."""
+        """Return the skill of the leaf that each environment's tree comes to, (n,)."""
         n = len(obs)
         mask = np.ones((n, len(self.skills)), bool) if mask is None else mask
         tick = _Tick(obs, mask, memory, self._who)
@@ -110,13 +110,13 @@ class TreeSelector(ReadySelector):
             node.tick(tick, np.arange(2))
 
     def source(self) -> dict[str, Any]:
-        """The checksum of its nodes; of functions the names alone are in it."""
+        """Return the checksum of its nodes; of functions the names alone are in it."""
         whole = json.dumps(_told(self.root))
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
 
 def _told(node: Node) -> Any:
-    """A node as JSON."""
+    """Return a node as JSON."""
     if isinstance(node, str):
         return node
     if isinstance(node, Condition):
@@ -177,7 +177,7 @@ class _Several:
     children: tuple[_Several | _Asked | _Leaf, ...]
 
     def tick(self, tick: _Tick, rows: Array) -> Array:
-        """The children in turn, until one of them decides."""
+        """Return the children in turn, until one of them decides."""
         status = np.full(len(rows), self.goes_on_after)
         first = tick.before[rows, self.number] if self.memory else np.zeros(len(rows), np.int64)
         for i, child in enumerate(self.children):
@@ -198,7 +198,7 @@ class _Plan:
     asked: list[_Asked] = field(default_factory=list)
 
     def add(self, node: Node, number_of: Callable[[str], int]) -> Any:
-        """A node with all below it."""
+        """Return a node with all below it."""
         if isinstance(node, Condition):
             self.asked.append(_Asked(node))
             return self.asked[-1]

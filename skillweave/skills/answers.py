@@ -97,7 +97,7 @@ def checked(
 
 
 def _number(row: int, ids: Array | None) -> int:
-    """The environment that a row is of."""
+    """Return the environment that a row is of."""
     return row if ids is None else int(ids[row])
 
 

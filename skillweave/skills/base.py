@@ -121,7 +121,7 @@ class Skill:
         return np.zeros(len(step.reward), bool)
 
     def defines(self, method: str) -> bool:
-        """Whether the subclass gives its own version of ``method``."""
+        """Return whether the subclass gives its own version of ``method``."""
         return getattr(type(self), method) is not getattr(Skill, method)
 
     def validate(self) -> None:
@@ -166,7 +166,7 @@ class Skill:
 
 
 def _is_color(value: object) -> bool:
-    """Whether a value is red, green and blue, each from 0 to 255."""
+    """Return whether a value is red, green and blue, each from 0 to 255."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, tuple | list) or len(value) != 3:
@@ -280,7 +280,7 @@ class Reflex:
 def apply_reflexes(
     reflexes: tuple[Reflex, ...], obs: Array, action: Array, space: Space[Any]
 ) -> tuple[Array, Array]:
-    """The actions with every reflex in force, and (n,) bool: where one of them acted.
+    """Return the actions with every reflex in force, and (n,) bool: where one of them acted.
 
     Where several hold, the last one counts.
     """

@@ -35,7 +35,7 @@ class Foreign(Memoryless):
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy on ``observation_space`` and ``action_space``, where it has none of its own.
+        """Return a copy on ``observation_space`` and ``action_space``, where it has none of its own.
 
         Messages begin with ``who``.
         """
@@ -71,7 +71,7 @@ class Foreign(Memoryless):
         return {"kind": self.kind, "name": self.name, **sha256}
 
     def content(self) -> bytes | None:
-        """The bytes that a run keeps a copy of; None: the run only names it."""
+        """Return the bytes that a run keeps a copy of; None: the run only names it."""
         return None
 
     def restored(self, content: bytes) -> Self:
@@ -98,7 +98,7 @@ class Foreign(Memoryless):
 def fitted(
     policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
 ) -> Policy:
-    """The policy, ready to act on the spaces of the environment named ``env``.
+    """Return the policy, ready to act on the spaces of the environment named ``env``.
 
     Raises:
         PolicyError: it does not fit; the message names ``who`` and both spaces.
@@ -147,7 +147,7 @@ def as_recorded(
     read: Callable[[], bytes | None],
     where: str,
 ) -> Policy:
-    """The policy as it was when ``recorded`` was its source; ``read`` gets the copy kept then.
+    """Return the policy as it was when ``recorded`` was its source; ``read`` gets the copy kept then.
 
     Raises:
         RunError: it is of another kind, or another file that was only named; or the copy is

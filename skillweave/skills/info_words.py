@@ -28,7 +28,7 @@ def keys_told(info: Mapping[str, Any]) -> str:
 
 
 def keys_of(info: Mapping[str, Any]) -> str:
-    """The keys of a batched info, in words."""
+    """Return the keys of a batched info, in words."""
     return ", ".join(short(key) for key in info_keys(info)) or "nothing"
 
 

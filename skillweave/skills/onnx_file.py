@@ -70,7 +70,7 @@ class OnnxPolicy(Foreign):
         self._input = self._session.get_inputs()[0]
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy for these spaces.
+        """Return a copy for these spaces.
 
         Raises:
             PolicyError: its input has another shape; the message names both.
@@ -97,7 +97,7 @@ class OnnxPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The model's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        """Return the model's actions; logits are sampled with ``rng`` where not ``deterministic``."""
         self.must_be_bound()
         rows = np.ascontiguousarray(obs, NUMBERS[self._input.type])
         if self._input.shape[0] == 1 and len(rows) != 1:
@@ -114,15 +114,15 @@ class OnnxPolicy(Foreign):
         return np.asarray(self._session.run([self.output], {self._input.name: rows})[0])
 
     def source(self) -> dict[str, Any]:
-        """The file, and the checksum of the copy that the run keeps."""
+        """Return the file, and the checksum of the copy that the run keeps."""
         return {"kind": self.kind, "file": str(self.file), "sha256": checksum(self.data)}
 
     def content(self) -> bytes:
-        """The whole model."""
+        """Return the whole model."""
         return self.data
 
     def restored(self, content: bytes) -> Self:
-        """A policy with the same spaces and this model."""
+        """Return a policy with the same spaces and this model."""
         spaces = self.observation_space, self.action_space
         found = type(self)(content, self.file, self.output, *spaces)
         found._who = self._who
@@ -137,7 +137,7 @@ def from_onnx(
     observation_space: Any = None,
     action_space: Any = None,
 ) -> OnnxPolicy:
-    """An ONNX file as a skill's policy; the run keeps a copy of it.
+    """Return an ONNX file as a skill's policy; the run keeps a copy of it.
 
     It takes a batch of observations, of any size or of one. Whole numbers that it returns are
     actions; other numbers are logits for Discrete and MultiDiscrete, actions for Box.
@@ -177,7 +177,7 @@ def from_onnx(
 
 
 def _numbers(tensor: Any, path: str | Path) -> Array:
-    """A weight as an array; of what is no real number, nothing."""
+    """Return a weight as an array; of what is no real number, nothing."""
     from onnx import numpy_helper
 
     try:

@@ -82,7 +82,7 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
 
 
 def _not_entered(error: BaseException) -> bool:
-    """Whether a function was called wrongly, and none of its lines ran."""
+    """Return whether a function was called wrongly, and none of its lines ran."""
     frames = error.__traceback__
     return frames is not None and frames.tb_next is None
 
@@ -98,7 +98,7 @@ def blame(error: BaseException, who: str) -> NoReturn:
 
 
 def at_step(elapsed: Any) -> str:
-    """The step, for messages; an empty string if ``elapsed`` is None."""
+    """Return the step, for messages; an empty string if ``elapsed`` is None."""
     return "" if elapsed is None else f" at step {np.max(elapsed)}"
 
 
@@ -155,7 +155,7 @@ def decoded(
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Array:
-    """A network's output as actions.
+    """Return a network's output as actions.
 
     Integers are actions, and for a Box all numbers are. Other numbers are logits: (n, A) for
     Discrete(A), concatenated (n, ΣA) for MultiDiscrete, one per bit for MultiBinary. If
@@ -205,7 +205,7 @@ def _width(space: Space[Any]) -> int:
 
 
 def _bounds(space: Space[Any]) -> tuple[Any, Any] | None:
-    """The first action and the one after the last; None for a Box."""
+    """Return the first action and the one after the last; None for a Box."""
     if isinstance(space, Discrete):
         return space.start, space.start + space.n
     if isinstance(space, MultiDiscrete):

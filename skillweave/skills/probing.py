@@ -46,7 +46,7 @@ class _Seen:
         self._names: dict[int, tuple[weakref.ref[Any], set[str]]] = {}
 
     def first_time(self, owner: Any, name: str) -> bool:
-        """Whether this is the first call with these arguments."""
+        """Return whether this is the first call with these arguments."""
         key = id(owner)
         if (entry := self._names.get(key)) is not None:
             if name in entry[1]:
@@ -134,7 +134,7 @@ def _values(given: Any) -> Iterator[Any]:
 
 
 def _sizes(given: Any, n: int) -> Iterator[int]:
-    """The sizes of all axes of an argument but the first."""
+    """Yield the sizes of all axes of an argument but the first."""
     for array in _values(given):
         if isinstance(array, np.ndarray):
             yield from array.shape[1:]
@@ -148,7 +148,7 @@ def _sizes_of_fields(dtype: np.dtype[Any]) -> Iterator[int]:
 
 
 def _has_rows(given: Any, n: int) -> bool:
-    """Whether an argument holds nothing whose rows cannot be taken, as a list in an info."""
+    """Return whether an argument holds nothing whose rows cannot be taken, as a list in an info."""
     plain = bool | int | float | str | None | np.generic
     return all(
         isinstance(value, plain) or (isinstance(value, np.ndarray) and value.shape[:1] == (n,))
@@ -157,7 +157,7 @@ def _has_rows(given: Any, n: int) -> bool:
 
 
 def _taken(given: Any, rows: Array, n: int) -> Any:
-    """The rows of an argument; what has no rows stays as it is."""
+    """Return the rows of an argument; what has no rows stays as it is."""
     if is_dataclass(given):
         parts = {f.name: _taken(getattr(given, f.name), rows, n) for f in fields(given)}
         kind: Any = type(given)
@@ -170,7 +170,7 @@ def _taken(given: Any, rows: Array, n: int) -> Any:
 
 
 def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a copy of its object, so that a counter or a generator stays as it was."""
+    """Return a method of a copy of its object, so that a counter or a generator stays as it was."""
     if not isinstance(function, types.MethodType):
         return function
     try:

@@ -16,7 +16,7 @@ from skillweave.types import Policy
 
 
 def ready_policy(skill: Skill) -> Policy | None:
-    """A skill's ready policy, functions and modules made into policies; None: it is trained.
+    """Return a skill's ready policy, functions and modules made into policies; None: it is trained.
 
     Raises:
         DeclarationError: the attribute ``policy`` is nothing that can act.

@@ -39,7 +39,7 @@ class SB3Policy(Foreign):
         self.policy, self.file, self.sha256 = model.policy, file, sha256
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy; images may have their channels last, where the model turned them."""
+        """Return a copy; images may have their channels last, where the model turned them."""
         bound = super().bind(observation_space, action_space, who)
         bound.policy = copy.deepcopy(self.policy)
         mine, theirs = self.observation_space, observation_space
@@ -62,7 +62,7 @@ class SB3Policy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The model's actions, by its own ``predict``."""
+        """Return the model's actions, by its own ``predict``."""
         import torch
 
         from skillweave.spaces import unpack
@@ -79,16 +79,16 @@ class SB3Policy(Foreign):
         return checked_actions(action, len(obs), self.action_space, self._who), memory
 
     def source(self) -> dict[str, Any]:
-        """The zip with its checksum; of a model in memory, that of its weights."""
+        """Return the zip with its checksum; of a model in memory, that of its weights."""
         where = {"file": str(self.file), "sha256": self.sha256} if self.file else {}
         return super().source() | {"name": self.algorithm} | where
 
     def content(self) -> bytes | None:
-        """The weights of a model in memory; a zip is only named: it can run code."""
+        """Return the weights of a model in memory; a zip is only named: it can run code."""
         return None if self.file else weights_of(self.policy, self._who)
 
     def restored(self, content: bytes) -> Self:
-        """A copy with these weights."""
+        """Return a copy with these weights."""
         found = copy.copy(self)
         found.policy = with_weights(self.policy, content, self._who)
         return found
@@ -96,7 +96,7 @@ class SB3Policy(Foreign):
 
 @checked_names
 def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = False) -> SB3Policy:
-    """A Stable-Baselines3 model as a skill's policy.
+    """Return a Stable-Baselines3 model as a skill's policy.
 
     A zip is named in the run with its checksum, not copied; of a model in memory the weights are
     copied. Observations that ``VecNormalize`` had scaled must be scaled by the environment: the zip

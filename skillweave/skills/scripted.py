@@ -40,7 +40,7 @@ class ScriptedPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The function's actions, checked where the action space is known."""
+        """Return the function's actions, checked where the action space is known."""
         action = called(self.function, read_only(obs), self._who, kind=PolicyError)
         if self.action_space is None:
             return as_array(action, self._who, PolicyError), memory
@@ -50,7 +50,7 @@ class ScriptedPolicy(Foreign):
         return actions, memory
 
     def source(self) -> dict[str, Any]:
-        """The function's name."""
+        """Return the function's name."""
         return {"kind": self.kind, "name": qualified(self.function)}
 
 
@@ -58,7 +58,7 @@ class ScriptedPolicy(Foreign):
 def from_function(
     function: Callable[[Array], Any], *, observation_space: Any = None, action_space: Any = None
 ) -> ScriptedPolicy:
-    """A Python function as a skill's policy; a skill takes the bare function too.
+    """Return a Python function as a skill's policy; a skill takes the bare function too.
 
     ```python
     import skillweave as sw

@@ -32,7 +32,7 @@ class TorchPolicy(Foreign):
         self.module = module
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy in evaluation mode: what the user does to the module later is no part of it."""
+        """Return a copy in evaluation mode: what the user does to the module later is no part of it."""
         bound = super().bind(observation_space, action_space, who)
         bound.module = copy.deepcopy(self.module).eval()
         return bound
@@ -46,7 +46,7 @@ class TorchPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The module's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        """Return the module's actions; logits are sampled with ``rng`` where not ``deterministic``."""
         import torch
 
         from skillweave.spaces import unpack
@@ -69,7 +69,7 @@ class TorchPolicy(Foreign):
         return action, memory
 
     def source(self) -> dict[str, Any]:
-        """The module's class, and the checksum of its weights."""
+        """Return the module's class, and the checksum of its weights."""
         name = qualified(type(self.module))
         return {"kind": self.kind, "name": name, "sha256": checksum(self.content())}
 
@@ -78,7 +78,7 @@ class TorchPolicy(Foreign):
         return weights_of(self.module, self._who)
 
     def restored(self, content: bytes) -> Self:
-        """A copy with these weights."""
+        """Return a copy with these weights."""
         found = copy.copy(self)
         found.module = with_weights(self.module, content, self._who)
         return found
@@ -88,7 +88,7 @@ class TorchPolicy(Foreign):
 def from_torch(
     module: nn.Module, *, observation_space: Any = None, action_space: Any = None
 ) -> TorchPolicy:
-    """A PyTorch module as a skill's policy; a skill takes the bare module too.
+    """Return a PyTorch module as a skill's policy; a skill takes the bare module too.
 
     ``forward`` gets observations (n, *obs_shape) of the type of its weights (without any, float32),
     images unscaled, of a Dict or Tuple a dict or tuple of such. It returns logits for Discrete
@@ -123,7 +123,7 @@ def _tensors(obs: Any, device: Any, dtype: Any) -> Any:
 
 
 def weights_of(module: nn.Module, who: str) -> bytes:
-    """The state of a module as a safetensors file.
+    """Return the state of a module as a safetensors file.
 
     Raises:
         PolicyError: it has state that is not a tensor.
@@ -140,7 +140,7 @@ def weights_of(module: nn.Module, who: str) -> bytes:
 
 
 def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
-    """A copy of a module with the weights of ``weights_of``.
+    """Return a copy of a module with the weights of ``weights_of``.
 
     Raises:
         RunError: they have other names or shapes.

@@ -135,6 +135,6 @@ def _expression(space: gym.Space[Any], at: int, one_hot: bool) -> tuple[str, int
 
 
 def _shaped(some: str, space: gym.Space[Any], size: int) -> str:
-    """The expression of ``size`` numbers with the shape and type of a space's actions."""
+    """Return the expression of ``size`` numbers with the shape and type of a space's actions."""
     shape = "" if space.shape == (size,) else f".reshape({space.shape})"
     return f"{some}{shape}.astype({str(space.dtype)!r})"

@@ -33,17 +33,17 @@ class ActionCodec:
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are discrete."""
+        """Return whether actions are discrete."""
         return bool(self.parts)
 
     @property
     def multi(self) -> bool:
-        """Whether an action has several discrete parts."""
+        """Return whether an action has several discrete parts."""
         return isinstance(self.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
 
     @cached_property
     def size(self) -> int:
-        """The width of the policy's head."""
+        """Return the width of the policy's head."""
         return sum(self.parts) or int(np.prod(self.space.shape or ()))
 
     def to_env(self, action: Array) -> Array:
@@ -94,7 +94,7 @@ class ActionCodec:
 
 
 def action_codec(space: gym.Space[Any]) -> ActionCodec:
-    """The codec of an action space.
+    """Return the codec of an action space.
 
     Raises:
         EnvError: the space is not supported; the message says which are.
@@ -117,7 +117,7 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
 
 
 def _width(space: gym.Space[Any]) -> int:
-    """The number of outputs of a policy's head for a space."""
+    """Return the number of outputs of a policy's head for a space."""
     if isinstance(space, gym.spaces.Discrete):
         return int(space.n)
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -126,6 +126,6 @@ def _width(space: gym.Space[Any]) -> int:
 
 
 def _first(start: Any) -> Array | None:
-    """The first values as an offset; None if all are 0."""
+    """Return the first values as an offset; None if all are 0."""
     first = np.asarray(start, np.int64)
     return (first.reshape(-1) if first.ndim else first) if first.any() else None

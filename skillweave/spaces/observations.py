@@ -23,7 +23,7 @@ _PICTURE = 36  # sides of what is a picture, and no board
 
 
 def to_tensor(array: Array) -> Tensor:
-    """A batch of observations as a tensor, without a copy where PyTorch can have the array itself.
+    """Return a batch of observations as a tensor, without a copy where PyTorch can have the array itself.
 
     A structured array (*lead,) becomes its bytes, uint8 (*lead, itemsize).
     """
@@ -58,7 +58,7 @@ class ImageLayout:
 
 
 def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
-    """The layout of a space that is an image, else None.
+    """Return the layout of a space that is an image, else None.
 
     Images are Boxes of 3 axes, or of 4 (a stack of frames), with bounds, and matrices of bytes.
     Where the shape does not say which axis of a frame holds the channels, the layout is not
@@ -187,7 +187,7 @@ class ObsCodec:
 
     @property
     def may_be_wrong(self) -> bool:
-        """Whether ``check`` could find something: all bytes of an image are right, say."""
+        """Return whether ``check`` could find something: all bytes of an image are right, say."""
         return any(leaf.choices or leaf.dtype.is_floating_point for leaf in self.leaves)
 
     def check(self, obs: Tensor) -> None:
@@ -209,7 +209,7 @@ class ObsCodec:
                     raise ValueError("an observation holds a choice that does not exist")
 
     def highest(self, i: int) -> Tensor:
-        """The highest number that each pixel of image ``i`` may have, (C, H, W), in its dtype."""
+        """Return the highest number that each pixel of image ``i`` may have, (C, H, W), in its dtype."""
         leaf = [leaf for leaf in self.leaves if leaf.image is not None][i]
         assert leaf.image is not None
         assert leaf.bounds is not None
@@ -258,7 +258,7 @@ class PixelScale:
 
 
 def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = None) -> ObsCodec:
-    """The codec of an observation space.
+    """Return the codec of an observation space.
 
     Args:
         planes: which axis holds the channels of the images whose shape does not say it; where each
@@ -294,7 +294,7 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
 
 
 def _scale(leaf: _Leaf) -> PixelScale:
-    """The scale of a leaf that is an image."""
+    """Return the scale of a leaf that is an image."""
     assert leaf.image is not None
     assert leaf.bounds is not None
     values = (np.asarray(x, np.float64) for x in leaf.bounds)
@@ -314,7 +314,7 @@ def _described(leaf: _Leaf) -> str:
 def _leaves(
     space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None, names: tuple[str, ...] = ()
 ) -> Iterator[_Leaf]:
-    """The leaves of a space whose observations of ``dtype`` lie ``offset`` bytes into the whole."""
+    """Yield the leaves of a space whose observations of ``dtype`` lie ``offset`` bytes into the whole."""
     if dtype.fields is not None:
         for name, part in (parts(space) or {}).items():
             field, at = dtype.fields[name][:2]

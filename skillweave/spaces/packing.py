@@ -39,7 +39,7 @@ def check_size(space: gym.Space[Any], what: str, numbers: int, largest: int = LA
 
 
 def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
-    """The named parts of a Dict or Tuple, in order; None for any other space.
+    """Return the named parts of a Dict or Tuple, in order; None for any other space.
 
     Raises:
         EnvError: there are none, or their names are not text.
@@ -56,12 +56,12 @@ def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
 
 
 def obs_shape(space: gym.Space[Any]) -> tuple[int, ...]:
-    """The shape of one observation in a batch; () for Dict and Tuple."""
+    """Return the shape of one observation in a batch; () for Dict and Tuple."""
     return tuple(space.shape or ())
 
 
 def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
-    """The dtype of observations; a structured one for Dict and Tuple.
+    """Return the dtype of observations; a structured one for Dict and Tuple.
 
     Raises:
         EnvError: the space is not supported; the message says which are, and what to do.
@@ -70,7 +70,7 @@ def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
 
 
 def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> np.dtype[Any]:
-    """The dtype of the part of ``whole`` that has these names."""
+    """Return the dtype of the part of ``whole`` that has these names."""
     inner = parts(space)
     if inner is None:
         kinds = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
@@ -99,7 +99,7 @@ def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...])
 
 
 def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> str:
-    """A sentence on a space that is not supported, the part of ``whole`` with these names."""
+    """Return a sentence on a space that is not supported, the part of ``whole`` with these names."""
     shown = " ".join(short(space).split())
     what = f"observation space {shown}"
     if place:
@@ -130,7 +130,7 @@ def _is_supported(space: gym.Space[Any]) -> bool:
 
 
 def pack(space: gym.Space[Any], batched: Any) -> Array:
-    """A batch as Gymnasium has it (dicts and tuples of arrays) as one array (*lead, *obs_shape).
+    """Return a batch as Gymnasium has it (dicts and tuples of arrays) as one array (*lead, *obs_shape).
 
     What is an array already is returned as it is.
     """
@@ -173,7 +173,7 @@ def unpack(space: gym.Space[Any], array: Array) -> Any:
 
 
 def _values(space: gym.Space[Any], batched: Any) -> Iterable[Any]:
-    """The parts of a batch in the order of the space's, which a dict need not have."""
+    """Return the parts of a batch in the order of the space's, which a dict need not have."""
     if isinstance(space, gym.spaces.Dict):
         return [batched[name] for name in space.spaces]
     return tuple(batched)

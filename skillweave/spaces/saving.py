@@ -20,7 +20,7 @@ _MOST = 10**8
 
 
 def _is_whole(data: Any) -> bool:
-    """Whether it is a whole number, or lists of such."""
+    """Return whether it is a whole number, or lists of such."""
     if isinstance(data, list):
         return all(_is_whole(x) for x in data)
     return type(data) is int and abs(data) < LARGEST
@@ -73,7 +73,7 @@ _SCHEMAS: dict[str, Any] = {
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    """A supported space as plain JSON; infinities become strings, equal bounds one number.
+    """Return a supported space as plain JSON; infinities become strings, equal bounds one number.
 
     Raises:
         EnvError: the space is not supported; the message says which are.
@@ -148,7 +148,7 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
 
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
-    """Whether a policy made for one space can act in the other: same kind, shape and choices."""
+    """Return whether a policy made for one space can act in the other: same kind, shape and choices."""
     if type(a) is not type(b) or a.shape != b.shape:
         return False
     inner, other = parts(a), parts(b)
@@ -169,7 +169,7 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
 
 
 def _dtype_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    """The type of a space of choices, where it is not the usual one."""
+    """Return the type of a space of choices, where it is not the usual one."""
     return {} if space.dtype == np.int64 else {"dtype": str(space.dtype)}
 
 
