@@ -14,9 +14,8 @@ from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.experience import Sample
 from skillweave.networks.config import Network
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_

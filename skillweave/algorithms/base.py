@@ -15,9 +15,8 @@ from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.experience import Report
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
-from skillweave.networks.stacked import Layout
+from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads

@@ -18,9 +18,8 @@ from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState, normal
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.qnet import QNet
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean

@@ -23,10 +23,9 @@ from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_n
 from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Report, Rollout
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views, take_rows
+from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
 from skillweave.ops.distributions import mask_logits, with_epsilon
 from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_loss, value_loss

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from skillweave.experience import Rollout
-from skillweave.networks.encoders import Inputs
-from skillweave.networks.stacked import take_rows
+from skillweave.networks.stacked import Inputs, take_rows
 from skillweave.ops.device import on_host
 
 

@@ -21,10 +21,9 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import (
     mask_logits,

@@ -19,10 +19,9 @@ from skillweave.algorithms.base import ActingParams, Device
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.distributions import smoothed_action
 from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
