@@ -332,7 +332,7 @@ WRONG = {
     "nobody": (
         {"skills": (type("Third", (Left,), {}), Push), "selector": lambda obs: obs[:, 2] > 0},
         None,
-        r"no learner of this run has learnt in .*: this run trains third, and that one has left, other",
+        r"no learner of this run has learnt in .*: this run trains third, and that one has left",
     ),
     "network": (
         {"algorithm": replace(ON, network=Network((9,)))},

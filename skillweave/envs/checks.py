@@ -33,13 +33,24 @@ LONG_EPISODE = 10_000
 gives a notice."""
 
 LIKE_MASKS = (
-    "action_masks", "legal_actions", "legal_moves", "valid_actions", "available_actions",
-    "avail_actions", "valid_action_mask", "legal_action_mask", "valid_moves",
-)  # fmt: skip
+    "action_masks",
+    "legal_actions",
+    "legal_moves",
+    "valid_actions",
+    "available_actions",
+    "avail_actions",
+    "valid_action_mask",
+    "legal_action_mask",
+    "valid_moves",
+)
 """Keys of masks in other libraries."""
 LIKE_METHODS = (
-    "action_masks", "get_action_mask", "valid_action_mask", "get_avail_actions", "legal_actions",
-)  # fmt: skip
+    "action_masks",
+    "get_action_mask",
+    "valid_action_mask",
+    "get_avail_actions",
+    "legal_actions",
+)
 """Attributes that return masks in other libraries, ``action_masks`` if it is not a method."""
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 

@@ -690,7 +690,7 @@ def test_a_run_deleted_while_it_is_trained_is_not_made_again(
     if how == "made again":
         RunDirectory.create(run.path, manifest())
     before = list(run.path.glob("**/*"))
-    with pytest.raises(SkillweaveError, match="was deleted or moved while"):
+    with pytest.raises(SkillweaveError, match="was deleted or moved during"):
         write(run, policy)
     assert list(run.path.glob("**/*")) == before
 
