@@ -297,7 +297,7 @@ def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
     with pytest.raises(SkillweaveError, match=r"left\.safetensors is missing.*train again"):
         declare().resume(run.path, quiet=True)
     shutil.copy(tmp_path / "run/starts/other.safetensors", file)
-    with pytest.raises(SkillweaveError, match="does not hold the initial policy of .left."):
+    with pytest.raises(SkillweaveError, match="does not hold the initial policy of 'left'"):
         declare().resume(run.path, quiet=True)
     shutil.copy(source / "policies/left.safetensors", file)
     with pytest.raises(SkillweaveError, match="belongs to another run"):

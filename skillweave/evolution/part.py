@@ -68,9 +68,9 @@ class Part:
         self.num_envs = count * each
         self.episodes = Episodes(scene.log_info)
         self.rounds = 0
-        """The random streams of the loop in which all members learn from one store."""
+        """Rounds of the loop in which all members learn from one store."""
         self.store: ReplayStore | None = None
-        self._kept: dict[str, Tensor] = {}  # what its learner counts
+        self._kept: dict[str, Tensor] = {}  # counts of its learner
         self._made: dict[AlgorithmConfig, Algorithm] = {}
 
     def train(

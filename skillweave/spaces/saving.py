@@ -167,7 +167,7 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
         )
     if isinstance(a, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
         plain = {"dtype": None}  # the type of choices does not matter
-    return space_to_json(a) | plain == space_to_json(b) | plain
+        return space_to_json(a) | plain == space_to_json(b) | plain
     layout = image_layout(a)
     if layout is None or layout != image_layout(b):
         return layout is None and image_layout(b) is None
