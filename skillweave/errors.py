@@ -49,7 +49,7 @@ class MissingExtra(SkillweaveError, ImportError):
         super().__init__(f"{feature} needs the extra '{extra}': pip install 'skillweave[{extra}]'")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let the error be pickled, although it is made of other arguments than its message."""
+        """Support pickling, because the arguments differ from the message."""
         return make_error, ("MissingExtra", str(self))
 
 
@@ -57,7 +57,7 @@ class Interrupted(ShortTraceback, KeyboardInterrupt):
     """Training was interrupted; the message says what is saved and how to continue.
 
     Args:
-        message: what is shown.
+        message: the text to show.
     """
 
     def __init__(self, message: str = "") -> None:

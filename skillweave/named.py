@@ -23,16 +23,16 @@ _KNOWN: dict[str, Named] = {}
 
 
 class Named(str):
-    """The name of a function of the user, with the function itself; equal to its plain name."""
+    """The name of a user's function, together with the function; equal to the plain name."""
 
     function: Callable[..., Any]
 
     def __call__(self, *args: Any) -> Any:
-        """Return what the function returns."""
+        """Call the function."""
         return self.function(*args)
 
     def __reduce__(self) -> Any:
-        """Make it known where it is unpacked, so that files that name it can be read there."""
+        """Register the function where it is unpickled, so that files that name it can be read."""
         return _known, (str(self), self.function)
 
     def __deepcopy__(self, memo: Any) -> Named:
@@ -40,14 +40,14 @@ class Named(str):
 
 
 def named(value: Any, where: str) -> Any:
-    """Return a function as ``Named``, and a text as the known function of this name.
+    """Convert a function to ``Named``, and a text to the known function of this name.
 
     Args:
-        value: a function, a class, or a text; a text without a known function stays as it is.
+        value: a function, a class, or a text; a text without a known function does not change.
         where: the setting, for messages: ``Network.encoder``.
 
     Raises:
-        DeclarationError: the function has no name by which it can be found again.
+        DeclarationError: the function has no name that identifies it.
     """
     if isinstance(value, Named):
         return value
@@ -57,9 +57,9 @@ def named(value: Any, where: str) -> Any:
 
 
 def find(name: str) -> Named | None:
-    """Return the known function that a file means by ``name``; None if no function fits.
+    """Return the known function for the ``name`` in a file; None if no function fits.
 
-    The module may have another name today: a recipe is a script, a module or a file to load.
+    The module may have another name now: a recipe is a script, a module or a file to load.
     """
     if name in _KNOWN:
         return _KNOWN[name]
@@ -77,11 +77,11 @@ def known_names() -> str:
 
 
 def _known(name: str, function: Callable[..., Any]) -> Named:
-    """Return the function under its name; the latest function of a name counts."""
-    found = Named(name)
-    found.function = function
-    _KNOWN[name] = found
-    return found
+    """Register a function under its name, in place of an earlier one."""
+    known = Named(name)
+    known.function = function
+    _KNOWN[name] = known
+    return known
 
 
 def _name_of(function: Any, where: str) -> str:
@@ -125,7 +125,7 @@ def _module_of(name: str) -> str:
 
 
 def _digest(function: Any) -> str:
-    """Return what distinguishes the lambdas of one module: a checksum of their code."""
+    """Return a checksum of a lambda's code, which distinguishes the lambdas of a module."""
     code = function.__code__
     constants = [repr(c) for c in code.co_consts if not inspect.iscode(c)]
     parts = code.co_code, constants, code.co_names

@@ -1,6 +1,6 @@
-"""Notices: sentences that people should read once, from any depth of the library.
+"""Notices: sentences for users, given once, from any module of the library.
 
-In a run its progress prints them. Elsewhere they are Python warnings.
+In a run, its progress prints them. Elsewhere they are Python warnings.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextvars import ContextVar
 
 
 class Notices:
-    """Notices of one run, each given once; they wait until a function is set that prints them."""
+    """Notices of one run, each given once; they wait until a function to print them is set."""
 
     def __init__(self) -> None:
         self._said: set[str] = set()
@@ -31,16 +31,16 @@ class Notices:
 
     @property
     def any(self) -> bool:
-        """True if notices wait."""
+        """Return whether notices wait."""
         return bool(self._waiting)
 
     def take(self) -> list[str]:
-        """Return the notices that wait, and remove them."""
-        found, self._waiting = self._waiting, []
-        return found
+        """Return the waiting notices, and remove them."""
+        waiting, self._waiting = self._waiting, []
+        return waiting
 
     def tell_by(self, tell: Callable[[str], None] | None) -> None:
-        """Print notices by this function from now on, first those that wait; None: they wait."""
+        """Print waiting and later notices with this function; None: let notices wait."""
         self._tell = tell
         if tell is not None:
             for text in self.take():
@@ -51,7 +51,7 @@ _CURRENT: ContextVar[Notices | None] = ContextVar("_CURRENT", default=None)
 
 
 def notice(text: str) -> None:
-    """Give people a notice, once in a run."""
+    """Give users a notice, once in a run."""
     notices = _CURRENT.get()
     if notices is None:
         warn(text)
@@ -60,12 +60,12 @@ def notice(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Give people a notice as a Python warning."""
+    """Give users a notice as a Python warning."""
     warnings.warn(text, stacklevel=2)
 
 
 def are_collected() -> bool:
-    """Return True in a run, and in a process of one."""
+    """Return whether this is a run or a process of one, where notices are collected."""
     return _CURRENT.get() is not None
 
 

@@ -1,8 +1,8 @@
-"""Reading what may be damaged, or made by others: plain files, strict JSON, and a schema.
+"""Reading of files that may be damaged or made by others: plain files, strict JSON, a schema.
 
 A schema is a type: a ``TypedDict`` for JSON that stays a dict, a dataclass for settings. ``fit``
-compares what was read with it, and every error names the file and the field. ``settings`` has the
-kinds that fields may be annotated with. This module does not import torch.
+compares data with it, and every error names the file and the field. ``settings`` has the kinds of
+annotations. This module does not import torch.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from skillweave.messages import short
 from skillweave.settings import Fitting, Unfit, annotations_of
 
 DEEPEST = 100
-"""How deep JSON may be nested; what reads it may then be recursive."""
+"""The deepest nesting of JSON, so that its readers may be recursive."""
 _SHOWN = 60
 
 
 def shown(value: object, most: int = _SHOWN) -> str:
-    """A value for a message: its ``repr``, shortened."""
+    """Return a value for a message: its ``repr``, shortened."""
     try:
         text = repr(value)
     except Exception:  # a number of too many digits, or nested too deep
@@ -40,9 +40,9 @@ def shown(value: object, most: int = _SHOWN) -> str:
 
 
 def check_file(path: Path, most: int | None = None) -> None:
-    """Raise a RunError where ``path`` is no plain file, or has more than ``most`` bytes.
+    """Raise a RunError where ``path`` is not a plain file, or has more than ``most`` bytes.
 
-    A pipe would wait for ever, and a device may never end.
+    A pipe would wait forever, and a device may never end.
     """
     try:
         found = os.stat(path)
@@ -61,7 +61,7 @@ def check_file(path: Path, most: int | None = None) -> None:
 
 
 def read_file(path: Path, most: int | None = None) -> bytes:
-    """The content of a plain file.
+    """Return the content of a plain file.
 
     Raises:
         RunError: it is missing, no plain file, too large, or cannot be read.
@@ -77,7 +77,7 @@ def read_file(path: Path, most: int | None = None) -> bytes:
 
 
 def parse_json(text: str | bytes, where: Path | str) -> Any:
-    """What a JSON text says; numbers are finite, and it is nested at most ``DEEPEST`` deep.
+    """Parse a JSON text whose numbers are finite and that is nested at most ``DEEPEST`` deep.
 
     Raises:
         RunError: it is damaged; the message begins with ``where``.
@@ -97,14 +97,14 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
 
 
 def as_json(value: Any, where: str, advice: str) -> Any:
-    """Return a setting as plain JSON: NumPy's numbers as Python's, tuples as lists.
+    """Convert a setting to plain JSON: NumPy's numbers to Python's, tuples to lists.
 
     Args:
-        where: what messages call it; the places in it are added: ``kwargs['sizes'][0]``.
+        where: its name in messages, to which places are added: ``kwargs['sizes'][0]``.
         advice: the end of messages, what to do.
 
     Raises:
-        DeclarationError: it holds something that is not the same after it was written and read.
+        DeclarationError: it holds a value that writing and reading would change.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -124,10 +124,10 @@ def as_json(value: Any, where: str, advice: str) -> Any:
 
 
 def load_json(text: str | bytes, **how: Any) -> Any:
-    """As ``json.loads``, but texts are of whole characters, as nothing else can be shown or saved.
+    """Load JSON as ``json.loads`` does, without lone surrogates, which cannot be shown or saved.
 
     Raises:
-        ValueError: it is no JSON, or holds a lone surrogate.
+        ValueError: it is not JSON, or holds a lone surrogate.
     """
     data = json.loads(text, **how)
     escape: Any = "\\" if isinstance(text, str) else b"\\"
@@ -156,13 +156,13 @@ def _finite(text: str) -> float:
 
 
 def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
-    """``data``, plain JSON, as a ``kind``: a type, or anything a field may be annotated with.
+    """Convert ``data``, plain JSON, to a ``kind``: a type, or any annotation of a field.
 
-    A TypedDict stays a dict, and may have more fields than its type names. A dataclass is made,
-    and may not; lists become tuples where it asks for them.
+    A TypedDict stays a dict, and may have further fields. A dataclass is created, and may not have
+    further fields; lists become tuples where it needs them.
 
     Args:
-        file: where it was read, for messages; "" where that is said elsewhere.
+        file: the file that it is from, for messages; "" if the caller names it.
         path: the field in it: ``stages[0].algorithm``.
 
     Raises:
@@ -176,7 +176,7 @@ def fit(kind: Any, data: Any, file: str, path: str = "") -> Any:
 
 
 class _FileFitting(Fitting):
-    """Fits JSON to a schema: records are made field by field, so that errors name the field."""
+    """A converter of JSON to a schema, field by field, so that errors name the field."""
 
     yes_and_no = "true", "false"
     mapping = "an object, in braces"
@@ -193,11 +193,11 @@ class _FileFitting(Fitting):
         return isinstance(value, Mapping) and all(isinstance(k, str) for k in value)
 
     def describe_other(self, kind: Any) -> str:
-        """Return what a record is called in JSON."""
+        """Return the name of a record in JSON."""
         return self.mapping
 
     def record(self, kind: Any, value: Any, path: str) -> Any:
-        """Return a dict as a TypedDict or as settings, each field fitted.
+        """Convert a dict to a TypedDict or to settings, each field fitted.
 
         Raises:
             RunError: a field is missing or unknown, or the fields do not fit each other.

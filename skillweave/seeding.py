@@ -1,7 +1,7 @@
-"""One tree of seeds: every random stream is derived by name from the run's seed (contract 8).
+"""The tree of seeds: every random stream is derived by name from the run's seed.
 
-Streams are derived afresh wherever they are needed ("the noise of update 17 of stage landing"),
-so no generator's state has to be saved for a run to resume exactly.
+Streams are derived wherever they are needed ("the noise of update 17 of stage landing"), so a run
+can resume exactly without saved states of generators.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ class Seeds:
         return np.random.SeedSequence(self.root, spawn_key=self.path)
 
     def integer(self) -> int:
-        """A 31-bit seed for engines that take one number."""
+        """Return a 31-bit seed for engines that take one number."""
         return int(self._sequence().generate_state(1, np.uint32)[0] >> 1)
 
     def integers(self, n: int) -> list[int]:
-        """``n`` 31-bit seeds."""
+        """Return ``n`` 31-bit seeds."""
         return [int(s >> 1) for s in self._sequence().generate_state(n, np.uint32)]
 
     def numpy(self) -> np.random.Generator:
-        """A NumPy generator at this node."""
+        """Return a NumPy generator at this node."""
         return np.random.Generator(np.random.PCG64(self._sequence()))
 
     def torch(self) -> torch.Generator:
-        """A torch CPU generator at this node."""
+        """Return a torch CPU generator at this node."""
         import torch
 
         state = self._sequence().generate_state(1, np.uint64)
@@ -98,7 +98,7 @@ _users: dict[str, Any] = {}  # the states before the first of them began
 
 @contextmanager
 def global_generators(seeds: Seeds) -> Iterator[None]:
-    """Seed the global generators; after the block they stand where they stood before it.
+    """Seed the global generators within the block, and restore their states after it.
 
     Threads share them: while blocks of several threads overlap, the states from before the first
     block return after the last one.
@@ -153,19 +153,19 @@ if hasattr(os, "register_at_fork"):
 
 
 class GlobalDraws:
-    """Notices which global generators are drawn from, in the first ``looks`` looks."""
+    """A detector of draws from global generators, in the first ``looks`` checks."""
 
     def __init__(self, looks: int) -> None:
         self.looks = looks
-        """Looks that are left."""
+        """The remaining checks."""
         self._before: dict[str, bytes] = {}
 
     def begin(self) -> None:
-        """Remember where the generators stand."""
+        """Store the states of the generators."""
         self._before = _fingerprints()
 
     def end(self) -> list[str]:
-        """Return the generators that were drawn from since ``begin``, by their modules' names."""
+        """Return the modules whose generators were drawn from since ``begin``."""
         self.looks -= 1
         if _threads > 1:  # another thread may have drawn
             return []
@@ -174,7 +174,7 @@ class GlobalDraws:
 
 
 def _fingerprints() -> dict[str, bytes]:
-    """Return bytes that change whenever a global generator is drawn from."""
+    """Return bytes for each global generator that change when it is drawn from."""
     states = global_generators_state()
     _, key, *place = states["numpy.random"]
     found = {"random": repr(hash(states["random"])).encode()}

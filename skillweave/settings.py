@@ -33,11 +33,11 @@ from skillweave.messages import short
 C = TypeVar("C", bound=type[Any])
 
 LARGEST = 2**63
-"""Whole numbers are smaller than this."""
+"""The limit of whole numbers."""
 LARGEST_FLOAT = 3.4e38
-"""Other numbers are smaller than this: tensors of float32 must hold them."""
+"""The limit of other numbers, which tensors of float32 must represent."""
 LONGEST_TEXT = 4096
-"""Characters of a text: the longest path that a system takes."""
+"""The most characters of a text: the longest path that a system accepts."""
 
 
 # Kinds of values
@@ -67,7 +67,7 @@ Fraction = Annotated[float, Check("between 0 and 1", lambda x: 0 <= x <= 1)]
 Share = Annotated[float, Check("more than 0 and at most 1", lambda x: 0 < x <= 1)]
 """A number from 0 to 1, without 0."""
 RECORDED = "recorded by its name"
-"""Beside a kind of function: the name under which files record the function is taken, too."""
+"""Beside a kind of function: also accept the name under which files record the function."""
 
 
 # Fitting a value to a kind
@@ -82,18 +82,18 @@ class Unfit(Exception):
 
 
 class Fitting:
-    """Fits values to kinds: types, or anything that a field may be annotated with.
+    """A converter of values to kinds: types, or any annotation of a field.
 
-    Settings are fitted by this class, files by a subclass of ``reading``.
+    Settings use this class, files a subclass in ``reading``.
     """
 
     yes_and_no: tuple[str, str] = "True", "False"
     mapping: str = "a dict with texts as keys"
 
     def fit(self, kind: Any, value: Any, path: str) -> Any:
-        """Return ``value`` as a ``kind``.
+        """Convert ``value`` to a ``kind``.
 
-        Lists become tuples and dicts become settings where the kind asks for them; NumPy's numbers
+        Lists become tuples and dicts become settings where the kind needs them; NumPy's numbers
         become Python's.
 
         Args:
@@ -120,7 +120,7 @@ class Fitting:
         return found
 
     def accepts(self, kind: Any, value: Any) -> bool:
-        """Return whether a value is of a kind, whatever its range and its entries are."""
+        """Return whether a value is of a kind, without a check of its range and entries."""
         if isinstance(value, str) and get_origin(kind) is Annotated and RECORDED in get_args(kind):
             return ":" in value
         kind, _ = _parts(kind)
@@ -157,7 +157,7 @@ class Fitting:
         """Return the settings that a dict names.
 
         Raises:
-            DeclarationError: it names one that does not exist, or a value is wrong.
+            DeclarationError: a name does not exist, or a value is wrong.
         """
         try:
             return kind(**value)
@@ -165,7 +165,7 @@ class Fitting:
             raise DeclarationError(f"{path}: {error}") from error
 
     def describe(self, kind: Any) -> str:
-        """Return what a value must be: "a whole number, at least 1, or None"."""
+        """Return a description of valid values: "a whole number, at least 1, or None"."""
         words = self._words(kind)
         options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
         if len(words) > 1 and all(get_origin(k) is Literal or k is NoneType for k in options):
@@ -210,7 +210,7 @@ class Fitting:
         return [self.describe_other(kind)]
 
     def describe_other(self, kind: Any) -> str:
-        """Return what an instance of a class is called."""
+        """Return the name of an instance of a class."""
         name = getattr(kind, "__name__", str(kind))
         return f"{name}()" if is_dataclass(kind) else f"an instance of {name}"
 
@@ -352,7 +352,7 @@ def checked_settings(kind: C) -> C:
 
 
 def check_fields(settings: Any) -> None:
-    """Check every field of a dataclass by its annotation, and replace what has a plainer form.
+    """Check every field of a dataclass by its annotation, and convert it to its plainest form.
 
     Raises:
         DeclarationError: a field does not fit; the message names its class and the field.
@@ -383,12 +383,12 @@ def fitted(kind: Any, value: Any, where: str) -> Any:
 
 
 def described(kind: Any) -> str:
-    """Return what a setting of a kind must be: "a whole number, at least 1, or None"."""
+    """Return a description of valid settings: "a whole number, at least 1, or None"."""
     return _SETTINGS.describe(kind)
 
 
 def check(settings: object, name: str, ok: bool, text: str) -> None:
-    """Raise a DeclarationError that names a field of settings and what it must be."""
+    """Raise a DeclarationError that names a field and its valid values, if not ``ok``."""
     if not ok:
         where = f"{type(settings).__name__}.{name}"
         raise DeclarationError(str(Unfit(where, getattr(settings, name), text)))

@@ -1,10 +1,10 @@
-"""Text on its way to people: the one place where it leaves for a terminal.
+"""The output of all text to a terminal.
 
-Names and dates in a run may come from somebody else, and a terminal obeys the control characters in
-them. Whoever reads may go away (``2>&1 | head``), a log's disk may be full, and a locale may know
-ASCII alone. Training goes on in all of these cases.
+Names and dates in a run may come from another person, and a terminal obeys control characters in
+them. The reader may close the stream (``2>&1 | head``), a log's disk may be full, and a locale may
+support only ASCII. Training continues in all of these cases.
 
-This module imports nothing of the library, so that all of it can stand on it.
+This module imports no other module of the library, so that all can import it.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ STANDARD = (0, 1, 2)
 
 
 def printable(text: str) -> str:
-    """Return a text with its control characters escaped: ``\\x1b`` for the one that terminals obey.
+    """Escape the control characters of a text (``\\x1b`` for the one that terminals obey).
 
-    Tabs and newlines stay.
+    Tabs and newlines do not change.
     """
     return _CONTROLS.sub(_escape, text)
 
 
 def one_line(value: object) -> str:
-    """Return a value for a place in a line, with newlines and tabs escaped, too."""
+    """Format a value for a line, with newlines and tabs escaped, too."""
     return printable(str(value).replace("\n", "\\n").replace("\t", "\\t"))
 
 
 def say(text: str = "") -> None:
-    """Write a line for people to standard error; where that cannot be written, do nothing."""
+    """Write a line for users to standard error; do nothing if that cannot be written."""
     stream = sys.stderr
     if stream is None:  # without a console; ``print`` would write to standard output
         return
@@ -49,10 +49,10 @@ def say(text: str = "") -> None:
 
 
 def put_result(text: str = "") -> None:
-    """Write a line to standard output; a reader who went away has read enough.
+    """Write a line to standard output; ignore a reader that has closed it.
 
     Raises:
-        OSError: it cannot be written, for example as the disk is full.
+        OSError: it cannot be written, for example because the disk is full.
     """
     stream = sys.stdout
     if stream is None or stream.closed:
@@ -67,7 +67,7 @@ def put_result(text: str = "") -> None:
 
 
 def end_quietly() -> None:
-    """Discard what a closed or full stream has not taken, so that Python ends without a message."""
+    """Discard the buffers of closed or full streams, so that Python ends without a message."""
     for stream in (sys.stdout, sys.stderr):
         try:
             if stream is not None:
@@ -78,11 +78,11 @@ def end_quietly() -> None:
 
 @contextmanager
 def steady_streams() -> Iterator[None]:
-    """Keep the places of the standard streams taken while files are written.
+    """Occupy the numbers of closed standard streams while files are written.
 
-    Where one of them is closed, the system gives its number to the next file that is opened, and
-    whatever a library writes to standard error then lands in that file. ``sys.stderr`` that was
-    closed takes no warnings; one that takes them and drops them is in its place meanwhile.
+    If one is closed, the system gives its number to the next file that is opened, and a library's
+    writes to standard error would end up in that file. A closed ``sys.stderr`` is replaced by one
+    that drops warnings.
     """
     for number in STANDARD:
         _take(number)
@@ -105,7 +105,7 @@ def _escape(found: re.Match[str]) -> str:
 
 
 def _encodable(text: str, stream: Any) -> str:
-    """Return a text as the stream's encoding can say it."""
+    """Return a text that the stream's encoding supports."""
     encoding = getattr(stream, "encoding", None)
     if not isinstance(encoding, str):
         return text
@@ -115,7 +115,7 @@ def _encodable(text: str, stream: Any) -> str:
 
 
 def _discard(stream: Any) -> None:
-    """Drop what a stream holds and could not write; the stream itself stays as it is."""
+    """Drop the buffer that a stream could not write; the stream itself does not change."""
     with suppress(Exception):  # a stream of the user's own may be anything
         number = stream.fileno()
         nowhere = os.open(os.devnull, os.O_WRONLY)

@@ -1,6 +1,6 @@
-"""Words that every room shares: steps, and what acts and what learns.
+"""Types that every room shares: steps, policies and arrays.
 
-This module imports nothing of the library, and no torch when it runs.
+This module imports no other module of the library, and no torch.
 """
 
 from __future__ import annotations
@@ -16,55 +16,55 @@ from numpy.typing import NDArray
 T = TypeVar("T")
 Array: TypeAlias = NDArray[Any]
 Memory: TypeAlias = dict[str, Array]
-"""What a policy remembers of each environment: arrays whose first axis is the environment."""
+"""A policy's state of each environment: arrays whose first axis is the environment."""
 
 
 def prefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
-    """Everything under another name: ``prefix.name``."""
+    """Return the dict with each name as ``prefix.name``."""
     return {f"{prefix}.{k}": v for k, v in named.items()}
 
 
 def unprefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
-    """What has names that begin with ``prefix.``, without it."""
-    cut = len(prefix) + 1
-    return {k[cut:]: v for k, v in named.items() if k.startswith(f"{prefix}.")}
+    """Return the entries with names ``prefix.name``, as ``name``."""
+    start = f"{prefix}."
+    return {k.removeprefix(start): v for k, v in named.items() if k.startswith(start)}
 
 
 def flat(prefix: str, value: Any) -> dict[str, Any]:
-    """Nested dicts as one, with dotted names."""
+    """Flatten nested dicts to one, with dotted names."""
     if not isinstance(value, dict):
         return {prefix: value}
-    found: dict[str, Any] = {}
+    flattened: dict[str, Any] = {}
     for k, v in value.items():
-        found |= flat(f"{prefix}.{k}", v)
-    return found
+        flattened |= flat(f"{prefix}.{k}", v)
+    return flattened
 
 
 def read_only(array: Array) -> Array:
-    """A view that cannot be written to."""
+    """Return a view that cannot be written to."""
     view = array.view()
-    view.setflags(False)  # type: ignore[call-arg]  # by name it takes three times as long
+    view.setflags(False)  # type: ignore[call-arg]  # a keyword takes three times as long
     return view
 
 
 LARGEST_REWARD = 1e15
-"""The largest size of a reward: what learners square, sums of rewards, fits into float32."""
+"""The largest size of a reward: learners square sums of rewards in float32."""
 
 
 def wrong_reward(rewards: Array) -> int | None:
-    """The first that is not finite or larger than ``LARGEST_REWARD``: its row; None: all fit."""
+    """Return the first row that is not finite or exceeds ``LARGEST_REWARD``; None: all fit."""
     fit = np.abs(rewards) <= LARGEST_REWARD
     return int(np.flatnonzero(~fit)[0]) if b"\0" in fit.tobytes() else None
 
 
 @dataclass(slots=True)
 class Step:
-    """One environment transition as a skill's methods see it, batched over N environments.
+    """An environment transition in the form that a skill's methods receive, of N environments.
 
-    Its arrays cannot be written to: others see the same ones.
+    Its arrays are read-only, because they are shared.
 
     ``elapsed`` counts the steps of the current episode or call, this one included (so it is 1
-    on the first). ``timed_out`` says that the skill's own ``max_steps`` ended it here.
+    on the first). ``timed_out`` is True where the skill's ``max_steps`` ended the call.
     """
 
     obs: Array  # (N, *obs_shape)
@@ -75,10 +75,10 @@ class Step:
     truncated: Array  # (N,) bool, the environment's time limit
     timed_out: Array  # (N,) bool, the skill's time limit
     elapsed: Array  # (N,) int64, steps
-    info: Mapping[str, Any]  # the environment's, arrays over N where it tells any
+    info: Mapping[str, Any]  # the environment's, arrays over N
 
     def __post_init__(self) -> None:
-        # Of every step of training: a loop over the names would take three times as long.
+        # Runs in every step of training: a loop over the names takes three times as long.
         self.obs, self.next_obs = read_only(self.obs), read_only(self.next_obs)
         self.action, self.reward = read_only(self.action), read_only(self.reward)
         self.terminated, self.truncated = read_only(self.terminated), read_only(self.truncated)
@@ -86,22 +86,22 @@ class Step:
 
 
 class Policy(Protocol):
-    """Acts: observations to actions, batched over n environments, with memory.
+    """A policy: a map from observations to actions of n environments, with a state of each.
 
-    ``observe`` is told every transition, so that a policy may notice that a running skill has
-    terminated. Memory rows belong to environments; a runner gathers and scatters them.
+    ``observe`` receives every transition, so that a policy can detect that a running skill has
+    terminated. Rows of ``memory`` belong to environments; a runner gathers and scatters them.
     """
 
     observation_space: Space[Any]
     action_space: Space[Any]
     labels: tuple[str, ...]
-    """Names of the skills below it, in order; empty for a plain policy."""
+    """Names of its skills, in order; empty for a plain policy."""
 
     def start(self, n: int) -> Memory:
-        """Fresh memory for n environments at the start of their episodes.
+        """Return the initial state for n environments at the start of their episodes.
 
         Args:
-            n: how many environments.
+            n: the number of environments.
 
         Returns:
             Arrays by name; the first axis of each is the environment.
@@ -117,57 +117,57 @@ class Policy(Protocol):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """What to do, and what to remember.
+        """Return actions and the state after them.
 
         Args:
-            memory: of the n environments.
+            memory: the state of the n environments.
             obs: (n, *obs_shape).
             mask: (n, A) bool, allowed actions; None: all.
             deterministic: act greedily, else sample.
-            rng: the source of chance, where it samples.
+            rng: the random generator of samples.
 
         Returns:
-            Actions (n, ...), and the memory after them.
+            Actions (n, ...), and the state after them.
         """
         ...
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """The memory after the environments answered.
+        """Return the state after the environments have stepped.
 
         Args:
-            memory: of the n environments, after ``act``.
-            step: what happened, batched over them.
+            memory: the state of the n environments, after ``act``.
+            step: the transition, batched over them.
 
         Returns:
-            The memory.
+            The new state.
         """
         ...
 
     def acting(self, memory: Memory) -> Array | None:
-        """Which of its skills acts in each environment.
+        """Return the skill that acts in each environment.
 
         Args:
-            memory: of the n environments.
+            memory: the state of the n environments.
 
         Returns:
-            (n,) int64, rows of ``labels``; None: it has no skills.
+            (n,) int64, rows of ``labels``; None: the policy has no skills.
         """
         ...
 
 
 class Memoryless:
-    """The part of a ``Policy`` that is the same for all that remember nothing."""
+    """Base class of policies without a state."""
 
     labels: tuple[str, ...] = ()
 
     def start(self, n: int) -> Memory:
-        """Nothing to remember."""
+        """Return an empty state."""
         return {}
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """Nothing to notice."""
+        """Return the state unchanged."""
         return memory
 
     def acting(self, memory: Memory) -> Array | None:
-        """No skills below: None."""
+        """Return None: the policy has no skills."""
         return None

@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 
 import skillweave as sw
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*whose generator all of a program shares")
+pytestmark = pytest.mark.filterwarnings("ignore:.*whose generator the whole program shares")
 # A quiet run says it as a Python warning.
 pytestmark = pytest.mark.filterwarnings("ignore:.* draws from ")
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((4,)))

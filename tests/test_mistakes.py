@@ -107,7 +107,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "env of no package": (lambda: train("procgen-v0"), "no environment 'procgen-v0'"),
     "env raises in step": (lambda: train(Boom), "of its episode: step() raised ValueError"),
     "env returns a wrong shape": (lambda: train(Wrong), "not in its observation_space"),
-    "four values of old gym": (lambda: train(Old), "returned 4 values; Gymnasium asks for five"),
+    "four values of old gym": (lambda: train(Old), "returned 4 values; Gymnasium needs five"),
     "misspelt keyword of an environment": (
         lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),
         "sutton_bartow_reward",

@@ -79,7 +79,7 @@ def test_what_no_run_can_record_is_named_before_training(tmp_path, value, kind):
         train(tmp_path / "run", value, kind)
     place = "kwargs['sizes']['a'][1][1] is" if isinstance(value, dict) and "a" in value else ""
     assert f"Arena: {place or 'kwargs[' + repr('sizes') + '] is'}" in str(error.value)
-    assert "give that as env: def make(): return Arena(sizes=...)" in str(error.value)
+    assert "pass that as env: def make(): return Arena(sizes=...)" in str(error.value)
     assert not (tmp_path / "run").exists()
 
 

@@ -294,10 +294,10 @@ def test_a_copy_that_is_lost_or_anothers_is_refused(source, tmp_path):
     file = tmp_path / "run/starts/left.safetensors"
     kept = file.read_bytes()
     file.unlink()
-    with pytest.raises(SkillweaveError, match=r"left\.safetensors is not there.*train anew"):
+    with pytest.raises(SkillweaveError, match=r"left\.safetensors is missing.*train again"):
         declare().resume(run.path, quiet=True)
     shutil.copy(tmp_path / "run/starts/other.safetensors", file)
-    with pytest.raises(SkillweaveError, match="does not hold what 'left' is to begin with"):
+    with pytest.raises(SkillweaveError, match="does not hold the initial policy of 'left'"):
         declare().resume(run.path, quiet=True)
     shutil.copy(source / "policies/left.safetensors", file)
     with pytest.raises(SkillweaveError, match="belongs to another run"):
@@ -332,7 +332,7 @@ WRONG = {
     "nobody": (
         {"skills": (type("Third", (Left,), {}), Push), "selector": lambda obs: obs[:, 2] > 0},
         None,
-        r"nobody who learns here has learnt in .*: here learn third, and there left, other, select",
+        r"no learner of this run has learnt in .*: this run trains third, and that one has left",
     ),
     "network": (
         {"algorithm": replace(ON, network=Network((9,)))},

@@ -1,4 +1,4 @@
-"""What SAC and TD3 share: an actor, K critics with slow copies, and how the critics learn."""
+"""The shared part of SAC and TD3: an actor, K critics with slow copies, and the critics' update."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.experience import Sample
 from skillweave.networks.config import Network
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.losses import critic_loss
 from skillweave.ops.optim import adam_, clip_grad_norm_
@@ -26,7 +25,7 @@ from skillweave.spaces import ObsCodec
 
 @dataclass
 class ActorCriticState(OffPolicyState):
-    """What both learn and count; ``params`` is the actor, K the number of critics."""
+    """State that SAC and TD3 share; ``params`` is the actor, K the number of critics."""
 
     critic: Tensor  # (P, K, D)
     critic_target: Tensor  # (P, K, D), the slow copy
@@ -37,10 +36,10 @@ class ActorCriticState(OffPolicyState):
 
 
 class ActorCriticAlgorithm(OffPolicyAlgorithm):
-    """Critics learn from ``critic_target``, and the actor from them; see ``learn``.
+    """Base of SAC and TD3: critics learn from ``critic_target``, the actor from the critics.
 
-    A subclass makes ``net`` and ``critics``; it says what critics learn (``critic_target``) and how
-    the actor learns (``improve_policy``).
+    A subclass creates ``net`` and ``critics``; it defines the critics' target (``critic_target``)
+    and the actor's update (``improve_policy``).
     """
 
     actor_weights: ClassVar[tuple[str, ...]] = ("params",)
@@ -49,11 +48,11 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
     critics: Critics
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
-        """The fields that both have, but for the critics."""
+        """Return the fresh fields of a state except the critics."""
         return super().fresh_fields(params) | {"policy_loss": torch.zeros(len(params), **FLOAT)}
 
     def fresh_networks(self, seeds: Sequence[Seeds]) -> dict[str, Tensor]:
-        """The same with fresh networks."""
+        """Return the fresh fields of a state with fresh networks."""
         params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         generators = self.member_generators(seeds)
         self.net.init_(self.layout.views(params), 0.01, generators)
@@ -67,14 +66,14 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
         }
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Everything in the state that has the shape of networks."""
+        """Return the groups of state fields that have the shape of networks."""
         actor = ParameterGroup(self.layout, (("network", self.net),), self.actor_weights)
         return [actor, self.critics.group()]
 
     def learn(
         self, state: Any, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """One gradient step of the critics, and where it is due of the actor, in place."""
+        """Take one gradient step of the critics and, where ``due``, of the actor, in place."""
         params = ActingParams({}, *self.scaling(state))
         inputs = self.inputs(params, sample.obs)
         with torch.no_grad():
@@ -92,21 +91,21 @@ class ActorCriticAlgorithm(OffPolicyAlgorithm):
     def critic_target(
         self, state: Any, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
-        """What all critics are to say of the sample's actions, (P, B)."""
+        """Return the target value of all critics for the sample's actions, (P, B)."""
         raise NotImplementedError
 
     def improve_policy(
         self, state: Any, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
     ) -> None:
-        """One gradient step of the actor, in place."""
+        """Take one gradient step of the actor, in place."""
         raise NotImplementedError
 
     def move_targets(self, state: Any, due: bool) -> None:
-        """Let the slow copies follow, in place."""
+        """Move the slow copies towards the current weights, in place."""
         state.critic_target.lerp_(state.critic, state.tau[:, None, None])
 
     def smallest(self, flat: Tensor, inputs: Inputs, action: Tensor | None = None) -> Tensor:
-        """The smallest value of critics (P, K, D): of actions (P, B), without them (P, B, A)."""
+        """Return the smallest value of critics (P, K, D): (P, B); without actions (P, B, A)."""
         q = self.critics(self.critics.views(flat), inputs, action).amin(1)
         return q if action is None else q.squeeze(-1)
 
@@ -122,16 +121,16 @@ class Critics:
         self.layout = Layout(self.net.shapes)
 
     def init(self, generators: list[torch.Generator]) -> Tensor:
-        """Fresh parameters (P, K, D), one generator per member."""
+        """Return fresh parameters (P, K, D), drawn with one generator per member."""
         flat = torch.zeros(len(generators), self.count, self.layout.size, **FLOAT)
         for member, generator in enumerate(generators):
             self.net.init_(self.layout.views(flat[member]), 1.0, [generator] * self.count)
         return flat
 
     def __call__(self, views: Views, inputs: Inputs, action: Tensor | None = None) -> Tensor:
-        """Inputs (P, B, …) and actions (P, B, A) to values (P, K, B, out).
+        """Map inputs (P, B, …) and actions (P, B, A) to values (P, K, B, out).
 
-        The views are of (P·K, D); of as many critics as they hold, if fewer.
+        The views are of (P·K, D). If they hold fewer critics, K is their number.
         """
         members = next(iter(inputs.values())).shape[0]
         count = next(iter(views.values())).shape[0] // members
@@ -145,28 +144,28 @@ class Critics:
         return out.view(members, count, *out.shape[1:])
 
     def chosen(self, views: Views, inputs: Inputs, action: Tensor) -> Tensor:
-        """Values (P, K, B) of discrete actions (P, B), or of continuous ones (P, B, A)."""
+        """Return values (P, K, B) of discrete actions (P, B), or of continuous ones (P, B, A)."""
         if action.is_floating_point():
             return self(views, inputs, action).squeeze(-1)
         out = self(views, inputs)  # (P, K, B, A)
         return out.gather(-1, action[:, None, :, None].expand(*out.shape[:3], 1)).squeeze(-1)
 
     def group(self) -> ParameterGroup:
-        """The fields of a state that hold critics."""
+        """Return the fields of a state that hold critics."""
         weights, moments = ("critic", "critic_target"), ("critic_mu", "critic_nu")
         nets = (("critic", self.net),)
         return ParameterGroup(self.layout, nets, weights, moments, "critic_count")
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
-        """Windows into (P, K, D), each (P·K, *shape)."""
+        """Return windows into (P, K, D), each (P·K, *shape)."""
         return self.layout.views(flat.flatten(0, 1))
 
     def leaves(self, flat: Tensor) -> dict[str, Tensor]:
-        """Like ``views``, each a leaf that can be differentiated by."""
+        """Return ``views`` as leaves that a loss can be differentiated by."""
         return self.layout.leaves(flat.flatten(0, 1))
 
     def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor, eps: float) -> Tensor:
-        """One gradient step on ``state.critic``; the gradient's norm before clipping, (P,)."""
+        """Take one gradient step on ``state.critic``; return the unclipped gradient norm, (P,)."""
         grad = self.layout.gradient(loss, leaves).view(len(state.critic), -1)
         norm = clip_grad_norm_(grad, state.max_grad_norm)
         flat = [x.flatten(1) for x in (state.critic, state.critic_mu, state.critic_nu)]

@@ -1,4 +1,4 @@
-"""What every algorithm shares: spaces, observation scaling, and its parameters as a policy."""
+"""The base of all algorithms: spaces, observation scaling, and parameters as a policy."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.experience import Report
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
-from skillweave.networks.stacked import Layout
+from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
@@ -31,7 +30,7 @@ Device = torch.device | str
 
 @dataclass
 class AgentState:
-    """What every algorithm learns and counts: P members, D parameters, O observation numbers."""
+    """State of any algorithm: P members, D parameters, O observation numbers."""
 
     HOST: ClassVar[tuple[str, ...]] = ()
     """Fields that stay on the CPU, because Python decides by them."""
@@ -51,12 +50,12 @@ class AgentState:
 
     @property
     def return_scale(self) -> Tensor:
-        """The deviation of returns, (P, 1)."""
+        """Return the deviation of returns, (P, 1)."""
         return (self.return_var + 1e-8).sqrt()
 
 
 def state_to(state: S, device: Device) -> S:
-    """The state on a device; tensors that are there already are not copied."""
+    """Return the state on a device; tensors that are there already are not copied."""
     stay: tuple[str, ...] = getattr(state, "HOST", ())
     moved = {k: v if k in stay else v.to(device) for k, v in vars(state).items()}
     return type(state)(**moved)
@@ -64,7 +63,7 @@ def state_to(state: S, device: Device) -> S:
 
 @dataclass
 class ActingParams:
-    """What acting needs of an algorithm's state: a copy, so that learning may go on beside it."""
+    """A copy of the part of a state that acting needs, so that learning may continue beside it."""
 
     views: Mapping[str, Tensor]  # the parameters that act, each (P, *shape)
     shift: Tensor | None  # (P, 1, O), where observations are normalised
@@ -74,12 +73,12 @@ class ActingParams:
     def state(self) -> dict[str, Tensor]:
         """Return copies of the tensors by name, (P, ...) each, for a checkpoint."""
         scaling = {"shift": self.shift, "scale": self.scale}
-        found = {k: v for k, v in scaling.items() if v is not None}
-        found |= prefixed("views", self.views) | prefixed("extra", self.extra)
-        return {k: v.detach().to("cpu", copy=True).contiguous() for k, v in found.items()}
+        tensors = {k: v for k, v in scaling.items() if v is not None}
+        tensors |= prefixed("views", self.views) | prefixed("extra", self.extra)
+        return {k: v.detach().to("cpu", copy=True).contiguous() for k, v in tensors.items()}
 
     def load(self, state: Mapping[str, Tensor]) -> None:
-        """Take over a ``state`` of acting parameters of the same algorithm.
+        """Load a ``state`` of acting parameters of the same algorithm.
 
         Weights are copied in place: the last bit of a product of matrices can depend on where they
         lie in memory.
@@ -87,11 +86,11 @@ class ActingParams:
         Raises:
             ValueError: the state does not fit.
         """
-        own = self.state()
-        if own.keys() != state.keys():
-            different = ", ".join(sorted(own.keys() ^ state.keys()))
+        current = self.state()
+        if current.keys() != state.keys():
+            different = ", ".join(sorted(current.keys() ^ state.keys()))
             raise ValueError(f"the parameters of the next rows do not fit: {different}")
-        for name, x in own.items():
+        for name, x in current.items():
             saved = state[name]
             if saved.shape != x.shape or saved.dtype != x.dtype or not bool(saved.isfinite().all()):
                 raise ValueError(f"{name} of the parameters of the next rows does not fit")
@@ -128,35 +127,35 @@ def read_by(config: Any, observation_space: gym.Space[Any], where: str = "") -> 
 
 
 class Algorithm:
-    """The part of an algorithm that is the same for all.
+    """Base class of all algorithms.
 
     A subclass sets ``layout``, the columns of its state's ``params`` (P, D), and ``acting``, the
     first of them, which acting needs. It defines ``fresh_state``, ``parameter_groups``, ``act``,
-    ``value`` and ``update``. It holds nothing that is learnt: that is in the state. It is made
-    of its settings (``config``), ``observation_space`` and ``action_space``.
+    ``value`` and ``update``. Everything learnt is in the state, nothing in this object. The
+    arguments are its settings (``config``), ``observation_space`` and ``action_space``.
 
     Raises:
-        DeclarationError: a setting is one that this algorithm does not support.
+        DeclarationError: the algorithm does not support a setting.
     """
 
     store: ClassVar[Literal["rollout", "replay"]]
-    """What it learns from: a ``Rollout`` of its own recent rows, or a ``Sample`` from replay."""
+    """The kind of batch to learn from: a ``Rollout`` of recent rows or a ``Sample`` of replay."""
     action_spaces: ClassVar[tuple[type[gym.Space[Any]], ...]]
-    """The kinds of action spaces that it can act in."""
+    """The kinds of action spaces that the algorithm supports."""
     state_type: ClassVar[Any] = AgentState
-    """The dataclass of tensors that it learns."""
+    """The dataclass of the state's tensors."""
     raw: ClassVar[tuple[str, ...]] = ()
-    """Raw columns of experience that it learns from, too: "env_reward", the environment's own."""
+    """Raw columns of experience to learn from, too: "env_reward", the environment's own."""
     member_hyperparameters: ClassVar[tuple[str, ...]] = ("learning_rate", "gamma")
-    """Fields of the config that each member has its own value of, and the state a tensor (P,)."""
+    """Fields of the config with one value per member; the state has a tensor (P,) of each."""
     follows_schedules: ClassVar[bool] = False
-    """Whether ``update`` takes its learning rate from ``rate_now``: then it may be a schedule."""
+    """True if ``update`` takes its learning rate from ``rate_now``: then it may be a schedule."""
     config: Any
     layout: Layout
     acting: Layout
     head: ActionHead
     memory_size: int = 0
-    """M, numbers that an environment's memory holds; 0: none."""
+    """M, the size of an environment's recurrent state; 0: the networks have none."""
 
     def __init__(
         self, config: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
@@ -172,14 +171,14 @@ class Algorithm:
         self.obs, self.codec = read_by(config, observation_space), action_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
-    # What an algorithm defines
+    # Methods that an algorithm defines
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> Any:
-        """A state of fresh members, one for each of ``seeds``, on the CPU; see ``fresh_fields``."""
+        """Create the state of fresh members, one per seed, on the CPU; see ``fresh_fields``."""
         self._missing("fresh_state")
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Everything in the state that has the shape of networks."""
+        """Return the groups of state fields that have the shape of networks."""
         self._missing("parameter_groups")
 
     def act(
@@ -190,19 +189,19 @@ class Algorithm:
         noise: Any,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Actions in policy units, what they were chosen from, and the memory after them.
+        """Return actions in policy units, their dist_params, and the recurrent state after them.
 
         Args:
             params: of ``acting_params`` or ``learning_params``.
             obs: (P, B, *item), raw.
             mask: (P, B, A) bool, allowed actions, or None: all.
             noise: one step of ``noise``, or None to act greedily.
-            memory: (P, B, M), for networks that have one.
+            memory: recurrent state (P, B, M), for networks that have one.
         """
         self._missing("act")
 
     def value(self, state: Any, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """What it expects, (P, B), in units of reward.
+        """Return the expected return, (P, B), in units of reward.
 
         Args:
             state: of P members.
@@ -212,28 +211,28 @@ class Algorithm:
         self._missing("value")
 
     def update(self, state: Any, batch: Any, rng: Sequence[torch.Generator]) -> tuple[Any, Report]:
-        """Learn from a batch, in place; returns the state and what to tell.
+        """Learn from a batch, in place; return the state and a report of metrics.
 
         Args:
             state: of P members.
-            batch: of the kind that ``store`` says, on the device of the state.
+            batch: of the kind that ``store`` names, on the device of the state.
             rng: one generator per member, on the CPU.
         """
         self._missing("update")
 
-    # What all share
+    # Methods that all algorithms share
 
     def init(self, seeds: Sequence[Seeds]) -> Any:
-        """Fresh members on the CPU, one for each of ``seeds``; none depends on its neighbours."""
-        with torch_threads(1):  # of a QR decomposition, the last bits depend on their number
+        """Create fresh members on the CPU, one per seed; none depends on its neighbours."""
+        with torch_threads(1):  # the last bits of a QR decomposition depend on the thread count
             return self.fresh_state(seeds)
 
     def member_generators(self, seeds: Sequence[Seeds]) -> list[torch.Generator]:
-        """The generators of fresh members' weights, one for each of ``seeds``."""
+        """Return the generators of fresh members' weights, one for each of ``seeds``."""
         return [(s / "init").torch() for s in seeds]
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
-        """The fields that every state has, of fresh ``params`` (P, D)."""
+        """Return the fields that every state has, for fresh ``params`` (P, D)."""
         members = len(params)
         return {
             "params": params,
@@ -255,7 +254,7 @@ class Algorithm:
     def acting_params(
         self, state: Any, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs of a ``state``, on a ``device``.
+        """Copy the part of a ``state`` that acting needs to a ``device``.
 
         ``progress`` is the share of the budget that is spent.
         """
@@ -264,11 +263,11 @@ class Algorithm:
         return ActingParams(self.acting.views(flat), shift, scale)
 
     def learning_params(self, state: Any) -> ActingParams:
-        """What learning needs to act with a ``state`` as it is; not a copy."""
+        """Return the acting parameters of a ``state`` without copying, for learning."""
         return ActingParams(self.layout.views(state.params), *self.scaling(state))
 
     def scaling(self, state: Any) -> tuple[Tensor | None, Tensor | None]:
-        """Shift and scale of observations by a ``state``, each (P, 1, O); None: there is none."""
+        """Return shift and scale of observations, each (P, 1, O); None: not normalised."""
         if not self.normalize_obs:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
@@ -277,24 +276,24 @@ class Algorithm:
         """Raise a RunError where a finite number of a ``state`` is out of its range."""
 
     def layouts(self) -> dict[str, Layout]:
-        """The fields of the state that hold parameters, or moments of them, and their columns."""
+        """Return the layout of each state field that holds parameters or their moments."""
         groups = self.parameter_groups()
         return {name: g.layout for g in groups for name in (*g.weights, *g.moments)}
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of one member's ``weights``."""
+        """Return names and shapes of one member's ``weights``."""
         scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """One ``member``'s policy in a ``state``: parameters (*shape), scaling (O,); on the CPU."""
+        """Copy one member's policy to the CPU: parameters (*shape), scaling (O,)."""
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
             named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
         return {k: v.detach().to("cpu", copy=True) for k, v in named.items()}
 
     def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
-        """The inverse of ``weights`` for a ``state`` of one member, in place; its slow copy too."""
+        """Load ``weights`` into a ``state`` of one member, in place; its slow copy too."""
         for name in self.parameter_groups()[0].weights:
             for k, view in self.layout.views(getattr(state, name)).items():
                 view[0].copy_(weights[k])
@@ -303,34 +302,34 @@ class Algorithm:
                 getattr(state, k)[0].copy_(weights[k])
 
     def acting_params_of(self, weights: Mapping[str, Tensor]) -> ActingParams:
-        """What acting needs, of one member's ``weights`` (P = 1)."""
+        """Return the acting parameters of one member's ``weights`` (P = 1)."""
         views = {k: weights[k][None].clone() for k in self.acting.shapes}
         if not self.normalize_obs:
             return ActingParams(views, None, None)
         return ActingParams(views, *_scaling(weights["obs_mean"][None], weights["obs_var"][None]))
 
     def inputs(self, params: ActingParams, obs: Tensor) -> Inputs:
-        """Raw ``obs`` (P, B, *item) as the network's inputs, by the scaling in ``params``.
+        """Convert raw ``obs`` (P, B, *item) to the network's inputs, scaled by ``params``.
 
-        Images stay as they came.
+        Images are not scaled.
         """
         vector, images = self.obs.split(obs)
-        found = {f"image.{i}": image for i, image in enumerate(images)}
+        inputs = {f"image.{i}": image for i, image in enumerate(images)}
         if self.obs.size:
             if params.shift is not None and params.scale is not None:
                 vector = ((vector - params.shift) * params.scale).clamp(-10.0, 10.0)
-            found["vector"] = vector
-        return found
+            inputs["vector"] = vector
+        return inputs
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
-        """Exploration noise for ``steps`` calls of ``act`` on (P, ``batch``) rows, by step.
+        """Draw exploration noise for ``steps`` calls of ``act`` on (P, ``batch``) rows, by step.
 
-        There is one of ``generators`` per member.
+        ``generators`` has one generator per member.
         """
         return self.head.noise(generators, steps, batch)
 
     def update_obs_stats(self, state: Any, obs: Tensor, valid: Tensor | None = None) -> None:
-        """Take observations into account in the running moments, in place.
+        """Update the running moments of observations, in place.
 
         Args:
             state: of P members.
@@ -343,14 +342,14 @@ class Algorithm:
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
 
     def update_return_stats(self, state: Any, returns: Tensor, valid: Tensor | None = None) -> None:
-        """Take ``returns`` (P, B), where ``valid`` (P, B), into the moments of ``state``."""
+        """Update the moments of returns with ``returns`` (P, B) where ``valid`` (P, B)."""
         moments = state.return_mean, state.return_var, state.return_count
         state.return_mean, state.return_var, state.return_count = merge_moments(
             *moments, returns[..., None], valid
         )
 
     def to_env(self, action: Array) -> Array:
-        """An ``action`` (n, …) in policy units as the environment's."""
+        """Convert actions (n, …) from policy units to the environment's."""
         return self.codec.to_env(action)
 
     def _missing(self, method: str) -> NoReturn:
@@ -365,5 +364,5 @@ REQUIRED = ("fresh_state", "parameter_groups", "act", "value", "update")
 
 
 def _scaling(mean: Tensor, var: Tensor) -> tuple[Tensor, Tensor]:
-    """Shift and scale (P, 1, O) from moments (P, O); copies."""
+    """Compute shift and scale (P, 1, O) from moments (P, O); both are copies."""
     return mean[:, None].clone(), (var + 1e-8).rsqrt()[:, None]

@@ -1,6 +1,6 @@
-"""Gradient steps compiled into one program: a small network's time is mostly calls of operations.
+"""Gradient steps compiled into one program: small networks spend most time on calling operations.
 
-LeanRL (Meta 2024) showed what this brings; here the backward pass and Adam are compiled along.
+As in LeanRL (Meta 2024); the backward pass and Adam are compiled, too.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ PROGRAMS = 64
 
 
 class Compiled:
-    """A function that is compiled by its first call; its arguments' shapes must not change much.
+    """A function that its first call compiles; its arguments' shapes must not change much.
 
     Args:
         function: tensor operations, which may differentiate within; nothing else.
-        config: whose ``compile`` asks for it: True; or "auto", then it is left as it is where it
-            cannot be compiled.
-        sizes_vary: where a size changes it is compiled once more, for any size there.
+        config: settings whose ``compile`` is True or "auto". With "auto" a function that cannot
+            be compiled runs as it is.
+        sizes_vary: a size that changes causes one more compilation, for any size there.
 
     Raises:
-        DeclarationError: this torch cannot.
-        TrainingError: by a call: there is no C++ compiler, or something in it cannot be compiled.
+        DeclarationError: this torch cannot compile a gradient step.
+        TrainingError: in a call: no C++ compiler is installed, or the function cannot be compiled.
     """
 
     def __init__(
@@ -50,12 +50,12 @@ class Compiled:
         self._program = function
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is sent to another process, which compiles anew."""
-        plain = self._program is self._function  # it could not be compiled here
+        """Return the state to send to another process, which compiles again."""
+        plain = self._program is self._function  # it could not be compiled in this process
         return vars(self) | {"_program": self._function if plain else None}
 
     def __call__(self, *args: Any) -> Any:
-        """What the function returns."""
+        """Call the function, compiled if possible."""
         from torch._dynamo import config as dynamo
         from torch._dynamo import exc
 
@@ -63,26 +63,26 @@ class Compiled:
             return self._function(*args)
         if self._program is None:
             # One algorithm's programs do not count against another's limit.
-            how: Any = {"fullgraph": True, "isolate_recompiles": True}
+            options: Any = {"fullgraph": True, "isolate_recompiles": True}
             dynamic = None if self._sizes_vary else False
-            self._program = torch.compile(self._function, dynamic=dynamic, **how)
-        # Without the first it refuses torch.autograd.grad; it changes nothing for others.
+            self._program = torch.compile(self._function, dynamic=dynamic, **options)
+        # Without trace_autograd_ops dynamo refuses torch.autograd.grad. Other code is unaffected.
         with dynamo.patch(trace_autograd_ops=True, recompile_limit=PROGRAMS):
             try:
                 return self._program(*args)
             except (exc.TorchDynamoException, exc.FailOnRecompileLimitHit) as error:
                 reason = str(error).strip().splitlines()[0]
-                says = f"{self._setting}: the gradient step could not be compiled ({reason})"
+                problem = f"{self._setting}: the gradient step could not be compiled ({reason})"
                 if not self._auto:
                     advice = f"{_advice(error)}leave it at False"
-                    raise TrainingError(f"{says}; {advice}") from error
-        warnings.warn(f"{says}. Gradient steps are not compiled", stacklevel=2)
+                    raise TrainingError(f"{problem}; {advice}") from error
+        warnings.warn(f"{problem}. Gradient steps are not compiled", stacklevel=2)
         self._program = self._function
         return self._function(*args)  # nothing is changed yet: compiling comes before the step
 
 
 def _advice(error: Exception) -> str:
-    """What helps, as the beginning of a sentence; or nothing."""
+    """Return advice on a failed compilation as the beginning of a sentence, or nothing."""
     from torch._dynamo import exc
 
     if isinstance(error, exc.BackendCompilerFailed):

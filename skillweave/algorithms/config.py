@@ -23,21 +23,21 @@ AlgorithmConfig: TypeAlias = OnPolicy | OffPolicy
 AlgorithmSettings: TypeAlias = Annotated[
     AlgorithmConfig, Check("the settings of an algorithm, such as PPO()")
 ]
-"""The same as a field of other settings."""
+"""An algorithm's settings as a field of other settings."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """An algorithm that is known by the name of its settings."""
+    """An algorithm, registered under the name of its settings."""
 
     config: type[Any]
     """The dataclass of its settings."""
     algorithm: Any
-    """Its class, or where that is, as ``module:class``."""
+    """Its class, or the path of its class, ``module:class``."""
     action_spaces: tuple[type[gym.Space[Any]], ...]
-    """The kinds of action spaces that it can act in."""
+    """The kinds of action spaces that the algorithm supports."""
     acts: bool = True
-    """Whether it can be chosen to act, or serves those that do."""
+    """True if the algorithm can be chosen to act; False if it only serves others."""
 
 
 _SPACES, _HOME = gym.spaces, "skillweave.algorithms"
@@ -58,26 +58,26 @@ BUILT_IN = tuple(_REGISTERED)
 """Names of the algorithms of this library."""
 
 
-def add_registration(found: Registration) -> None:
-    """Make an algorithm known, or known anew; see ``registry.register_algorithm``."""
-    _REGISTERED[found.config.__name__] = found
+def add_registration(registration: Registration) -> None:
+    """Register an algorithm, in place of an earlier one; see ``registry.register_algorithm``."""
+    _REGISTERED[registration.config.__name__] = registration
 
 
 def own_registrations() -> list[Registration]:
-    """The algorithms that are not of this library."""
-    return [found for name, found in _REGISTERED.items() if name not in BUILT_IN]
+    """Return the algorithms that are not of this library."""
+    return [r for name, r in _REGISTERED.items() if name not in BUILT_IN]
 
 
 def registration_of(config: Any) -> Registration:
-    """The algorithm that settings belong to.
+    """Return the algorithm that settings belong to.
 
     Raises:
-        DeclarationError: it was never registered.
+        DeclarationError: the algorithm was never registered.
     """
     kind = type(config)
-    for found in _REGISTERED.values():
-        if found.config is kind:
-            return found
+    for registration in _REGISTERED.values():
+        if registration.config is kind:
+            return registration
     raise DeclarationError(_not_registered(kind.__name__))
 
 
@@ -91,7 +91,7 @@ def _not_registered(name: str) -> str:
 
 
 def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
-    """Raise a DeclarationError where an algorithm cannot act in a space, with those that can."""
+    """Raise a DeclarationError that names other algorithms if this one cannot act in a space."""
     if not isinstance(action_space, registration_of(config).action_spaces):
         able = [k for k, r in _REGISTERED.items() if r.acts]
         able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]
@@ -102,13 +102,13 @@ def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> 
 
 
 def named_config(name: str, where: str) -> AlgorithmConfig:
-    """An algorithm's or a preset's default settings by name, in any case.
+    """Return an algorithm's or a preset's default settings by name, in any case.
 
     Raises:
-        DeclarationError: there is none of this name; the message, which begins with ``where``,
+        DeclarationError: no algorithm has this name; the message, which begins with ``where``,
             lists them.
     """
-    kinds = {name: found.config for name, found in _REGISTERED.items() if found.acts}
+    kinds = {name: r.config for name, r in _REGISTERED.items() if r.acts}
     presets: dict[str, Any] = {**kinds, "Rainbow": DQN.rainbow, "DDPG": TD3.ddpg}
     for known, make in presets.items():
         if known.lower() == name.lower():
@@ -118,7 +118,7 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
-    """Settings as plain JSON, with the algorithm's name under ``algorithm``.
+    """Convert settings to plain JSON, with the algorithm's name under ``algorithm``.
 
     Raises:
         DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
@@ -128,14 +128,15 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
 
 
 def _settings(value: Any, where: str) -> Any:
-    """Return settings as dicts; functions of the user are the names that are recorded.
+    """Convert settings to dicts; functions of the user become their recorded names.
 
     Raises:
         DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
     """
     if is_dataclass(value):
-        own = {f.name: getattr(value, f.name) for f in fields(value)}
-        return {name: _settings(one, f"{where}.{name}") for name, one in own.items()}
+        return {
+            f.name: _settings(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value)
+        }
     if isinstance(value, Named):
         return str(value)
     return as_json(value, where, "record a name, and let the algorithm look up what it means")
@@ -148,10 +149,10 @@ def own_encoders(config: Any) -> list[str]:
 
 
 def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConfig:
-    """The inverse of ``config_to_json``.
+    """Read settings from the JSON of ``config_to_json``.
 
     Args:
-        file: where it was read, for messages.
+        file: the file it was read from, for messages.
         path: the field in it: ``stages[0].algorithm``.
 
     Raises:
@@ -168,6 +169,13 @@ def config_from_json(data: Any, file: str = "", path: str = "") -> AlgorithmConf
 
 
 __all__ = [
-    "DQN", "PPO", "SAC", "TD3", "AlgorithmConfig", "OffPolicy", "OnPolicy", "SelfImitationPPO",
+    "DQN",
+    "PPO",
+    "SAC",
+    "TD3",
+    "AlgorithmConfig",
+    "OffPolicy",
+    "OnPolicy",
+    "SelfImitationPPO",
     "SkillCritic",
-]  # fmt: skip
+]

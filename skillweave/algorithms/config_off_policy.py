@@ -1,6 +1,7 @@
 """Settings of the algorithms that learn from a replay buffer.
 
-This module does not import torch; see ``config``, which has the rest.
+Stands alone because ``config`` is the sum of two tables of settings, this and
+``config_on_policy``. Does not import torch.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Schedule = Literal["constant", "linear"]
 @checked_settings
 @dataclass(frozen=True)
 class OffPolicy:
-    """What the algorithms that learn from a replay buffer have in common."""
+    """Settings that all algorithms with a replay buffer share."""
 
     num_envs: AtLeastOne = 8
     """Environments stepped side by side."""
@@ -48,9 +49,9 @@ class OffPolicy:
     prioritized: bool = False
     """Sample by the size of the last error (Schaul et al. 2016)."""
     priority_alpha: Fraction = 0.6
-    """How strongly priorities count; 0: not at all."""
+    """Exponent of the priorities; 0: uniform sampling."""
     priority_beta: Fraction = 0.4
-    """Correction of the bias that they bring, at the start; 1 at the end of the budget."""
+    """Exponent that corrects the priorities' bias, at the start; 1 at the end of the budget."""
     learning_rate: LearningRate = 3e-4
     """Adam\'s step size, at the start; or ``Linear(start, end)``, or a function of the share of the
     budget that remains, 1 at the start and 0 at the end, as in Stable-Baselines3."""
@@ -71,18 +72,18 @@ class OffPolicy:
     network: Network = field(default_factory=lambda: Network((256, 256), "relu"))
     """The network that acts."""
     save_buffer: bool = True
-    """Checkpoints hold the replay buffer, so that resuming is exact; else it fills anew."""
+    """Checkpoints hold the replay buffer, so that resuming is exact; else it starts empty."""
     overlap: bool = False
-    """Collect while learning, with the parameters of one update before: pays where environments
-    are slow. The lag is ``train_freq`` steps of every environment. Where several learn together,
-    only if all of them have it."""
+    """Collect while learning, with the parameters of one update before: useful where environments
+    are slow. The lag is ``train_freq`` steps of every environment. Where several policies learn
+    together, all of them must set it."""
     action_repeat: Fraction = 0.0
-    """Chance that an environment, somewhere in ``action_repeat_steps`` of its steps, repeats one
-    random action (as in εz-greedy exploration, Dabney et al. 2021). It finds what needs patience,
-    like resting on the ground with the engines off. Falls to 0 over the budget. Only where it acts
-    in every step: for plain agents, and skills that learn apart."""
+    """Probability that an environment, somewhere in ``action_repeat_steps`` of its steps, repeats
+    one random action (as in εz-greedy exploration, Dabney et al. 2021). It explores behaviour that
+    takes many equal steps, like resting on the ground with the engines off. Falls to 0 over the
+    budget. Only for policies that act in every step: plain agents, and skills that learn apart."""
     action_repeat_steps: AtLeastOne = 60
-    """Steps of the longest repetition; shorter ones are as likely."""
+    """The longest repetition, in steps; lengths are drawn uniformly."""
     threads: AtLeastOne = 1
     """Torch threads while learning."""
     compile: bool | Literal["auto"] = False
@@ -90,11 +91,16 @@ class OffPolicy:
     auto: where that is possible. Weights differ in their last bits, also of a run that was stopped
     and goes on."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
+    """Device of learning; auto: a GPU if available. Acting runs on the CPU."""
 
     def __post_init__(self) -> None:
         check_critic(self)
-        check(self, "network", self.network.rnn is None, "without rnn: only PPO has memory")
+        check(
+            self,
+            "network",
+            self.network.rnn is None,
+            "without rnn: only PPO supports recurrent networks",
+        )
         check_rate(self)
         least = self.num_envs * (self.n_step + 1)
         check(
@@ -125,10 +131,10 @@ class DQN(OffPolicy):
     n_atoms: Annotated[int, Check("at least 2", lambda x: x >= 2)] = 51
     """C51's atoms."""
     v_min: float | None = None
-    """C51's smallest return; None: −10 times the root mean square of the returns seen so far, in
-    units of which it then learns. What lies beyond the atoms is learnt as the last one."""
+    """C51's smallest return; None: −10 times the root mean square of the returns so far, which is
+    then the unit of learning. Returns beyond the atoms are learnt as the last atom."""
     v_max: float | None = None
-    """C51's largest return; None, as v_min is: 10 times."""
+    """C51's largest return; None, if v_min is None: 10 times the root mean square."""
     max_grad_norm: Positive | None = 10.0
     """Gradients are scaled down to this norm; None: they are not."""
     learning_starts: Count = 1_000
@@ -142,32 +148,39 @@ class DQN(OffPolicy):
     target_update_interval: AtLeastOne = 1
     """Gradient steps between target updates."""
     loss: Literal["huber", "mse"] = "huber"
-    """Of the temporal-difference error; C51 has its own. Where errors exceed 1, huber learns their
-    median, which a landing that crashes one time in three does not change: mse learns the mean."""
+    """Loss of the temporal-difference error; C51 has its own. Where errors exceed 1, huber learns
+    their median, which rare large errors (a crash in one landing of three) do not change; mse
+    learns the mean."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        together = self.v_min is not None or self.v_max is None
-        check(self, "v_min", together, f"a finite number where v_max is one ({self.v_max})")
-        together = self.v_max is not None or self.v_min is None
-        check(self, "v_max", together, f"a finite number where v_min is one ({self.v_min})")
+        given = self.v_min is not None or self.v_max is None
+        check(self, "v_min", given, f"a finite number where v_max is one ({self.v_max})")
+        given = self.v_max is not None or self.v_min is None
+        check(self, "v_max", given, f"a finite number where v_min is one ({self.v_min})")
         if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
 
     @classmethod
     def rainbow(cls, **settings: Any) -> DQN:
-        """Every extension at once, as in Rainbow (Hessel et al. 2018); ``settings`` override."""
+        """Return DQN with all extensions of Rainbow (Hessel et al. 2018); ``settings`` override."""
         everything = {
-            "double": True, "dueling": True, "noisy": True, "distributional": True,
-            "prioritized": True, "n_step": 3, "priority_alpha": 0.5, "adam_eps": 1.5e-4,
-        }  # fmt: skip
+            "double": True,
+            "dueling": True,
+            "noisy": True,
+            "distributional": True,
+            "prioritized": True,
+            "n_step": 3,
+            "priority_alpha": 0.5,
+            "adam_eps": 1.5e-4,
+        }
         return cls(**{**everything, **settings})
 
 
 @checked_settings
 @dataclass(frozen=True)
 class ActorCritic(OffPolicy):
-    """What TD3 and SAC have in common, and where their defaults are not DQN's."""
+    """Settings that TD3 and SAC share, with defaults that differ from DQN's."""
 
     update_ratio: Positive = 0.5
     """Gradient steps per transition collected (the update-to-data ratio)."""
@@ -181,7 +194,7 @@ class ActorCritic(OffPolicy):
     normalize_obs: bool = True
     """Running zero mean, unit deviation of observations; saved with the policy."""
     action_repeat: Fraction = 0.2
-    """As of ``OffPolicy``."""
+    """See ``OffPolicy``."""
     network: Network = field(default_factory=lambda: Network((128, 128), "relu"))
     """The network that acts."""
     critic: Network | None = None
@@ -204,16 +217,16 @@ class TD3(ActorCritic):
     target_noise_clip: NonNegative = 0.5
     """Largest noise on the target's actions."""
     twin: bool = True
-    """The smaller of two critics is the target's; else there is one critic."""
+    """Use the smaller value of two critics as the target; False: one critic."""
     actor_rate: Positive = 0.3
     """The actor's learning rate, as a share of the critics'."""
     action_l2: NonNegative = 0.003
     """Cost of the squared outputs of the actor before tanh, as a share of the mean size of values
-    (Andrychowicz et al. 2017, appendix A): where values say little, actions stay small."""
+    (Andrychowicz et al. 2017, appendix A): where values hardly differ, actions stay small."""
 
     @classmethod
     def ddpg(cls, **settings: Any) -> TD3:
-        """DDPG (Lillicrap et al. 2016): one critic, no delay, no noise on targets, one step.
+        """Return DDPG (Lillicrap et al. 2016): one critic, no delay, no target noise, one step.
 
         Actor and critic learn at one rate, no action is repeated, and large outputs cost nothing;
         ``settings`` override.
@@ -237,11 +250,11 @@ class SAC(ActorCritic):
     """Soft actor-critic (Haarnoja et al. 2018b); for discrete actions Christodoulou 2019."""
 
     ent_coef: Positive = 1.0
-    """The temperature α; where it is learnt, at the start."""
+    """The temperature α; if α is learnt, its initial value."""
     learn_ent_coef: bool = True
-    """α is learnt, so that the policy's entropy is ``target_entropy``."""
+    """Learn α, so that the policy's entropy is ``target_entropy``."""
     target_entropy: float | None = None
-    """Entropy aimed at, in nats; None: −A for A continuous actions, half of log A for A discrete
-    ones. Where a mask allows m of A discrete actions, it is this times log m / log A."""
+    """The intended entropy, in nats; None: −A for A continuous actions, half of log A for A
+    discrete ones. Where a mask allows m of A discrete actions, it is this times log m / log A."""
     policy_delay: AtLeastOne = 1
     """Critic updates for each update of the actor."""

@@ -1,4 +1,8 @@
-"""Settings of the algorithms that learn from their own latest rollout; see ``config``."""
+"""Settings of the algorithms that learn from their own latest rollout.
+
+Stands alone because ``config`` is the sum of two tables of settings, this and
+``config_off_policy``. Does not import torch.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ from skillweave.settings import (
 @checked_settings
 @dataclass(frozen=True)
 class OnPolicy:
-    """What the algorithms that learn from their own latest rollout have in common.
+    """Settings that all algorithms share that learn from their own latest rollout.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
@@ -44,7 +48,7 @@ class OnPolicy:
     threads: AtLeastOne = 1
     """Torch threads while learning."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where learning runs; auto: on a GPU where there is one. Acting runs on the CPU."""
+    """Device of learning; auto: a GPU if available. Acting runs on the CPU."""
 
     def __post_init__(self) -> None:
         check_critic(self)
@@ -61,7 +65,7 @@ class PPO(OnPolicy):
     """
 
     batch_size: AtLeastOne = 256
-    """Samples of one gradient step (a minibatch), about; a smaller rollout is one minibatch."""
+    """Approximate samples of a gradient step (a minibatch); a smaller rollout is one minibatch."""
     update_epochs: AtLeastOne = 10
     """Passes over each rollout."""
     learning_rate_schedule: Literal["constant", "linear", "kl"] = "linear"
@@ -74,7 +78,7 @@ class PPO(OnPolicy):
     clip_coef: Positive = 0.2
     """ε of the clipped surrogate."""
     clip_value: Positive | None = None
-    """How far a value may move per update, in units of normalised returns; None: freely."""
+    """Largest change of a value per update, in units of normalised returns; None: no limit."""
     ent_coef: NonNegative = 0.01
     """Weight of the entropy bonus, and of the cost of bounded actions' deviations beyond 1."""
     ent_coef_final: NonNegative | None = None
@@ -94,8 +98,8 @@ class PPO(OnPolicy):
     normalize_advantage: bool = True
     """Zero mean, unit deviation of the advantages of each update."""
     min_advantage_std: NonNegative = 0.05
-    """Advantages to normalise that have a smaller deviation, in units of reward, are divided by
-    this: where hardly anything was won yet, they are the critic's errors. 0: no limit."""
+    """Least divisor of normalised advantages, in units of reward. While rewards are still rare,
+    smaller deviations are only the critic's errors. 0: no limit."""
     normalize_returns: bool = True
     """The critic learns returns in units of their running deviation, so rewards may be large."""
     action_std_init: Positive = 0.6
@@ -120,61 +124,66 @@ class PPO(OnPolicy):
             check(self, "compile", self.compile is not True, "False where network.rnn is set")
         rollout = self.num_envs * self.n_steps
         most = max(rollout, PPO.batch_size)  # a small rollout alone is no mistake
-        says = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"
-        check(self, "batch_size", self.batch_size <= most, says)
+        rule = f"at most {most}; a rollout has num_envs·n_steps ({rollout}) samples"
+        check(self, "batch_size", self.batch_size <= most, rule)
 
 
 @checked_settings
 @dataclass(frozen=True)
 class SelfImitationPPO(PPO):
-    """PPO that learns again from what it once did well (Oh et al. 2018, "Self-Imitation Learning").
+    """PPO that learns again from its good past steps (Oh et al. 2018, "Self-Imitation Learning").
 
-    For rewards that come seldom: PPO learns once from each, and may forget it until the next comes.
-    Here further gradient steps follow each update, on rows of before whose return was more than
-    the critic expects. Only trajectories that terminated within a rollout count: of others it is
-    not known what they were paid. Where chance decides what is paid, it imitates luck, too.
+    For rare rewards: PPO learns once from each, and may forget it before the next comes. Here each
+    update is followed by further gradient steps on earlier rows whose return exceeds the critic's
+    value. Only trajectories that terminated within a rollout count: the return of others is
+    unknown. Where rewards are random, it also imitates luck.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
     imitation_rows: AtLeastOne = 4096
-    """Rows that are kept, the latest."""
+    """The latest good rows that are kept."""
     imitation_steps: AtLeastOne = 8
-    """The most gradient steps on kept rows after each update, each on ``batch_size`` of them; they
-    are fewer where one pass over what is kept takes fewer."""
+    """The most gradient steps on kept rows after each update, each on ``batch_size`` rows; at most
+    one pass over the kept rows."""
     imitation_coef: NonNegative = 1.0
-    """Weight of their policy loss."""
+    """Weight of the imitation's policy loss."""
     imitation_vf_coef: NonNegative = 0.01
-    """Weight of their value loss."""
+    """Weight of the imitation's value loss."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(self, "network", self.network.rnn is None, "without rnn: kept rows have no memory")
+        check(
+            self,
+            "network",
+            self.network.rnn is None,
+            "without rnn: kept rows have no recurrent state",
+        )
 
 
 @checked_settings
 @dataclass(frozen=True)
 class SkillCritic(OnPolicy):
-    """What each skill is worth to the task, Q(s, skill), learnt from every step of all."""
+    """Settings of the critic of skills: Q(s, skill) of the task, learnt from every step."""
 
     batch_size: AtLeastOne = 256
-    """Samples of one gradient step, about."""
+    """Approximate samples of one gradient step."""
     update_epochs: AtLeastOne = 2
     """Passes over each rollout."""
     gae_lambda: Fraction = 0.95
-    """λ of the returns that it learns."""
+    """λ of the returns that the critic learns."""
     adam_eps: Positive = 1e-5
     """Adam's ε."""
     max_grad_norm: Positive = 0.5
     """Gradients are scaled down to this norm."""
     deciding: bool = False
-    """It also learns what it is worth to decide anew, which interruption asks for."""
+    """Also learn the value of deciding again, which interruption needs."""
     min_advantage_std: NonNegative = 0.05
-    """The task's advantages of a smaller deviation, in units of reward, are divided by this."""
+    """Least divisor of the task's normalised advantages, in units of reward."""
     epsilon: Fraction = 0.0
-    """Share of calls that the selector draws uniformly at the start, to try skills. Few of them are
-    cut: while skills learn, what skills are worth is multiplied by 1 − epsilon."""
+    """Share of calls that the selector draws uniformly at the start, to try skills. Few of these
+    are interrupted: while skills learn, their values are multiplied by 1 − epsilon."""
     epsilon_final: Fraction | None = None
     """The value that epsilon falls to, linearly; None: constant."""
     epsilon_fraction: Fraction = 1.0

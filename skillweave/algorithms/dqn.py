@@ -1,6 +1,6 @@
 """DQN for P members at once, with the six extensions of Rainbow (Hessel et al. 2018).
 
-Read down the page: State, init, act, update, loss. The settings are ``config.DQN``.
+In the order of reading: State, init, act, update, loss. The settings are ``config.DQN``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from skillweave.algorithms.config import DQN
 from skillweave.algorithms.off_policy import OffPolicyAlgorithm, OffPolicyState, normal
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.qnet import QNet
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean
@@ -33,13 +32,13 @@ WIDEST = 10.0
 
 @dataclass
 class State(OffPolicyState):
-    """Everything DQN learns and counts."""
+    """Learnt numbers and counts of DQN."""
 
     target: Tensor  # (P, D), the slow copy of ``params``
 
 
 class DQNAlgorithm(OffPolicyAlgorithm):
-    """DQN on one pair of spaces. Holds no learnt state: that is in ``State``."""
+    """DQN on one pair of spaces; all that is learnt is in ``State``."""
 
     state_type = State
 
@@ -55,44 +54,47 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             high = WIDEST if config.v_max is None else config.v_max
             self.atoms = Constant(torch.linspace(low, high, config.n_atoms, **FLOAT))
         self.net = QNet(
-            self.obs, config.network, self.codec.size,
+            self.obs,
+            config.network,
+            self.codec.size,
             atoms=config.n_atoms if config.distributional else 1,
-            dueling=config.dueling, noisy=config.noisy,
-        )  # fmt: skip
+            dueling=config.dueling,
+            noisy=config.noisy,
+        )
         self.layout = self.acting = Layout(self.net.shapes)
 
     @property
-    def _given(self) -> bool:
-        """Whether the atoms are returns of the settings' own, not of those seen."""
+    def _has_fixed_atoms(self) -> bool:
+        """Return whether the settings give the atoms' range, not the returns seen so far."""
         return self.config.v_min is not None
 
     @property
     def scales_rewards(self) -> bool:
-        """Whether it needs the running moments of returns."""
-        return super().scales_rewards or (self.atoms is not None and not self._given)
+        """Return whether learning needs the running moments of returns."""
+        return super().scales_rewards or (self.atoms is not None and not self._has_fixed_atoms)
 
     def reward_scale(self, state: State) -> Tensor | None:
-        """What rewards are multiplied by, (P, 1): it brings them to the units of the atoms."""
-        if self.atoms is None or self._given:
+        """Return the factor of rewards, (P, 1), that brings them to the units of the atoms."""
+        if self.atoms is None or self._has_fixed_atoms:
             return super().reward_scale(state)
-        # The root of the mean square: of returns that are all alike the deviation would be 0.
+        # The root of the mean square: the deviation of equal returns would be 0.
         square = state.return_var + state.return_mean.square()
         return (square + 1e-8).rsqrt()
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """A state of fresh members, one for each seed."""
+        """Create the state of fresh members, one for each seed."""
         params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         self.net.init_(self.layout.views(params), self.member_generators(seeds))
         return State(**self.fresh_fields(params), target=params.clone())
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Everything in the state that has the shape of networks."""
+        """Return the groups of state fields that have the shape of networks."""
         return [ParameterGroup(self.layout, (("network", self.net),), ("params", "target"))]
 
     def acting_params(
         self, state: State, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs, with ε."""
+        """Copy the part that acting needs, with ε."""
         cfg, params = self.config, super().acting_params(state, progress, device)
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
         start, final = cfg.exploration_initial_eps, cfg.exploration_final_eps
@@ -105,7 +107,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     def noise(
         self, generators: Sequence[torch.Generator], steps: int, batch: int
     ) -> list[tuple[Tensor, Tensor | None]]:
-        """For each step, uniform numbers (P, batch, A + 1) and the weights' noise (P, K)."""
+        """Draw uniform numbers (P, batch, A + 1) and the weights' noise (P, K) for each step."""
         shape, inner = (steps, batch, self.codec.size + 1), self.net.noise_size
         uniform = torch.stack([torch.rand(shape, generator=g, **FLOAT) for g in generators], dim=1)
         if not inner:
@@ -123,27 +125,27 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         noise: tuple[Tensor, Tensor | None] | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """Actions (P, B), their values (P, B, A), and no memory; see ``Algorithm.act``."""
+        """Return actions (P, B) and values (P, B, A); see ``Algorithm.act``."""
         uniform, normal = noise or (None, None)
         views = params.views if normal is None else self.net.perturbed(params.views, normal)
         q = mask_logits(self._q(self.net(views, self.inputs(params, obs))), mask)
         action = q.argmax(-1)
         if uniform is not None:
-            anything = mask_logits(uniform[..., 1:], mask).argmax(-1)
+            random_action = mask_logits(uniform[..., 1:], mask).argmax(-1)
             epsilon = params.extra.get("epsilon")
             final = self.config.exploration_final_eps * (not self.config.noisy)
             explore = uniform[..., 0] < (final if epsilon is None else epsilon)
-            action = torch.where(explore, anything, action)
+            action = torch.where(explore, random_action, action)
         return action, q, None
 
     def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """``max Q`` over allowed actions, of C51 their means, in units of reward, (P, B)."""
+        """Return ``max Q`` over allowed actions (C51: of means), in units of reward, (P, B)."""
         params = self.learning_params(state)
         q = self._q(self.net(params.views, self.inputs(params, obs)))
         return self.in_rewards(state, mask_logits(q, mask).amax(-1))
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
-        """Of the weights: online, the target's, and those that choose its action; (P, K) each."""
+        """Draw noise of the online, the target's and the choosing weights, (P, K) each."""
         if not self.config.noisy:
             return []
         return list(normal(rng, 3, self.net.noise_size).unbind(1))
@@ -151,7 +153,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     def learn(
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """One gradient step, in place; metrics (P,) and errors (P, B)."""
+        """Take one gradient step, in place; return metrics (P,) and errors (P, B)."""
         leaves = self.layout.leaves(state.params)
         loss, error, q = self.loss(leaves, state, sample, noise or [None] * 3)
         norm = self.step_(state, loss, leaves, rate)
@@ -163,10 +165,10 @@ class DQNAlgorithm(OffPolicyAlgorithm):
     def loss(
         self, views: Views, state: State, sample: Sample, noises: Sequence[Tensor | None]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loss (P,), error of each sample (P, B) and mean value (P,), the latter two detached."""
+        """Compute loss (P,), each sample's error (P, B), mean value (P,); the last two detached."""
         params = ActingParams({}, *self.scaling(state))
         out = self.net(self._noisy(views, noises[0]), self.inputs(params, sample.obs))
-        out = _taken(out, sample.action)
+        out = _of_action(out, sample.action)
         next_inputs = self.inputs(params, sample.next_obs)
         reward = self.rewards(state, sample)
         with torch.no_grad():
@@ -191,12 +193,12 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         reward: Tensor,
         noises: Sequence[Tensor | None],
     ) -> Tensor:
-        """``r + discount·Q̄(s′, a′)``, (P, B); or its distribution over the atoms, (P, B, N)."""
+        """Return ``r + discount·Q̄(s′, a′)``, (P, B); or its distribution on atoms, (P, B, N)."""
         slow = self.layout.views(state.target)
         out = self.net(self._noisy(slow, noises[1]), inputs)
-        judge = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
-        best = mask_logits(self._q(judge), sample.next_mask).argmax(-1)
-        chosen = _taken(out, best)
+        online = self.net(self._noisy(views, noises[2]), inputs) if self.config.double else out
+        best = mask_logits(self._q(online), sample.next_mask).argmax(-1)
+        chosen = _of_action(out, best)
         if self.atoms is None:
             return td_target(reward, sample.discount, chosen.squeeze(-1))
         atoms = self.atoms.on(reward.device)
@@ -206,13 +208,13 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         return views if noise is None else self.net.perturbed(views, noise)
 
     def _q(self, out: Tensor) -> Tensor:
-        """Network outputs (P, B, A, atoms) as values (P, B, A)."""
+        """Convert network outputs (P, B, A, atoms) to values (P, B, A)."""
         if self.atoms is None:
             return out.squeeze(-1)
         return (out.softmax(-1) * self.atoms.on(out.device)).sum(-1)
 
 
-def _taken(out: Tensor, action: Tensor) -> Tensor:
-    """What a network says of one action each: (P, B, A, atoms), (P, B) to (P, B, atoms)."""
+def _of_action(out: Tensor, action: Tensor) -> Tensor:
+    """Select one action's outputs: (P, B, A, atoms), (P, B) to (P, B, atoms)."""
     index = action[..., None, None].expand(*action.shape, 1, out.shape[-1])
     return out.gather(2, index).squeeze(2)

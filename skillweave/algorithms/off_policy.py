@@ -1,4 +1,4 @@
-"""What the algorithms that learn from a replay buffer share: reward scale, schedules, updates."""
+"""The base of algorithms that learn from replay: reward scale, schedules, updates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skillweave.ops.optim import adam_, clip_grad_norm_
 
 @dataclass
 class OffPolicyState(AgentState):
-    """What every algorithm with a replay buffer learns and counts."""
+    """Learnt numbers and counts of any algorithm with a replay buffer."""
 
     HOST = ("updates",)
 
@@ -32,32 +32,35 @@ class OffPolicyState(AgentState):
 
 
 class OffPolicyAlgorithm(Algorithm):
-    """Learns from samples of a replay buffer, one gradient step at a time."""
+    """Base class of algorithms that learn from a replay buffer, one gradient step at a time."""
 
     store = "replay"
     follows_schedules = True
     member_hyperparameters: ClassVar[tuple[str, ...]] = (
-        "learning_rate", "gamma", "tau", "max_grad_norm",
-    )  # fmt: skip
+        "learning_rate",
+        "gamma",
+        "tau",
+        "max_grad_norm",
+    )
     interval: int
-    """Gradient steps between those that the slower networks take part in."""
+    """Gradient steps between updates of the slower networks."""
     between: ClassVar[bool] = False
-    """Whether it learns from the observations between those that n steps begin and end with."""
+    """True if learning needs the observations between the first and the last of n steps."""
 
     @property
     def scales_rewards(self) -> bool:
-        """Whether it needs the running moments of returns."""
+        """Return whether learning needs the running moments of returns."""
         return bool(self.config.normalize_rewards)
 
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
-        """The fields that every state has, and the count of gradient steps."""
+        """Return the fields that every state has, and the count of gradient steps."""
         updates = torch.zeros(len(params), **INT)
         return super().fresh_fields(params) | {"updates": updates}
 
     def update(
         self, state: Any, batch: Sample, rng: Sequence[torch.Generator]
     ) -> tuple[Any, Report]:
-        """One gradient step, in place; the report has the samples' errors (P, B)."""
+        """Take one gradient step, in place; the report has the samples' errors (P, B)."""
         state.updates += 1
         due = int(state.updates[0]) % self.interval == 0
         drawn = self.learning_noise(rng, batch.reward.shape[1], due)
@@ -71,18 +74,18 @@ class OffPolicyAlgorithm(Algorithm):
         return Compiled(self.learn, self.config)
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
-        """The random numbers that ``learn`` needs, from one generator per member."""
+        """Return the random numbers that ``learn`` needs, from one generator per member."""
         raise NotImplementedError
 
     def learn(
         self, state: Any, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """``update`` as nothing but tensor operations, so that it can be compiled.
+        """Take the gradient step of ``update`` with tensor operations only, so it can be compiled.
 
         Args:
             rate: the learning rate now, (P,).
-            noise: of ``learning_noise``.
-            due: whether it is the slower networks' turn, too.
+            noise: from ``learning_noise``.
+            due: whether the slower networks are updated, too.
 
         Returns:
             Metrics (P,), and the error of each sample (P, B).
@@ -92,7 +95,7 @@ class OffPolicyAlgorithm(Algorithm):
     def random_actions(
         self, generators: Sequence[torch.Generator], batch: int, mask: Tensor | None
     ) -> Tensor:
-        """Actions (P, batch, ...) drawn uniformly from those allowed, on the CPU."""
+        """Draw actions (P, batch, ...) uniformly from the allowed ones, on the CPU."""
         drawn = [torch.rand(batch, self.codec.size, generator=g, **FLOAT) for g in generators]
         uniform = torch.stack(drawn)
         if not self.codec.discrete:
@@ -100,28 +103,28 @@ class OffPolicyAlgorithm(Algorithm):
         return mask_logits(uniform, mask).argmax(-1)
 
     def reward_scale(self, state: Any) -> Tensor | None:
-        """What rewards are multiplied by before critics learn from them, (P, 1); None: 1."""
+        """Return the factor of rewards before critics learn from them, (P, 1); None: 1."""
         if not self.config.normalize_rewards:
             return None
         scale: Tensor = (state.return_var + 1e-8).rsqrt()
         return scale
 
     def rewards(self, state: Any, sample: Sample) -> Tensor:
-        """Rewards (P, B) in the units that critics learn in."""
+        """Return rewards (P, B) in the units that critics learn in."""
         scale = self.reward_scale(state)
         return sample.reward if scale is None else sample.reward * scale
 
     def in_rewards(self, state: Any, value: Tensor) -> Tensor:
-        """Values (P, B) in the critics' units as such in units of reward."""
+        """Convert values (P, B) from the critics' units to units of reward."""
         scale = self.reward_scale(state)
         return value if scale is None else value / scale
 
     def rate(self, state: Any, progress: float) -> Tensor:
-        """The learning rate now, (P,)."""
+        """Return the learning rate now, (P,)."""
         return rate_now(self.config, state.learning_rate, progress)
 
     def step_(self, state: Any, loss: Tensor, leaves: Views, rate: Tensor) -> Tensor:
-        """One gradient step on ``state.params``; the gradient's norm before clipping, (P,)."""
+        """Take one gradient step on ``state.params``; return the unclipped gradient norm, (P,)."""
         grad = self.layout.gradient(loss, leaves)
         norm = clip_grad_norm_(grad, state.max_grad_norm)
         moments = state.mu, state.nu, state.count
@@ -130,5 +133,5 @@ class OffPolicyAlgorithm(Algorithm):
 
 
 def normal(generators: Sequence[torch.Generator], *shape: int) -> Tensor:
-    """Standard normal numbers (P, *shape), from one generator per member."""
+    """Draw standard normal numbers (P, *shape), from one generator per member."""
     return torch.stack([torch.randn(shape, generator=g, **FLOAT) for g in generators])

@@ -1,4 +1,4 @@
-"""What evolution and files need to know of a state: what its tensors are."""
+"""The meaning of a state's tensors, for evolution and files; values of schedules."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class ParameterGroup:
     nets: tuple[tuple[str, Any], ...]
     """The networks in the layout, each with the field of the config that shapes it."""
     weights: tuple[str, ...] = ("params",)
-    """What learns, then its slow copy if there is one."""
+    """The field that learns, then its slow copy if it has one."""
     moments: tuple[str, ...] = ("mu", "nu")
-    """The optimiser's."""
+    """The optimiser's moments."""
     count: str = "count"
     """The field with the optimiser's steps: (P,), or (..., D) where parameters differ in age."""
 
@@ -31,7 +31,7 @@ def rate_now(config: Any, rate: Tensor, progress: float) -> Tensor:
     """Return the learning rate (P,) at this share of the budget.
 
     Args:
-        rate: (P,), that of each member at the start.
+        rate: (P,), each member's rate at the start.
     """
     if is_schedule(config.learning_rate):
         return torch.full_like(rate, scheduled(config, 1.0 - progress))
@@ -39,13 +39,27 @@ def rate_now(config: Any, rate: Tensor, progress: float) -> Tensor:
     return rate * (1.0 - progress) if linear else rate
 
 
+def epsilon_now(config: Any, progress: float, like: Tensor) -> Tensor | None:
+    """Return the share of actions drawn uniformly, (P, 1, 1); None: none is drawn.
+
+    Args:
+        like: (P,), gives the number of members and the device.
+    """
+    first, last = config.epsilon, config.epsilon_final
+    if max(first, last or 0.0) == 0.0:
+        return None
+    fallen = min(1.0, progress / max(config.epsilon_fraction, 1e-9))
+    share = first if last is None else first + fallen * (last - first)
+    return torch.full((len(like), 1, 1), share, dtype=torch.float32, device=like.device)
+
+
 LARGEST = torch.finfo(torch.float32).max
 
 
 def setting_number(value: float | None) -> float:
-    """A hyperparameter as it stands in a state, where None (no limit) is the largest number.
+    """Return a hyperparameter's number in a state; None (no limit) becomes the largest number.
 
-    Not infinity: in a state that is not finite something has diverged.
+    Not infinity: a state that is not finite has diverged.
     """
     return LARGEST if value is None else float(value)
 

@@ -24,7 +24,7 @@ S = TypeVar("S")
 
 
 class AgentPolicy(Memoryless):
-    """One trained agent; a copy of what acting needs, independent of further learning."""
+    """A trained agent that acts; a copy, independent of further learning."""
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm, self.weights = algorithm, weights
@@ -34,11 +34,11 @@ class AgentPolicy(Memoryless):
 
     @classmethod
     def of(cls, algorithm: Algorithm, state: Any, member: int = 0) -> AgentPolicy:
-        """The policy of one member of a state."""
+        """Return the policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
 
     def start(self, n: int) -> Memory:
-        """Zeros, (n, M), where the network has a memory."""
+        """Return the initial recurrent state, zeros (n, M); empty if the network has none."""
         size = self.algorithm.memory_size
         return {"rnn": np.zeros((n, size), np.float32)} if size else {}
 
@@ -52,7 +52,7 @@ class AgentPolicy(Memoryless):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions (n, ...) in the environment's units; greedy, or sampled with ``rng``."""
+        """Return actions (n, ...) in the environment's units; greedy, or sampled with ``rng``."""
         noise = None
         if not deterministic:
             rng = rng or np.random.default_rng()
@@ -67,15 +67,15 @@ class AgentPolicy(Memoryless):
 
     @torch.inference_mode()
     def heads(self, obs: Array) -> Array:
-        """What actions are chosen from, (n, H), without a memory: logits, means or values."""
+        """Return dist_params (n, H) of a network without recurrence: logits, means or values."""
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
-        _, head, _ = self.algorithm.act(self.params, rows, None, None)
-        assert head is not None
-        found: Array = head[0].numpy()
-        return found
+        _, dist_params, _ = self.algorithm.act(self.params, rows, None, None)
+        assert dist_params is not None
+        array: Array = dist_params[0].numpy()
+        return array
 
     def source(self) -> dict[str, Any]:
-        """The checksum of what it acts by, for a run that it is a skill of."""
+        """Return the checksum of spaces and weights, for a run that has this policy as a skill."""
         digest = hashlib.sha256(type(self.algorithm).__name__.encode())
         for space in (self.observation_space, self.action_space):
             digest.update(json.dumps(space_to_json(space), sort_keys=True).encode())
@@ -85,7 +85,7 @@ class AgentPolicy(Memoryless):
         return {"sha256": digest.hexdigest()}
 
     def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and the JSON that ``from_file`` needs."""
+        """Return tensors and the JSON header that ``from_file`` needs."""
         return self.weights, {
             "kind": "agent",
             "algorithm": config_to_json(self.algorithm.config),
@@ -97,11 +97,11 @@ class AgentPolicy(Memoryless):
     def from_file(
         cls, tensors: dict[str, Tensor], header: dict[str, Any], where: str
     ) -> AgentPolicy:
-        """The inverse of ``to_file``.
+        """Create a policy from the tensors and header of ``to_file``.
 
         Raises:
-            RunError: the header is damaged; or tensors are missing, have other shapes or
-                types than the header says, or are not finite.
+            RunError: the header is damaged; or tensors are missing, have shapes or types that
+                differ from the header, or are not finite.
         """
         fit(AgentHeader, header, where)
         try:
@@ -117,21 +117,21 @@ class AgentPolicy(Memoryless):
         for name, value in weights.items():
             if not value.isfinite().all():
                 raise RunError(
-                    f"{where}: tensor {name} holds NaN or infinity: what was trained had diverged, "
+                    f"{where}: tensor {name} holds NaN or infinity: the training had diverged, "
                     "or the file was altered"
                 )
         return cls(algorithm, weights)
 
 
 class AgentHeader(TypedDict):
-    """What a policy's file says of it."""
+    """The JSON header of a policy's file."""
 
     algorithm: dict[str, Any]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     kind: NotRequired[str]
     run: NotRequired[str]
-    """The run that it was trained in."""
+    """The run in which the policy was trained."""
     stage: NotRequired[str]
     env: NotRequired[str]
     env_kwargs: NotRequired[dict[str, Any]]
@@ -142,18 +142,18 @@ class AgentHeader(TypedDict):
 def checked_tensor(
     tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...], dtype: torch.dtype, where: str
 ) -> Tensor:
-    """A tensor by name.
+    """Return a tensor by name.
 
     Raises:
-        RunError: it is missing, or has another shape or type.
+        RunError: the tensor is missing, or has another shape or type.
     """
-    found = tensors.get(name)
-    if found is None or tuple(found.shape) != shape:
-        what = "nothing" if found is None else tuple(found.shape)
-        raise RunError(f"{where}: tensor {name} should be {shape}, found {what}")
-    if found.dtype != dtype:
-        raise RunError(f"{where}: tensor {name} should hold {dtype}, found {found.dtype}")
-    return found
+    tensor = tensors.get(name)
+    if tensor is None or tuple(tensor.shape) != shape:
+        shape_found = "nothing" if tensor is None else tuple(tensor.shape)
+        raise RunError(f"{where}: tensor {name} should be {shape}, found {shape_found}")
+    if tensor.dtype != dtype:
+        raise RunError(f"{where}: tensor {name} should hold {dtype}, found {tensor.dtype}")
+    return tensor
 
 
 def state_from(
@@ -164,29 +164,33 @@ def state_from(
     *,
     may_diverge: bool = False,
 ) -> S:
-    """The state that ``tensors`` hold by field, if it is of the shapes and types of ``like``.
+    """Read a state from ``tensors`` by field, with the shapes and types of ``like``.
 
     Args:
-        groups: of the algorithm, where networks may have grown.
-        may_diverge: numbers need not be finite, as of a member that trains no more.
+        groups: of the algorithm, if networks may have grown.
+        may_diverge: allow numbers that are not finite, as in a member that trains no more.
 
     Raises:
-        RunError: it is not, or holds a number that is not finite; the tensor is named.
+        RunError: a tensor has another shape or type, or a number that is not finite; it is named.
     """
     shapes = {name: tuple(value.shape) for name, value in vars(like).items()}
     for family in groups:  # after growth each parameter has an age of its own
         if family.count in tensors and tensors[family.count].ndim > 1:
             shapes[family.count] = shapes[family.weights[0]]
-    found = {
+    values = {
         name: checked_tensor(tensors, name, shapes[name], value.dtype, where)
         for name, value in vars(like).items()
     }
-    for name, value in found.items():
+    for name, value in values.items():
         if not may_diverge and value.is_floating_point() and not bool(value.isfinite().all()):
             raise RunError(f"{where}: tensor {name} holds NaN or infinity: the file was altered")
-    return type(like)(**found)
+    return type(like)(**values)
 
 
 __all__ = [
-    "AgentHeader", "AgentPolicy", "checked_tensor", "make_algorithm", "state_from",
-]  # fmt: skip
+    "AgentHeader",
+    "AgentPolicy",
+    "checked_tensor",
+    "make_algorithm",
+    "state_from",
+]

@@ -1,8 +1,8 @@
 """PPO (Schulman et al. 2017) for P members at once; a single agent is P = 1.
 
-Read down the page: State, init, act, value, update, learn, loss; then ``ppo_samples``. The settings
-are ``config.PPO``. What acted may be an update old: the objective is the decoupled one of Hilton,
-Cobbe & Schulman 2022.
+In the order of reading: State, init, act, value, update, learn, loss; then the terms of a loss and
+the samples of a rollout. The settings are ``config.PPO``. The weights that acted may be one update
+old, so the objective is the decoupled one of Hilton, Cobbe & Schulman 2022.
 """
 
 from __future__ import annotations
@@ -19,20 +19,19 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.config import PPO
-from skillweave.algorithms.parameters import ParameterGroup
-from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
-from skillweave.algorithms.rollouts import Samples, minibatches
+from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
+from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
-from skillweave.experience import Report, Rollout
-from skillweave.networks.encoders import Inputs
+from skillweave.experience import Reference, Report, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
 from skillweave.ops.distributions import mask_logits, with_epsilon
-from skillweave.ops.losses import approximate_kl, ppo_policy_loss, value_loss
-from skillweave.ops.moments import masked_mean
+from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_loss, value_loss
+from skillweave.ops.moments import explained_variance, masked_mean, normalise
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
+from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -43,7 +42,7 @@ _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 @dataclass
 class State(AgentState):
-    """Everything PPO learns and counts; ``params`` is the actor first, then the critic."""
+    """Learnt numbers and counts of PPO; ``params`` is the actor first, then the critic."""
 
     gae_lambda: Tensor  # (P,), as all below a hyperparameter of each member
     clip_coef: Tensor  # (P,)
@@ -53,15 +52,20 @@ class State(AgentState):
 
 
 class PPOAlgorithm(Algorithm):
-    """PPO on one pair of spaces. Holds no learnt state: that is in ``State``."""
+    """PPO on one pair of spaces; all that is learnt is in ``State``."""
 
     store = "rollout"
     follows_schedules = True
     state_type: ClassVar[type[State]] = State
     member_hyperparameters = (
-        "learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "vf_coef",
+        "learning_rate",
+        "gamma",
+        "gae_lambda",
+        "clip_coef",
+        "ent_coef",
+        "vf_coef",
         "max_grad_norm",
-    )  # fmt: skip
+    )
 
     def __init__(
         self, config: PPO, observation_space: gym.Space[Any], action_space: gym.Space[Any]
@@ -79,16 +83,16 @@ class PPOAlgorithm(Algorithm):
             acting["actor.log_std"] = (1, self.codec.size)
         self.layout = Layout(acting | self.critic_net.shapes)
         self.memory_size = self.actor_net.memory_size + self.critic_net.memory_size
-        # With memory the critic runs along while acting: its memory must be known, too.
+        # A recurrent critic runs while acting, too, because learning needs its recurrent state.
         self.acting = self.layout if self.memory_size else Layout(acting)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """A state of fresh members, one for each seed."""
+        """Create the state of fresh members, one for each seed."""
         params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         views, generators = self.layout.views(params), self.member_generators(seeds)
         self.actor_net.init_(views, 0.01, generators)
-        # All values begin at 0. A random critic's errors are the only advantages until something
-        # is paid for the first time, and they can lead the policy away from where that would be.
+        # All values begin at 0. Until the first reward, a random critic's errors would be the only
+        # advantages, and they could lead the policy away from that reward.
         self.critic_net.init_(views, 0.0, generators)
         if self.head.std_in_head:
             bias = views[f"{self.actor_net.head}.bias"]
@@ -98,7 +102,7 @@ class PPOAlgorithm(Algorithm):
         return State(**self.fresh_fields(params))
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Everything in the state that has the shape of networks."""
+        """Return the groups of state fields that have the shape of networks."""
         nets = ("network", self.actor_net), ("critic", self.critic_net)
         return [ParameterGroup(self.layout, nets)]
 
@@ -110,35 +114,39 @@ class PPOAlgorithm(Algorithm):
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Actions in policy units, the head they came from, and the memory; `Algorithm.act`."""
+        """Return actions in policy units, their dist_params and recurrent state; see the base."""
         inputs, views = self.inputs(params, obs), params.views
         if memory is None:
-            head = self.actor_net(views, inputs)
+            dist_params = self.actor_net(views, inputs)
         else:
-            own, other = memory.tensor_split([self.actor_net.memory_size], dim=-1)
-            head, own = self.actor_net.step(views, inputs, own)
-            _, other = self.critic_net.step(views, inputs, other)
-            memory = torch.cat([own, other], dim=-1)
+            actor, critic = memory.tensor_split([self.actor_net.memory_size], dim=-1)
+            dist_params, actor = self.actor_net.step(views, inputs, actor)
+            _, critic = self.critic_net.step(views, inputs, critic)
+            memory = torch.cat([actor, critic], dim=-1)
         if self.head.discrete:
             epsilon = params.extra.get("epsilon")
-            head = mask_logits(head, mask) if epsilon is None else with_epsilon(head, mask, epsilon)
-        return self.head.act(head, views.get("actor.log_std"), noise), head, memory
+            if epsilon is None:
+                dist_params = mask_logits(dist_params, mask)
+            else:
+                dist_params = with_epsilon(dist_params, mask, epsilon)
+        action = self.head.act(dist_params, views.get("actor.log_std"), noise)
+        return action, dist_params, memory
 
     def acting_params(
         self, state: State, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs; see ``Algorithm.acting_params``."""
-        found = super().acting_params(state, progress, device)
+        """Copy the part that acting needs, with epsilon; see ``Algorithm.acting_params``."""
+        params = super().acting_params(state, progress, device)
         if (epsilon := epsilon_now(self.config, progress, state.learning_rate)) is not None:
-            found.extra["epsilon"] = epsilon.to(device)
-        return found
+            params.extra["epsilon"] = epsilon.to(device)
+        return params
 
     def to_env(self, action: Array) -> Array:
-        """Policy units (n, …) to the environment's."""
+        """Convert actions (n, …) from policy units to the environment's."""
         return self.head.to_env(action)
 
     def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """V in units of reward, (P, B); with a memory, that of an episode's first observation."""
+        """Return V in units of reward, (P, B); a recurrent state starts empty."""
         params = self.learning_params(state)
         inputs, size = self.inputs(params, obs), self.critic_net.memory_size
         if not size:
@@ -151,24 +159,27 @@ class PPOAlgorithm(Algorithm):
     ) -> tuple[State, Report]:
         """Learn from the valid rows of a rollout, in place; ``rng`` orders the minibatches."""
         cfg = self.config
-        now = Terms.of(cfg, state, batch)
-        samples, metrics = samples_of(self, state, batch, now)
-        rate, count, limited = now.rate, samples.count, self._kl_limit is not None
-        names = REPORT if now.reference is None else (*REPORT, "reference_kl")
-        taken, sums = torch.zeros_like(rate), rate.new_zeros(len(names), len(rate))
+        terms = Terms.of(cfg, state, batch)
+        samples, metrics = samples_of(self, state, batch, terms)
+        rate = terms.rate
+        count = samples.count
+        limited = self._kl_limit is not None
+        names = REPORT if terms.reference is None else (*REPORT, "reference_kl")
+        steps = torch.zeros_like(rate)
+        sums = rate.new_zeros(len(names), len(rate))
         compiles = cfg.compile and not self.memory_size
         # A compiled step makes its leaves itself; others share these.
         leaves = None if compiles else self.layout.leaves(state.params)
         learn = self._compiled if compiles else self.learn
         active, all_learn = count > 0, not limited and samples.valid is None
         for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
-            found, learns = learn(state, leaves, minibatch, now, None if all_learn else active)
-            taken = taken + active
-            sums.addcmul_(torch.stack([found[k] for k in names]), active.float())
+            report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
+            steps = steps + active
+            sums.addcmul_(torch.stack([report[k] for k in names]), active.float())
             active = active if learns is None else learns
             if limited and all_false(active):
                 break
-        metrics |= dict(zip(names, sums / taken.clamp_min(1.0), strict=True))
+        metrics |= dict(zip(names, sums / steps.clamp_min(1.0), strict=True))
         if cfg.learning_rate_schedule == "kl":
             target = torch.full_like(rate, cfg.target_kl or 0.0)
             state.learning_rate = kl_adapted_rate(rate, metrics["kl"], target, *_LR_RANGE)
@@ -176,7 +187,7 @@ class PPOAlgorithm(Algorithm):
 
     @property
     def _kl_limit(self) -> float | None:
-        """The KL beyond which a member learns no more from this rollout; None: there is none."""
+        """Return the KL beyond which a member stops learning from this rollout; None: no limit."""
         cfg = self.config
         if cfg.target_kl is None or cfg.learning_rate_schedule == "kl":
             return None
@@ -184,7 +195,7 @@ class PPOAlgorithm(Algorithm):
 
     @functools.cached_property
     def _compiled(self) -> Compiled:
-        # Skills that learn together have as many rows as they acted in: each time others.
+        # Where skills learn together, their rows are the steps in which they acted: n varies.
         return Compiled(self.learn, self.config, sizes_vary=True)
 
     def learn(
@@ -192,59 +203,66 @@ class PPOAlgorithm(Algorithm):
         state: State,
         leaves: Views | None,
         batch: Samples,
-        now: Terms,
+        terms: Terms,
         active: Tensor | None,
     ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """One gradient step, in place: nothing but tensor operations, so that it can be compiled.
+        """Take one gradient step in place, with tensor operations only, so it can be compiled.
 
         Args:
-            leaves: of ``state.params``; None: they are made here.
+            leaves: of ``state.params``; None: create them here.
             active: (P,) bool, members that learn; None: all, always.
 
         Returns:
-            Metrics (P,), and who has learnt: a member stops before a step that oversteps the KL.
+            Metrics (P,), and the members that learnt, (P,) bool: a member stops before a step that
+            exceeds the limit of the KL.
         """
         leaves = self.layout.leaves(state.params) if leaves is None else leaves
-        loss, report = self.loss(leaves, state, batch, now)
+        loss, report = self.loss(leaves, state, batch, terms)
         grad = self.layout.gradient(loss, leaves)
         report["grad_norm"] = clip_grad_norm_(grad, state.max_grad_norm)
         if active is not None and self._kl_limit is not None:
             active = active & (report["kl"] <= self._kl_limit)
         adam_(
-            state.params, grad, state.mu, state.nu, state.count, now.rate,
-            eps=self.config.adam_eps, active=active,
-        )  # fmt: skip
+            state.params,
+            grad,
+            state.mu,
+            state.nu,
+            state.count,
+            terms.rate,
+            eps=self.config.adam_eps,
+            active=active,
+        )
         return report, active
 
     def loss(
-        self, views: Views, state: State, batch: Samples, now: Terms
+        self, views: Views, state: State, batch: Samples, terms: Terms
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Policy, value and entropy loss of one minibatch, (P,), and detached metrics (P,)."""
-        head, _ = self.run(self.actor_net, views, batch.inputs, batch.memory, batch.starts)
+        """Compute the loss of a minibatch (policy, value, entropy) and detached metrics, (P,)."""
+        dist_params, _ = self.run(self.actor_net, views, batch.inputs, batch.memory, batch.starts)
         raw, _ = self.run(self.critic_net, views, batch.inputs, batch.memory, batch.starts)
         if batch.memory is not None:
             batch = batch.changed(lambda x: x.flatten(1, 2))
         log_std, valid, acted = views.get("actor.log_std"), batch.valid, batch.own
-        log_prob, entropy = self.head.stats(head, log_std, batch.mask, batch.action)
+        log_prob, entropy = self.head.stats(dist_params, log_std, batch.mask, batch.action)
         old, weight = batch.log_prob, batch.importance
         policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, acted)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
         value = value_loss(raw.squeeze(-1), batch.target, batch.old_value, bound, valid)
         mean_entropy = bonus = masked_mean(entropy, acted)
-        if (surplus := self.head.surplus(head, log_std)) is not None:
+        if (surplus := self.head.surplus(dist_params, log_std)) is not None:
             bonus = mean_entropy - masked_mean(surplus, acted)
-        total = policy + state.vf_coef * value - now.ent_coef * bonus
+        total = policy + state.vf_coef * value - terms.ent_coef * bonus
         with torch.no_grad():
             kl = approximate_kl(log_prob, old, weight, acted)
         report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy, "kl": kl}
-        if now.reference is not None:
-            near = now.reference.params
-            other = None if near is None else near.views.get("actor.log_std")
+        if terms.reference is not None:
+            params = terms.reference.params
+            other = None if params is None else params.views.get("actor.log_std")
             assert batch.reference is not None
-            away = self.head.kl(head, log_std, batch.reference, other, batch.mask)
-            report["reference_kl"] = masked_mean(away, acted)
-            total = total + now.reference.coef * report["reference_kl"]
+            divergence = self.head.kl(dist_params, log_std, batch.reference, other, batch.mask)
+            report["reference_kl"] = masked_mean(divergence, acted)
+            total = total + terms.reference.coef * report["reference_kl"]
         return total, {k: v.detach() for k, v in report.items()}
 
     def run(
@@ -255,14 +273,162 @@ class PPOAlgorithm(Algorithm):
         memory: Tensor | None,
         starts: Tensor | None,
     ) -> tuple[Tensor, Tensor | None]:
-        """A network's outputs (P, N, out) and memories (P, N, M); sequences are laid end to end."""
+        """Return a network's outputs (P, N, out) and recurrent states (P, N, M).
+
+        Sequences (T, B) are flattened to N = T·B.
+        """
         if memory is None or starts is None:
             return net(views, inputs), None
-        own, other = memory.tensor_split([self.actor_net.memory_size], dim=-1)
-        memory = own if net is self.actor_net else other
+        actor, critic = memory.tensor_split([self.actor_net.memory_size], dim=-1)
+        memory = actor if net is self.actor_net else critic
         out, after = net.sequence(views, inputs, memory, starts)
         return out.flatten(1, 2), after.flatten(1, 2)
 
     def in_rewards(self, state: State, raw: Tensor) -> Tensor:
-        """The critic's outputs (P, N, 1) in units of reward, (P, N)."""
+        """Convert the critic's outputs (P, N, 1) to units of reward, (P, N)."""
         return raw.squeeze(-1) * state.return_scale + state.return_mean
+
+
+@dataclass
+class Terms:
+    """The loss terms of one update that schedules and the stage determine."""
+
+    rate: Tensor  # (P,), Adam's step size
+    ent_coef: Tensor  # (P,)
+    reference: Reference | None
+
+    @classmethod
+    def of(cls, config: PPO, state: Any, rollout: Rollout) -> Terms:
+        """Return the terms of an update from this rollout."""
+        progress = rollout.progress
+        rate = rate_now(config, state.learning_rate, progress)
+        ent_coef, final = state.ent_coef, config.ent_coef_final
+        if final is not None:
+            ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
+        return cls(rate, ent_coef, rollout.reference)
+
+
+@torch.no_grad()
+def samples_of(
+    agent: PPOAlgorithm, state: State, rollout: Rollout, terms: Terms
+) -> tuple[Samples, dict[str, Tensor]]:
+    """Return the samples of a rollout that ``loss`` needs, and metrics (P,)."""
+    cfg, memory, starts = agent.config, rollout.recurrent_state, rollout.episode_start
+    if not agent.memory_size:
+        memory = starts = None
+    cells = Cells(rollout, all_cells=memory is not None)
+    obs, valid = cells.flat(rollout.obs), cells.flat_or_none(rollout.valid)
+    agent.update_obs_stats(state, obs, valid)
+    params = agent.learning_params(state)
+    inputs = agent.inputs(params, obs)
+    if memory is not None:
+        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+    raw, after = agent.run(agent.critic_net, params.views, inputs, memory, starts)
+    value = agent.in_rewards(state, raw)
+    following = next_values(agent, state, params, rollout, cells.grid(value), after)
+    reward, discount, last = rollout.reward, rollout.discount, rollout.last
+    grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
+    advantage = cells.flat(grid)
+    returns = advantage + value
+    metrics = {"explained_variance": explained_variance(value, returns, valid)}
+    if cfg.normalize_returns:
+        agent.update_return_stats(state, returns, valid)
+    mean, scale = state.return_mean, state.return_scale
+    action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.mask)
+    # Clipping and KL refer to the current policy, even if an older one, or one with epsilon, acted.
+    # With a high epsilon, a ratio of mixtures would let the policy collapse within the clip,
+    # because the policy can change only a share of 1 − epsilon of the mixture.
+    dist_params, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
+    log_prob, _ = agent.head.stats(dist_params, params.views.get("actor.log_std"), mask, action)
+    own = _own(cells.flat_or_none(rollout.overridden), valid)
+    samples = Samples(
+        inputs={} if memory is not None else inputs,
+        action=action,
+        log_prob=log_prob,
+        importance=likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action)),
+        advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
+        reference=_reference(agent, terms, rollout, cells),
+        target=(returns - mean) / scale,
+        old_value=None if cfg.clip_value is None else (value - mean) / scale,
+        mask=mask,
+        valid=valid,
+        own=own,
+        most=cells.most,
+    )
+    if memory is not None:
+        samples = samples.changed(cells.unflat)
+        samples.inputs, samples.memory, samples.starts = inputs, memory, starts
+    return samples, metrics
+
+
+def _own(overridden: Tensor | None, valid: Tensor | None) -> Tensor | None:
+    """Return the samples whose action is the policy's own, not a reflex's, (P, N) bool."""
+    if overridden is None:
+        return valid
+    return ~overridden if valid is None else valid & ~overridden
+
+
+def _reference(agent: PPOAlgorithm, terms: Terms, rollout: Rollout, cells: Cells) -> Tensor | None:
+    """Return dist_params (P, N, H) of the reference policy.
+
+    A recurrent reference runs along each trajectory. Its recurrent state before the rollout's first
+    row is unknown; the learner's, which is similar, takes its place.
+    """
+    if terms.reference is None:
+        return None
+    if terms.reference.params is None:
+        return cells.flat_or_none(rollout.guide)
+    params, recurrent = terms.reference.params, bool(agent.memory_size)
+    inputs = agent.inputs(params, cells.flat(rollout.obs))
+    if recurrent:
+        inputs = {k: cells.unflat(v) for k, v in inputs.items()}
+    memory, starts = (rollout.recurrent_state, rollout.episode_start) if recurrent else (None, None)
+    return agent.run(agent.actor_net, params.views, inputs, memory, starts)[0]
+
+
+def _advantage(
+    agent: PPOAlgorithm, own: Tensor, other: Tensor | None, counts: Tensor | None
+) -> Tensor:
+    """Return the normalised advantage plus the stage's, in the same units, (P, N)."""
+    if agent.config.normalize_advantage:
+        own = normalise(own, counts, min_std=agent.config.min_advantage_std)
+    return own if other is None else own + other
+
+
+def _acted(
+    agent: PPOAlgorithm, rollout: Rollout, cells: Cells, mask: Tensor | None, action: Tensor
+) -> Tensor:
+    """Return log-probabilities (P, N) of the actions under the policy that acted."""
+    assert rollout.dist_params is not None
+    log_std = rollout.log_std
+    if log_std is not None:
+        single = log_std.shape[2] == 1
+        log_std = (
+            log_std[:, 0] if single else cells.flat(log_std.expand(-1, cells.shape[0], -1, -1))
+        )
+    return agent.head.stats(cells.flat(rollout.dist_params), log_std, mask, action)[0]
+
+
+def next_values(
+    agent: PPOAlgorithm,
+    state: State,
+    params: ActingParams,
+    rollout: Rollout,
+    value: Tensor,
+    after: Tensor | None,
+) -> Tensor:
+    """Return V(next_obs), (P, T, B): the next row's V(obs), (P, T, B), except at ends.
+
+    Args:
+        after: (P, T·B, M), the critic's recurrent state after each row, if it has one.
+    """
+
+    def at_ends(rows: Tensor) -> Tensor:
+        inputs = agent.inputs(params, take_rows(rollout.next_obs.flatten(1, 2), rows))
+        if after is None:
+            raw = agent.critic_net(params.views, inputs)
+        else:
+            raw, _ = agent.critic_net.step(params.views, inputs, take_rows(after, rows))
+        return agent.in_rewards(state, raw)
+
+    return values_after(value, rollout.last, at_ends)

@@ -1,4 +1,4 @@
-"""Which algorithms there are: those of this library, and those that users register."""
+"""The registry of algorithms: those of this library, and those that users register."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ _SETTINGS: dict[str, type[Any]] = {"rollout": OnPolicy, "replay": OffPolicy}
 
 @checked_names
 def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) -> None:
-    """Make an algorithm known, under the name of its settings.
+    """Register an algorithm under the name of its settings.
 
     It can then train plain agents, skills, selectors and populations, and its settings are written
     to and read from files. Every process that uses it must register it, so call this in the file
     that defines it. The same name may be registered again: the latest counts.
 
     Args:
-        config_type: a frozen dataclass on ``OnPolicy`` or ``OffPolicy``, as ``store`` asks for.
+        config_type: a frozen dataclass on ``OnPolicy`` (``store = "rollout"``) or ``OffPolicy``
+            (``store = "replay"``).
         algorithm_type: a subclass of ``Algorithm`` that is made with
             ``(config, observation_space, action_space)``.
 
     Raises:
-        DeclarationError: a method or a class attribute is missing, it is named; or the name is one
-            of this library's own.
+        DeclarationError: a method or a class attribute is missing; the message names it. Or the
+            name belongs to this library.
     """
     name = config_type.__name__
     where = f"register_algorithm({name}, {algorithm_type.__name__})"
@@ -69,11 +70,11 @@ def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) 
 
 
 def make_algorithm(config: AlgorithmConfig, observation_space: Any, action_space: Any) -> Algorithm:
-    """The algorithm that these settings belong to, on one pair of spaces.
+    """Create the algorithm of these settings on one pair of spaces.
 
     Raises:
-        DeclarationError: nobody registered it, or it cannot act in these spaces; the message names
-            those that can.
+        DeclarationError: the algorithm is not registered, or cannot act in these spaces; the
+            message names algorithms that can.
     """
     kind = registration_of(config).algorithm
     if isinstance(kind, str):

@@ -1,7 +1,7 @@
 """Soft actor-critic (Haarnoja et al. 2018b) for P members at once.
 
-For continuous actions, and for discrete ones (Christodoulou 2019). Read down the page: State, init,
-act, value, and how it learns; the critics' step is ``actor_critic.learn``. The settings are
+For continuous actions, and for discrete ones (Christodoulou 2019). In the order of reading: State,
+init, act, value, learning; the critics' step is ``actor_critic.learn``. The settings are
 ``config.SAC``.
 """
 
@@ -21,10 +21,9 @@ from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.distributions import (
     mask_logits,
@@ -41,7 +40,7 @@ from skillweave.settings import check
 
 @dataclass
 class State(ActorCriticState):
-    """Everything SAC learns and counts."""
+    """Learnt numbers and counts of SAC."""
 
     log_alpha: Tensor  # (P, 1), log of the temperature
     alpha_mu: Tensor  # (P, 1)
@@ -52,7 +51,7 @@ class State(ActorCriticState):
 
 
 class SACAlgorithm(ActorCriticAlgorithm):
-    """SAC on one pair of spaces. Holds no learnt state: that is in ``State``."""
+    """SAC on one pair of spaces; all that is learnt is in ``State``."""
 
     state_type = State
     member_hyperparameters = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
@@ -69,9 +68,9 @@ class SACAlgorithm(ActorCriticAlgorithm):
         size, discrete = self.codec.size, self.codec.discrete
         critic = config.critic or config.network
         self.critics = Critics(self.obs, critic, size if discrete else 1, 0 if discrete else size)
-        usual = 0.5 * math.log(size) if discrete else -float(size)
-        self.target_entropy = usual if config.target_entropy is None else config.target_entropy
-        highest = math.log(size) if discrete else size * math.log(2.0)  # of even chances
+        default = 0.5 * math.log(size) if discrete else -float(size)
+        self.target_entropy = default if config.target_entropy is None else config.target_entropy
+        highest = math.log(size) if discrete else size * math.log(2.0)  # uniformly random
         check(
             config,
             "target_entropy",
@@ -80,7 +79,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
         )
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """A state of fresh members, one for each seed."""
+        """Create the state of fresh members, one for each seed."""
         members = len(seeds)
         return State(
             **self.fresh_networks(seeds),
@@ -99,21 +98,21 @@ class SACAlgorithm(ActorCriticAlgorithm):
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """Discrete actions (P, B), or continuous ones (P, B, A) in [−1, 1]; `Algorithm.act`."""
-        head = self.net(params.views, self.inputs(params, obs))
+        """Return discrete actions (P, B) or continuous ones (P, B, A) in [−1, 1]; see the base."""
+        dist_params = self.net(params.views, self.inputs(params, obs))
         if self.codec.discrete:
-            head = mask_logits(head, mask)
-            return self.head.act(head, None, noise), head, None
-        return self.head.act(head, None, noise).tanh(), head, None
+            dist_params = mask_logits(dist_params, mask)
+            return self.head.act(dist_params, None, noise), dist_params, None
+        return self.head.act(dist_params, None, noise).tanh(), dist_params, None
 
     def alpha(self, state: State) -> Tensor:
-        """The temperature, (P, 1)."""
+        """Return the temperature, (P, 1)."""
         return state.log_alpha.exp() if self.config.learn_ent_coef else state.ent_coef[:, None]
 
     def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """The soft value ``E[min Q − α·log π]`` in units of reward, (P, B).
+        """Return the soft value ``E[min Q − α·log π]`` in units of reward, (P, B).
 
-        Of continuous actions it is that of the greedy action, with ``squashed_entropy``.
+        For continuous actions, Q of the greedy action plus ``squashed_entropy``.
         """
         params = self.learning_params(state)
         inputs, alpha = self.inputs(params, obs), self.alpha(state)
@@ -128,7 +127,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
         return self.in_rewards(state, q + alpha * squashed_entropy(mean, log_std))
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
-        """Of the next actions, of those between, and of the actor's; (P, B or B·(n − 1), A)."""
+        """Draw noise of the next, the between and the actor's actions: (P, B or B·(n − 1), A)."""
         if self.codec.discrete:
             return []
         between = [batch * (self.config.n_step - 1)] * (self.config.n_step > 1)
@@ -138,7 +137,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
     def learn(
         self, state: State, sample: Sample, rate: Tensor, noise: list[Tensor], due: bool
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """One gradient step of critics, actor and temperature, in place."""
+        """Take one gradient step of critics, actor and temperature, in place."""
         alpha = self.alpha(state).squeeze(1)
         metrics, error = super().learn(state, sample, rate, noise, due)
         return metrics | {"entropy": state.entropy, "ent_coef": alpha}, error
@@ -146,7 +145,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
     def critic_target(
         self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
-        """``r + discount·V̄(s′)`` with the soft value V̄ of the slow critics (eq. 5), (P, B)."""
+        """Return ``r + discount·V̄(s′)``, V̄ the soft value of the slow critics (eq. 5), (P, B)."""
         inputs, alpha = self.inputs(params, sample.next_obs), self.alpha(state)
         head, slow = self.net(self.layout.views(state.params), inputs), state.critic_target
         if self.codec.discrete:
@@ -163,11 +162,11 @@ class SACAlgorithm(ActorCriticAlgorithm):
     def entropy_between(
         self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
-        """What the policy's entropy at the steps between adds to n steps' reward, (P, B).
+        """Return the part of the n steps' reward from the entropy at the steps between, (P, B).
 
-        The soft value of the first step holds ``γᵏ·α·H(π(·|sₖ))`` for each k from 1 to n − 1
-        (Haarnoja et al. 2018a, eq. 3). Of continuous actions H is estimated by an action drawn
-        now: of the one that was taken, by an older policy, −log π may be any number.
+        The soft value of the first step includes ``γᵏ·α·H(π(·|sₖ))`` for each k from 1 to n − 1
+        (Haarnoja et al. 2018a, eq. 3). For continuous actions H is estimated with an action drawn
+        now: the recorded action is of an older policy, so its −log π may be any number.
         """
         assert sample.between_obs is not None
         assert sample.between_discount is not None
@@ -185,7 +184,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
     def improve_policy(
         self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
     ) -> None:
-        """One gradient step of the actor, and of the temperature if it is learnt, in place."""
+        """Take one gradient step of the actor and of a learnt temperature, in place."""
         leaves, mask = self.layout.leaves(state.params), sample.mask
         loss, entropy = self.policy_loss(leaves, state, mask, inputs, noise[-1:])
         self.step_(state, loss, leaves, rate)
@@ -199,7 +198,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
     def policy_loss(
         self, views: Views, state: State, mask: Tensor | None, inputs: Inputs, noise: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """``E[α·log π − min Q]`` (eq. 7) and the policy's entropy, detached; each (P,)."""
+        """Return ``E[α·log π − min Q]`` (eq. 7) and the detached policy entropy, each (P,)."""
         head, alpha = self.net(views, inputs), self.alpha(state)
         if self.codec.discrete:
             log_p = masked_log_probs(head, mask)

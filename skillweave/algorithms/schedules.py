@@ -84,7 +84,7 @@ def scheduled(config: Any, remaining: float) -> float:
         remaining: the share of the budget that remains, as in Stable-Baselines3.
 
     Raises:
-        DeclarationError: its function is not known here, or raised, or returned no finite number
+        DeclarationError: its function is not loaded, or raised, or did not return a finite number
             of at least 0.
     """
     schedule, where = config.learning_rate, f"{type(config).__name__}.learning_rate"

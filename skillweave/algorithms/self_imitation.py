@@ -1,7 +1,7 @@
 """PPO with self-imitation (Oh, Guo, Singh & Lee 2018) for P members at once.
 
-An update is PPO's own; then come steps on good rows of before, which are part of the state. What
-counts is by how much a row's return exceeds the value, (R − V)₊ of eqs. 2 and 3 there.
+An update is PPO's, followed by gradient steps on good earlier rows, which are part of the state.
+Rows are weighted by the part of the return that exceeds the value, (R − V)₊ of eqs. 2 and 3 there.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import SelfImitationPPO
-from skillweave.algorithms.ppo import PPOAlgorithm
+from skillweave.algorithms.ppo import PPOAlgorithm, Terms
 from skillweave.algorithms.ppo import State as PPOState
-from skillweave.algorithms.ppo_samples import Terms
 from skillweave.algorithms.rollouts import Cells, first_true
 from skillweave.errors import RunError
 from skillweave.experience import Report, Rollout
@@ -32,7 +31,7 @@ from skillweave.spaces import obs_dtype, obs_shape, to_tensor
 
 @dataclass
 class State(PPOState):
-    """PPO's, and K rows that are kept."""
+    """PPO's state, and K kept rows."""
 
     kept: Tensor  # (P, K) bool, the others are empty; the latest come first
     kept_obs: Tensor  # (P, K, *obs_shape)
@@ -42,13 +41,13 @@ class State(PPOState):
 
     @property
     def rows(self) -> Rows:
-        """What is kept."""
+        """Return the kept rows."""
         return Rows(self.kept_obs, self.kept_action, self.kept_mask, self.kept_return)
 
 
 @dataclass(slots=True)
 class Rows:
-    """What rows of P members did; fields as in ``State``."""
+    """Rows of P members; fields as in ``State``."""
 
     obs: Tensor
     action: Tensor
@@ -56,19 +55,19 @@ class Rows:
     returns: Tensor
 
     def take(self, rows: Tensor) -> Rows:
-        """Those of ``rows`` (P, B)."""
-        parts = (self.obs, self.action, self.mask, self.returns)
-        return Rows(*(take_rows(x, rows) for x in parts))
+        """Select the rows with indices (P, B)."""
+        columns = (self.obs, self.action, self.mask, self.returns)
+        return Rows(*(take_rows(x, rows) for x in columns))
 
 
 class SelfImitationAlgorithm(PPOAlgorithm):
-    """PPO that learns again from good rows of before; see the module."""
+    """PPO that learns again from good earlier rows; see the module."""
 
     state_type: ClassVar[type[State]] = State
     config: SelfImitationPPO
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """A state of fresh members, which have no row yet."""
+        """Create the state of fresh members, which have no kept row yet."""
         lead, width = (len(seeds), self.config.imitation_rows), self.codec.size
         action = self.codec.from_env(np.asarray(self.action_space.sample())[None])
         space: gym.Space[Any] = self.observation_space
@@ -83,24 +82,24 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         )
 
     def check_state(self, state: Any) -> None:
-        """Raise a RunError where a row that is kept is none of these spaces."""
+        """Raise a RunError where a kept row is not of these spaces."""
         try:
             self.obs.check(state.kept_obs)
             self.codec.check(state.kept_action)
         except ValueError as error:
             raise RunError(
-                f"what SelfImitationPPO has kept to learn from again is damaged: {error}. The file "
-                "that it was read from was altered"
+                f"the rows that SelfImitationPPO has kept are damaged: {error}. The file that they "
+                "were read from was altered"
             ) from error
 
     def update(
         self, state: Any, batch: Rollout, rng: Sequence[torch.Generator]
     ) -> tuple[Any, Report]:
-        """PPO's update, then steps on what is kept, good rows of this rollout included."""
+        """Update as PPO does, then learn from kept rows, good rows of this rollout included."""
         self.keep(state, batch)
         state, report = super().update(state, batch, rng)
-        now = Terms.of(self.config, state, batch)
-        report.metrics |= self.imitate(state, now.rate, rng)
+        terms = Terms.of(self.config, state, batch)
+        report.metrics |= self.imitate(state, terms.rate, rng)
         return state, report
 
     @torch.no_grad()
@@ -125,7 +124,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
     def imitate(
         self, state: State, rate: Tensor, rng: Sequence[torch.Generator]
     ) -> dict[str, Tensor]:
-        """Gradient steps on kept rows, in place, and metrics (P,).
+        """Take gradient steps on kept rows, in place; return metrics (P,).
 
         Rows are drawn in proportion to their gain, (R − V)₊.
 
@@ -138,34 +137,41 @@ class SelfImitationAlgorithm(PPOAlgorithm):
             gain = (rows.returns - self.value(state, rows.obs)).clamp_min(0.0) * state.kept
         total = gain.cumsum(1)
         count = state.kept.sum(1)
-        # At most one pass over what is kept: many over a few rows would learn these by heart.
+        # At most one pass over the kept rows: many passes over few rows would overfit them.
         due = (-(-count // cfg.batch_size)).clamp_max(cfg.imitation_steps) * (total[:, -1] > 0.0)
         for step in range(cfg.imitation_steps):
             if all_false(active := step < due):
                 break
             drawn = torch.stack([torch.rand(cfg.batch_size, generator=g, **FLOAT) for g in rng])
             place = torch.searchsorted(total, drawn.to(total.device) * total[:, -1:], right=True)
-            # Rounding may lead beyond the last row; of a member without rows it does.
+            # Rounding may lead beyond the last row; in a member without rows it always does.
             batch = rows.take(place.clamp_max(total.shape[1] - 1))
             grad = self.layout.gradient(self.imitation_loss(leaves, state, batch), leaves)
             clip_grad_norm_(grad, state.max_grad_norm)
             adam_(
-                state.params, grad, state.mu, state.nu, state.count, rate,
-                eps=cfg.adam_eps, active=active,
-            )  # fmt: skip
+                state.params,
+                grad,
+                state.mu,
+                state.nu,
+                state.count,
+                rate,
+                eps=cfg.adam_eps,
+                active=active,
+            )
         mean = total[:, -1] / count.clamp_min(1)
         return {"imitation_rows": count.to(gain.dtype), "imitation_gain": mean}
 
     def imitation_loss(self, views: Views, state: State, batch: Rows) -> Tensor:
-        """``E[−log π(a|s)·min(g, 1)]`` and ``½E[g²]``, weighted; g = (R − V)₊; (P,).
+        """Return ``E[−log π(a|s)·min(g, 1)]`` and ``½E[g²]``, weighted; g = (R − V)₊; (P,).
 
         Oh et al. 2018, eqs. 2 and 3; g is in deviations of returns, and at most 1 in the policy's
         loss, as in the authors' code.
         """
         inputs = self.inputs(self.learning_params(state), batch.obs)
-        head, raw = self.actor_net(views, inputs), self.critic_net(views, inputs)
+        dist_params = self.actor_net(views, inputs)
+        raw = self.critic_net(views, inputs)
         log_std = views.get("actor.log_std")
-        log_prob, _ = self.head.stats(head, log_std, batch.mask, batch.action)
+        log_prob, _ = self.head.stats(dist_params, log_std, batch.mask, batch.action)
         target = (batch.returns - state.return_mean) / state.return_scale
         gain = (target - raw.squeeze(-1)).clamp_min(0.0)
         policy = -(log_prob * gain.detach().clamp_max(1.0)).mean(1)
@@ -174,7 +180,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
 
 
 def joined(first: Rows, second: Rows) -> Rows:
-    """The rows of both, one after the other."""
+    """Concatenate the rows of both."""
     return Rows(
         obs=torch.cat([first.obs, second.obs], dim=1),
         action=torch.cat([first.action, second.action], dim=1),
@@ -184,15 +190,16 @@ def joined(first: Rows, second: Rows) -> Rows:
 
 
 def returns_of(rollout: Rollout) -> tuple[Tensor, Tensor]:
-    """What followed each row was paid, (P, T, B), and where that is known, (P, T, B) bool.
+    """Compute each row's return, (P, T, B), and where it is known, (P, T, B) bool.
 
-    It is where the trajectory terminates within the rollout. Elsewhere it would take the critic's
-    word for the rest, and imitate its errors.
+    It is known where the trajectory terminates within the rollout. Elsewhere the rest would be the
+    critic's estimate, and imitation would repeat its errors.
     """
-    last, none = rollout.last, torch.zeros_like(rollout.reward)
-    one = none.new_ones(len(none))
-    ends = (last & (rollout.discount == 0.0)).to(none.dtype)
-    known = gae(ends, (~last).to(none.dtype), none, none, last, one) > 0.0
+    last = rollout.last
+    zeros = torch.zeros_like(rollout.reward)
+    ones = zeros.new_ones(len(zeros))
+    ends = (last & (rollout.discount == 0.0)).to(zeros.dtype)
+    known = gae(ends, (~last).to(zeros.dtype), zeros, zeros, last, ones) > 0.0
     if rollout.valid is not None:
         known &= rollout.valid
-    return gae(rollout.reward, rollout.discount, none, none, last, one), known
+    return gae(rollout.reward, rollout.discount, zeros, zeros, last, ones), known

@@ -1,11 +1,11 @@
-"""What each skill's call is worth to the task: Q(s, skill), learnt from every step.
+"""The critic of skills: Q(s, skill) of the task's return, learnt from every step.
 
-One critic serves the skills, which may count the task's advantage beside their own (Zhang &
-Whiteson 2019, "DAC"), and interruption. A call is cut where its skill is worth less than V(s) =
-Σ π(k | s) Q(s, k), which is what it is worth to decide anew (Sutton, Precup & Singh 1999, sec. 4).
-π is what the selector does while it learns, so V is learnt from its decisions. The best Q in place
-of V would be too much: the selector does not always call that skill, and the best of several
-estimates is mostly one that is too high.
+The skills, which may add the task's advantage to their own (Zhang & Whiteson 2019, "DAC"), and
+interruption use one critic. A call is interrupted where Q of its skill is less than V(s) =
+Σ π(k | s) Q(s, k), the value of deciding again (Sutton, Precup & Singh 1999, sec. 4). π is the
+selector's policy while it learns, so V is learnt from its decisions. The best Q in place of V would
+be too high: the selector does not always call that skill, and the maximum of several estimates is
+biased upwards.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from torch import Tensor
 
 from skillweave.algorithms.base import ActingParams, AgentState, Algorithm, Device
 from skillweave.algorithms.config import SkillCritic
-from skillweave.algorithms.parameters import ParameterGroup, rate_now
-from skillweave.algorithms.ppo_samples import epsilon_now
+from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
 from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
@@ -34,9 +33,9 @@ from skillweave.seeding import Seeds
 
 
 class SkillCriticAlgorithm(Algorithm):
-    """Learns the return of the task, while a skill is called and then whoever follows.
+    """The algorithm that learns the task's return from a state and the skill that acts there.
 
-    Rows are steps of all skills, in the order of time; an action is the skill that acted.
+    Rows are steps of all skills, in the order of time; a row's action is the skill that acted.
     """
 
     store = "rollout"
@@ -51,18 +50,18 @@ class SkillCriticAlgorithm(Algorithm):
     ) -> None:
         super().__init__(config, observation_space, action_space)
         self.skills = int(action_space.n)
-        outputs = self.skills + config.deciding  # the last one: deciding anew
+        outputs = self.skills + config.deciding  # the last one: the value of deciding again
         self.net = Net("critic", self.obs, config.network, outputs)
         self.acting = self.layout = Layout(self.net.shapes)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
-        """A state of fresh members, to which all skills are worth the same."""
+        """Create the state of fresh members, in which all skills have the same value."""
         params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
         self.net.init_(self.layout.views(params), 0.0, self.member_generators(seeds))
         return AgentState(**self.fresh_fields(params))
 
     def parameter_groups(self) -> list[ParameterGroup]:
-        """Everything in the state that has the shape of the network."""
+        """Return the groups of state fields that have the shape of the network."""
         return [ParameterGroup(self.layout, (("network", self.net),))]
 
     def act(
@@ -73,38 +72,38 @@ class SkillCriticAlgorithm(Algorithm):
         noise: Any,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, None]:
-        """The skill that is worth most, and what each is worth in deviations of the return; last
-        what it is worth to decide anew, with ``deciding``.
+        """Return the skill of highest value, and all values in deviations of the return.
 
-        Where the selector still draws calls to try them, worths differ less: few calls are cut.
+        With ``deciding``, the last value is that of deciding again. While the selector still draws
+        skills at random, values are scaled down, so few calls are interrupted.
         """
-        worth = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
-        return worth[..., : self.skills].argmax(-1), worth, None
+        q = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
+        return q[..., : self.skills].argmax(-1), q, None
 
     def acting_params(
         self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs; ``trust`` multiplies worths while skills learn."""
-        found = super().acting_params(state, progress, device)
+        """Copy the part that acting needs; ``trust`` multiplies values while skills learn."""
+        params = super().acting_params(state, progress, device)
         epsilon = epsilon_now(self.config, progress, state.learning_rate)
-        if epsilon is not None and progress < 1.0:  # at the end calls are cut as they will be
-            found.extra["trust"] = 1.0 - epsilon.to(device)
-        return found
+        if epsilon is not None and progress < 1.0:  # at the end, values count in full
+            params.extra["trust"] = 1.0 - epsilon.to(device)
+        return params
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Any:
-        """None: there is no chance in what it says."""
+        """Return None for each step: the critic is deterministic."""
         return [None] * steps
 
     def value(self, state: AgentState, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """What the best skill is worth, (P, B), in units of reward."""
+        """Return the value of the best skill, (P, B), in units of reward."""
         params = self.learning_params(state)
-        worth = self.net(params.views, self.inputs(params, obs))[..., : self.skills].amax(-1)
-        return worth * state.return_scale + state.return_mean
+        q = self.net(params.views, self.inputs(params, obs))[..., : self.skills].amax(-1)
+        return q * state.return_scale + state.return_mean
 
     def advantage(self, state: AgentState, rollout: Rollout) -> Tensor:
-        """GAE(λ) of the task's reward, (P, T, B), in deviations of the return."""
-        found, _ = self._judged(state, rollout)
-        return found / state.return_scale[..., None]
+        """Compute GAE(λ) of the task's reward, (P, T, B), in deviations of the return."""
+        advantage, _ = self._advantage_and_q(state, rollout)
+        return advantage / state.return_scale[..., None]
 
     def update(
         self, state: AgentState, batch: Rollout, rng: Sequence[torch.Generator]
@@ -113,7 +112,7 @@ class SkillCriticAlgorithm(Algorithm):
         cfg = self.config
         obs = _valid(batch, batch.obs)
         self.update_obs_stats(state, obs)
-        advantage, value = (_valid(batch, x) for x in self._judged(state, batch))
+        advantage, value = (_valid(batch, x) for x in self._advantage_and_q(state, batch))
         returns = advantage + value
         self.update_return_stats(state, returns)
         target = (returns - state.return_mean) / state.return_scale
@@ -132,14 +131,14 @@ class SkillCriticAlgorithm(Algorithm):
                 target.device
             )
             for rows in order.chunk(parts, dim=1):
-                own = {k: take_rows(v, rows) for k, v in inputs.items()}
-                worth, goal = self.net(leaves, own), take_rows(target, rows)
-                chosen = worth.gather(2, take_rows(action, rows)[..., None])
+                q = self.net(leaves, {k: take_rows(v, rows) for k, v in inputs.items()})
+                goal = take_rows(target, rows)
+                chosen = q.gather(2, take_rows(action, rows)[..., None])
                 loss = value_loss(chosen.squeeze(-1), goal)
-                if call_start is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt where one decided
-                    # A row counts as much as one of Q, however few decisions there are.
-                    anew = torch.where(take_rows(call_start, rows), worth[..., -1], goal)
-                    loss = loss + value_loss(anew, goal)
+                if call_start is not None:  # V(s) = Σ π(k | s) Q(s, k), learnt at decisions
+                    # A row weighs as much as one of Q, however few decisions the batch has.
+                    decided = torch.where(take_rows(call_start, rows), q[..., -1], goal)
+                    loss = loss + value_loss(decided, goal)
                 grad = self.layout.gradient(loss, leaves)
                 clip_grad_norm_(grad, torch.full_like(rate, cfg.max_grad_norm))
                 adam_(state.params, grad, state.mu, state.nu, state.count, rate, eps=cfg.adam_eps)
@@ -147,24 +146,24 @@ class SkillCriticAlgorithm(Algorithm):
         return state, Report({"value_loss": loss.detach(), "explained_variance": explained})
 
     @torch.no_grad()
-    def _judged(self, state: AgentState, rollout: Rollout) -> tuple[Tensor, Tensor]:
-        """Advantage and Q(s, the skill that acted), (P, T, B) each, in units of reward.
+    def _advantage_and_q(self, state: AgentState, rollout: Rollout) -> tuple[Tensor, Tensor]:
+        """Compute advantage and Q(s, the skill that acted), (P, T, B), in units of reward.
 
-        What follows a step is worth Q of whoever acts next; at ends, of who acted.
+        The value after a step is Q of the skill that acts next; at ends, of the one that acted.
         """
-        value = self._worth(state, rollout.obs, rollout.action).view_as(rollout.reward)
+        value = self._q(state, rollout.obs, rollout.action).view_as(rollout.reward)
 
         def at_ends(rows: Tensor) -> Tensor:
             obs, action = rollout.next_obs.flatten(1, 2), rollout.action.flatten(1)
-            return self._worth(state, take_rows(obs, rows)[:, None], take_rows(action, rows))
+            return self._q(state, take_rows(obs, rows)[:, None], take_rows(action, rows))
 
         following = values_after(value, rollout.last, at_ends)
         decay = torch.full_like(state.gamma, self.config.gae_lambda)
-        found = gae(rollout.reward, rollout.discount, value, following, rollout.last, decay)
-        return found, value
+        advantage = gae(rollout.reward, rollout.discount, value, following, rollout.last, decay)
+        return advantage, value
 
-    def _worth(self, state: AgentState, obs: Tensor, skill: Tensor) -> Tensor:
-        """Q(s, skill) in units of reward, (P, N), of (P, …) observations on two axes."""
+    def _q(self, state: AgentState, obs: Tensor, skill: Tensor) -> Tensor:
+        """Return Q(s, skill) in units of reward, (P, N), of observations (P, a, b, …), N = a·b."""
         params = self.learning_params(state)
         raw = self.net(params.views, self.inputs(params, obs.flatten(1, 2)))
         chosen = raw.gather(2, skill.flatten(1)[..., None]).squeeze(-1)
@@ -172,6 +171,6 @@ class SkillCriticAlgorithm(Algorithm):
 
 
 def _valid(batch: Rollout, rows: Tensor) -> Tensor:
-    """The valid ones of rows (P, T, B, …), as (P, K, …); of one member where some are not."""
+    """Select the valid rows of (P, T, B, …), as (P, K, …); P must be 1 if some are invalid."""
     flat = rows.flatten(1, 2)
     return flat if batch.valid is None else flat[:, batch.valid[0].flatten()]

@@ -1,6 +1,6 @@
 """TD3 (Fujimoto et al. 2018) for P members at once; DDPG is a preset of it.
 
-Read down the page: State, init, act, value, and how it learns; the critics' step is
+In the order of reading: State, init, act, value, learning; the critics' step is
 ``actor_critic.learn``. The settings are ``config.TD3``.
 """
 
@@ -19,10 +19,9 @@ from skillweave.algorithms.base import ActingParams, Device
 from skillweave.algorithms.config import TD3
 from skillweave.algorithms.off_policy import normal
 from skillweave.experience import Sample
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.heads import ActionHead
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, Views
+from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.distributions import smoothed_action
 from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
@@ -30,7 +29,7 @@ from skillweave.seeding import Seeds
 
 @dataclass
 class State(ActorCriticState):
-    """Everything TD3 learns and counts."""
+    """Learnt numbers and counts of TD3."""
 
     target: Tensor  # (P, D), the actor's slow copy
     exploration_noise: Tensor  # (P,), as all below a hyperparameter of each member
@@ -39,14 +38,19 @@ class State(ActorCriticState):
 
 
 class TD3Algorithm(ActorCriticAlgorithm):
-    """TD3 on one pair of spaces. Holds no learnt state: that is in ``State``."""
+    """TD3 on one pair of spaces; all that is learnt is in ``State``."""
 
     state_type = State
     actor_weights = ("params", "target")
     member_hyperparameters = (
-        "learning_rate", "gamma", "tau", "max_grad_norm", "exploration_noise", "target_noise",
+        "learning_rate",
+        "gamma",
+        "tau",
+        "max_grad_norm",
+        "exploration_noise",
+        "target_noise",
         "target_noise_clip",
-    )  # fmt: skip
+    )
 
     def __init__(
         self, config: TD3, observation_space: gym.Space[Any], action_space: gym.Space[Any]
@@ -60,14 +64,14 @@ class TD3Algorithm(ActorCriticAlgorithm):
         self.critics = Critics(self.obs, network, 1, self.codec.size, count)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
-        """A state of fresh members, one for each seed."""
+        """Create the state of fresh members, one for each seed."""
         fields = self.fresh_networks(seeds)
         return State(**fields, target=fields["params"].clone())
 
     def acting_params(
         self, state: State, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
-        """A copy of what acting needs, with the deviation of its noise."""
+        """Copy the part that acting needs, with the deviation of its noise."""
         params = super().acting_params(state, progress, device)
         params.extra["noise"] = state.exploration_noise[:, None, None].to(device, copy=True)
         return params
@@ -80,7 +84,7 @@ class TD3Algorithm(ActorCriticAlgorithm):
         noise: Tensor | None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, None, None]:
-        """Actions (P, B, A) in [−1, 1]; see ``Algorithm.act``."""
+        """Return actions (P, B, A) in [−1, 1]; see ``Algorithm.act``."""
         action = self.net(params.views, self.inputs(params, obs)).tanh()
         if noise is not None:
             scale = params.extra.get("noise", self.config.exploration_noise)
@@ -88,20 +92,20 @@ class TD3Algorithm(ActorCriticAlgorithm):
         return action, None, None
 
     def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
-        """``min Q(s, π(s))`` over the critics, in units of reward, (P, B)."""
+        """Return ``min Q(s, π(s))`` over the critics, in units of reward, (P, B)."""
         params = self.learning_params(state)
         inputs = self.inputs(params, obs)
         action = self.net(params.views, inputs).tanh()
         return self.in_rewards(state, self.smallest(state.critic, inputs, action))
 
     def learning_noise(self, rng: Sequence[torch.Generator], batch: int, due: bool) -> list[Tensor]:
-        """Of the target's actions, (P, B, A), where there is any."""
+        """Draw noise of the target's actions, (P, B, A), if they have noise."""
         return [normal(rng, batch, self.codec.size)] if self.config.target_noise else []
 
     def critic_target(
         self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
-        """``r + discount·min Q̄(s′, π̄(s′) + noise)`` (eq. 10 and 14), (P, B)."""
+        """Return ``r + discount·min Q̄(s′, π̄(s′) + noise)`` (eq. 10 and 14), (P, B)."""
         inputs = self.inputs(params, sample.next_obs)
         action = self.net(self.layout.views(state.target), inputs).tanh()
         if noise:
@@ -113,14 +117,14 @@ class TD3Algorithm(ActorCriticAlgorithm):
     def improve_policy(
         self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
     ) -> None:
-        """One gradient step of the actor, in place."""
+        """Take one gradient step of the actor, in place."""
         leaves = self.layout.leaves(state.params)
         loss = self.policy_loss(leaves, state, inputs)
         self.step_(state, loss, leaves, rate * self.config.actor_rate)
         state.policy_loss = loss.detach()
 
     def policy_loss(self, views: Views, state: State, inputs: Inputs) -> Tensor:
-        """``−Q₁(s, π(s))`` (eq. 15 with one critic, as in the paper) and ``action_l2``, (P,)."""
+        """Return ``−Q₁(s, π(s))`` (eq. 15, one critic as in the paper) plus ``action_l2``, (P,)."""
         first = self.critics.views(state.critic[:, :1])
         before_tanh = self.net(views, inputs)  # (P, B, A)
         q = self.critics(first, inputs, before_tanh.tanh()).flatten(1)
@@ -129,7 +133,7 @@ class TD3Algorithm(ActorCriticAlgorithm):
         return cost - q.mean(1)
 
     def move_targets(self, state: State, due: bool) -> None:
-        """Let the slow copies follow where it is the actor's turn, in place."""
+        """Move the slow copies towards the current weights where ``due``, in place."""
         if due:
             super().move_targets(state, due)
             state.target.lerp_(state.params, state.tau[:, None])

@@ -1,1 +1,1 @@
-"""Environments: engines with one auto-reset meaning, and a skill's view of them."""
+"""Environments: engines with one meaning of resets, and checks of environments."""

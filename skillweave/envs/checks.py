@@ -1,7 +1,7 @@
-"""Whether environments return what Gymnasium says they return; if not, which one and when.
+"""Checks that environments follow Gymnasium's API; errors name the environment and the step.
 
-``CheckedEnv`` looks at one environment's answers, in the process it runs in. ``Watch`` looks at the
-numbers of all of them at once, which costs a few microseconds a step, whatever the engine.
+``CheckedEnv`` checks the return values of one environment, in its process. ``Watch`` checks the
+numbers of all environments at once, in a few microseconds per step, with any engine.
 """
 
 from __future__ import annotations
@@ -23,29 +23,40 @@ from skillweave.spaces.packing import parts
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
 LONGEST_EPISODE = 100_000
-"""Steps after which an engine truncates an episode that nothing else has ended."""
+"""Steps after which an engine truncates an episode that has not ended before."""
 LARGEST_SEEN = float(np.finfo(np.float32).max)
 """The largest size of a number in an observation: networks compute in float32."""
 COARSE = 2.0**24
-"""Size from which float32 does not tell whole numbers apart."""
+"""Size from which float32 cannot represent all whole numbers."""
 LONG_EPISODE = 10_000
-"""Steps of an episode without an end and without a limit that is known: an evaluation or a video
-ends it there, and training says so."""
+"""Steps after which an evaluation or a video ends an episode without a known time limit; training
+gives a notice."""
 
 LIKE_MASKS = (
-    "action_masks", "legal_actions", "legal_moves", "valid_actions", "available_actions",
-    "avail_actions", "valid_action_mask", "legal_action_mask", "valid_moves",
-)  # fmt: skip
-"""Keys under which people keep masks elsewhere."""
+    "action_masks",
+    "legal_actions",
+    "legal_moves",
+    "valid_actions",
+    "available_actions",
+    "avail_actions",
+    "valid_action_mask",
+    "legal_action_mask",
+    "valid_moves",
+)
+"""Keys of masks in other libraries."""
 LIKE_METHODS = (
-    "action_masks", "get_action_mask", "valid_action_mask", "get_avail_actions", "legal_actions",
-)  # fmt: skip
-"""Attributes by which environments tell them; ``action_masks`` that is no method is one."""
+    "action_masks",
+    "get_action_mask",
+    "valid_action_mask",
+    "get_avail_actions",
+    "legal_actions",
+)
+"""Attributes that return masks in other libraries, ``action_masks`` if it is not a method."""
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
 def is_batched(env: object) -> bool:
-    """Return whether it is a simulator that steps many environments at once, or its class."""
+    """Return whether ``env`` is a simulator of many environments at once, or its class."""
     kind = env if isinstance(env, type) else type(env)
     if issubclass(kind, gym.Env):
         return False
@@ -65,15 +76,15 @@ def refuse_batched(name: str) -> EnvError:
 
 
 class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment whose errors, and whose wrong answers, are told with its number and its step.
+    """An environment whose exceptions and invalid return values raise with its number and step.
 
     Args:
         env: the environment.
-        name: what messages call it.
-        number: which one of several it is.
+        name: its name in messages.
+        number: its number among several.
 
     Raises:
-        EnvError: it has no spaces; later, whatever it does or returns that is wrong.
+        EnvError: the environment has no spaces; later, it raised or returned an invalid value.
     """
 
     def __init__(self, env: gym.Env[Any, Any], name: str, number: int | None = None) -> None:
@@ -84,32 +95,30 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._name, self._number, self._elapsed = name, number, 0
         for kind in ("observation_space", "action_space"):
-            found = getattr(env, kind, None)
-            if not isinstance(found, gym.Space):
-                raise EnvError(
-                    f"{name}: {kind} is {short(found)}; it must be a space of Gymnasium's"
-                )
+            space = getattr(env, kind, None)
+            if not isinstance(space, gym.Space):
+                raise EnvError(f"{name}: {kind} is {short(space)}; it must be a Gymnasium space")
         self._fits = _fits(env.observation_space)
         for wrapper in _wrappers(env):
             _refuse_changing(wrapper, name)
-        self._looked = number != 0  # the first of several speaks for all
+        self._looked = number != 0  # only the first of several is checked
         self._chooses = isinstance(env.action_space, DISCRETE)
         masks = _attribute(env, "action_masks") if self._chooses else None
         self._masks = masks if _takes_nothing(masks) else None
-        """As sb3-contrib's MaskablePPO asks environments for masks."""
+        """The method of masks that sb3-contrib's MaskablePPO also calls."""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Start anew."""
+        """Reset the environment and check the result."""
         self._elapsed = 0
         try:
-            found = self.env.reset(seed=seed, options=options)
+            result = self.env.reset(seed=seed, options=options)
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
             raise self._wrong(f"reset() raised {told(error)}") from error
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise self._wrong(f"reset() returned {_many(found)}; Gymnasium asks for obs, info")
-        obs, info = found
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise self._wrong(f"reset() returned {_many(result)}; Gymnasium needs obs, info")
+        obs, info = result
         if not self._fits(obs):
             raise self._misfit(obs)
         self._check_info(info)
@@ -119,20 +128,20 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         return obs, self._with_mask(info) if self._chooses else info
 
     def step(self, action: Any) -> Any:
-        """Act."""
+        """Step the environment and check the result."""
         self._elapsed += 1
         try:
-            found = self.env.step(action)
+            result = self.env.step(action)
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
             raise self._wrong(f"step() raised {told(error)}") from error
-        if not isinstance(found, tuple) or len(found) != 5:
+        if not isinstance(result, tuple) or len(result) != 5:
             raise self._wrong(
-                f"step() returned {_many(found)}; Gymnasium asks for five: obs, reward, "
+                f"step() returned {_many(result)}; Gymnasium needs five: obs, reward, "
                 "terminated, truncated, info"
             )
-        obs, reward, terminated, truncated, info = found
+        obs, reward, terminated, truncated, info = result
         if not self._fits(obs):
             raise self._misfit(obs)
         if type(reward) is not float:
@@ -150,30 +159,30 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         return obs, reward, terminated, truncated, info
 
     def _look_for_masks(self, info: dict[str, Any]) -> None:
-        """Warn where something else than a mask that is used looks like one."""
+        """Give a notice where a key or attribute that is not used looks like an action mask."""
         space, actions = self.env.observation_space, self.env.action_space
         if not self._chooses or self._masks is not None or MASK in info:
             return
         if observes_mask(space, actions):
             return
-        shown = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        observed = space.spaces if isinstance(space, gym.spaces.Dict) else {}
         names = (MASK, *LIKE_MASKS)
-        found = [f"info[{n!r}]" for n in names if n in info]
-        found += [f"the observation's {n!r}" for n in names if n in shown]
-        found += [f"its {n}" for n in LIKE_METHODS if _attribute(self.env, n) is not None]
-        if found:
+        similar = [f"info[{n!r}]" for n in names if n in info]
+        similar += [f"the observation's {n!r}" for n in names if n in observed]
+        similar += [f"its {n}" for n in LIKE_METHODS if _attribute(self.env, n) is not None]
+        if similar:
             notice(
-                f"{self._name}: {found[0]} looks like an action mask, but is not used as one: "
+                f"{self._name}: {similar[0]} looks like an action mask, but is not used as one: "
                 f"every action counts as allowed. Give info['{MASK}'] in reset() and step(), or a "
                 f"method action_masks(): a number for each choice of {actions}, 0 where it is "
                 "forbidden"
             )
 
     def _with_mask(self, info: dict[str, Any], *, over: bool = False) -> dict[str, Any]:
-        """Return the info with its mask (A,) bool, or with the one of ``action_masks()``.
+        """Return the info with its mask as (A,) bool, from the info or ``action_masks()``.
 
         Args:
-            over: the episode is, so that nothing needs to be allowed.
+            over: the episode has ended, so no action needs to be allowed.
         """
         if MASK in info:
             mask = info[MASK]
@@ -185,7 +194,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             except (Exception, SystemExit) as error:
                 raise self._wrong(f"action_masks() raised {told(error)}") from error
         others = {key: value for key, value in info.items() if key != MASK}
-        if mask is None:  # everything is allowed
+        if mask is None:  # all actions are allowed
             return others
         try:
             return {**others, MASK: checked_mask(mask, self.env.action_space)}
@@ -193,13 +202,13 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise self._wrong(str(error)) from error
 
     def close(self) -> None:
-        """Release it; what goes wrong is told, and costs nothing that was learnt."""
+        """Close the environment; an error becomes a notice, so no result is lost."""
         try:
             super().close()
         except (Exception, SystemExit) as error:
             notice(
-                f"{self._name}: close() raised {told(error)}. What was learnt is kept; what the "
-                "environment holds may not have been released"
+                f"{self._name}: close() raised {told(error)}. The training result is kept, but "
+                "resources of the environment may not have been released"
             )
 
     def _number_of(self, reward: Any) -> float:
@@ -236,9 +245,9 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
-    """Return the attribute of an environment or of one of its wrappers; None: there is none.
+    """Return an attribute of an environment or of one of its wrappers; None: it has none.
 
-    An environment that passes any name on to a server is not asked.
+    Looks up attributes statically: an environment may forward any name to a server.
     """
     for layer in (*_wrappers(env), env.unwrapped):
         if inspect.getattr_static(layer, name, None) is not None:
@@ -258,7 +267,7 @@ def _takes_nothing(method: Any) -> bool:
 
 
 def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """The wrappers of an environment, outermost first."""
+    """Yield the wrappers of an environment, outermost first."""
     while isinstance(env, gym.Wrapper):
         yield env
         env = env.env
@@ -270,43 +279,43 @@ _INSTEAD = {
     "NormalizeReward": "algorithms scale rewards themselves (normalize_returns=True of PPO, "
     "normalize_rewards=True of DQN, TD3 and SAC), and scores stay in the environment's own unit",
 }
-"""By the wrapper of Gymnasium's that changes while it is used, what does the same here."""
+"""Settings that replace Gymnasium's wrappers of changing statistics."""
 
 
 def _refuse_changing(wrapper: gym.Wrapper[Any, Any, Any, Any], name: str) -> None:
-    """Raise an EnvError where a wrapper has statistics that go on changing."""
+    """Raise an EnvError where a wrapper has statistics that change while it is used."""
     for kind, instead in _INSTEAD.items():
         changing = getattr(wrapper, "update_running_mean", True)
         if isinstance(wrapper, getattr(gym.wrappers, kind)) and changing:
             raise EnvError(
                 f"{name}: the wrapper {type(wrapper).__name__} changes while it is used, "
-                "differently in each environment, and what it has learnt is not saved with a "
-                f"policy. Leave it out: {instead}. (With statistics of your own, set its "
+                "differently in each environment, and its statistics are not saved with a "
+                f"policy. Omit it: {instead}. (With fixed statistics, set its "
                 "update_running_mean = False)"
             )
 
 
 def time_limit(env: gym.Env[Any, Any]) -> int | None:
-    """Steps after which an environment truncates its episodes; None: nobody knows."""
+    """Return the steps after which an environment truncates its episodes; None: unknown."""
     frames = None if env.spec is None else env.spec.kwargs.get("max_num_frames_per_episode")
     while isinstance(env, gym.Wrapper):
         if isinstance(env, gym.wrappers.TimeLimit):
             return int(env._max_episode_steps)
         env = env.env
-    return frames if isinstance(frames, int) and frames > 0 else None  # of Atari's games
+    return frames if isinstance(frames, int) and frames > 0 else None  # Atari's limit
 
 
 def longest_evaluation(limit: int | None) -> int:
-    """Steps after which an evaluation cuts an episode, where the environment has this limit."""
+    """Return the steps after which an evaluation truncates an episode, for a time limit."""
     return min(limit or LONG_EPISODE, LONGEST_EPISODE)
 
 
 class Watch:
-    """Counts the steps of N environments' episodes, and sees where a number is not finite.
+    """A counter of N environments' steps that checks that all numbers are finite.
 
     Args:
-        name: what messages call the environment.
-        space: of one observation.
+        name: the environment's name in messages.
+        space: the space of one observation.
         num_envs: N.
         first: the number of the first environment, for messages.
     """
@@ -315,21 +324,21 @@ class Watch:
         self._name, self._num_envs, self._first = name, num_envs, first
         self._places = tuple(_numbers_in(space))
         self._elapsed = np.zeros(num_envs, np.int64)
-        self._told_coarse = first != 0  # the first of several speaks for all
+        self._coarse_noticed = first != 0  # only the first of several gives notices
         self._bounds = ImageBounds(name, space) if first == 0 else None
 
     def begun(self, obs: Array, ids: Array | None = None) -> Array:
-        """The first observations of environments ``ids`` (None: all), unchanged.
+        """Return the first observations of environments ``ids`` (None: all), unchanged.
 
         Raises:
-            EnvError: one is not finite; the message names the environment.
+            EnvError: an observation is not finite; the message names the environment.
         """
         self._elapsed[slice(None) if ids is None else ids] = 0
         self._check(obs, ids)
         return obs
 
     def stepped(self, raw: Any, ids: Array | None = None) -> Any:
-        """The answer (a ``RawStep``) of environments ``ids`` to a step, unchanged.
+        """Return the result (a ``RawStep``) of a step of environments ``ids``, unchanged.
 
         Raises:
             EnvError: an observation or a reward is not finite; the message names the
@@ -345,9 +354,9 @@ class Watch:
         return raw
 
     def too_long(self, ids: Array | None = None) -> Array:
-        """Return (n,) bool: the episodes of environments ``ids`` have had enough steps."""
-        found: Array = self._elapsed[slice(None) if ids is None else ids] >= LONGEST_EPISODE
-        return found
+        """Return where episodes of environments ``ids`` reach ``LONGEST_EPISODE``, (n,) bool."""
+        reached: Array = self._elapsed[slice(None) if ids is None else ids] >= LONGEST_EPISODE
+        return reached
 
     def _check(self, obs: Array, ids: Array | None) -> None:
         for place in self._places:
@@ -355,16 +364,16 @@ class Watch:
             for name in place:
                 part = part[name]
             coarse, real = part.dtype.itemsize > 4, part.dtype.kind == "f"
-            if not real and self._told_coarse:
+            if not real and self._coarse_noticed:
                 continue
             size = np.abs(part) if coarse or not real else part
             if real:
                 fits = size <= LARGEST_SEEN if coarse else np.isfinite(part)
-                if b"\0" in fits.tobytes():  # for small arrays half the time of all()
+                if b"\0" in fits.tobytes():  # for small arrays twice as fast as all()
                     raise self._out_of_range(part, place, ids)
-            if (coarse or not real) and not self._told_coarse and size.max(initial=0) > COARSE:
-                self._told_coarse = True
-                self._tell_coarse(float(size.max()), place, part.dtype)
+            if (coarse or not real) and not self._coarse_noticed and size.max(initial=0) > COARSE:
+                self._coarse_noticed = True
+                self._notice_coarse(float(size.max()), place, part.dtype)
         if self._bounds is not None and not self._bounds.see(obs):
             self._bounds = None
 
@@ -379,18 +388,18 @@ class Watch:
             row,
             ids,
             f"its observation{_named(place)} has {len(wrong)} of {bad.shape[1]} numbers that "
-            f"{what}, the first is {wrong[0]}. No agent can learn from that: mend the environment, "
+            f"{what}, the first is {wrong[0]}. No agent can learn from them: fix the environment, "
             "or wrap it",
         )
 
-    def _tell_coarse(self, size: float, place: tuple[str, ...], dtype: np.dtype[Any]) -> None:
-        """Warn of numbers that networks cannot tell apart."""
+    def _notice_coarse(self, size: float, place: tuple[str, ...], dtype: np.dtype[Any]) -> None:
+        """Give a notice of numbers that networks cannot distinguish."""
         step = float(np.spacing(np.float32(size / 2)) * 2)
         notice(
             f"{self._name}: its observation{_named(place)} has a number as large as {size:,.0f}, "
             f"in {dtype}. Networks compute in float32, where numbers of this size are {step:g} "
-            "apart: smaller changes cannot be seen. Let the environment subtract what is always "
-            "there, or give it in other units"
+            "apart: smaller changes cannot be seen. Let the environment subtract a constant, or "
+            "use other units"
         )
 
     def _wrong(self, row: int, ids: Array | None, what: str) -> EnvError:
@@ -406,7 +415,7 @@ def _named(place: tuple[str, ...]) -> str:
 
 
 def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield the places of floats, and of whole numbers that float32 may not hold, by part names."""
+    """Yield the part names of floats, and of whole numbers that float32 may not represent."""
     inner = parts(space)
     if inner is not None:
         for name, part in inner.items():
@@ -418,9 +427,9 @@ def _numbers_in(space: gym.Space[Any], place: tuple[str, ...] = ()) -> Iterator[
 
 
 def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
-    """Whether an observation has a space's shape and kind, and is a choice that exists.
+    """Return a function that checks an observation's shape, type and choices for a space.
 
-    The bounds of a Box are not asked for: many good environments step beyond them.
+    It does not check the bounds of a Box: many good environments exceed them.
     """
     if isinstance(space, gym.spaces.Dict):
         inner = {name: _fits(part) for name, part in space.spaces.items()}
@@ -447,7 +456,7 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
             array = np.asarray(obs)
         except Exception:
             return False
-        # Whole numbers where reals are asked are fine, and reals of another size.
+        # Whole numbers are accepted as reals, and reals of another size.
         return array.shape == shape and _kind_fits(array, dtype)
 
     return fits
@@ -465,8 +474,8 @@ def _holds(space: gym.Space[Any], obs: Any) -> bool:
         return False
 
 
-def _many(found: Any) -> str:
-    return f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+def _many(result: Any) -> str:
+    return f"{len(result)} values" if isinstance(result, tuple) else f"a {type(result).__name__}"
 
 
 def _described(obs: Any) -> str:

@@ -1,20 +1,20 @@
-"""Engines: many environments of one kind, stepped together, reset only when told.
+"""Engines: many environments of one kind, stepped together, reset only by an explicit call.
 
 Gymnasium resets on the next step, in the same step or never; EnvPool resets on the next step
-and ignores the action sent then. An ``Engine`` knows none of this: ``step`` steps the
-environments named and returns their true successors, ``reset_some`` starts those named anew.
-An environment that has ended must be reset before the next step. An episode that nothing else
-ends is truncated after ``LONGEST_EPISODE`` steps.
+and ignores the action of that step. An ``Engine`` hides these differences: ``step`` steps the given
+environments and returns their true successors, ``reset_some`` resets the given ones. An environment
+whose episode has ended must be reset before its next step. An episode without an end is truncated
+after ``LONGEST_EPISODE`` steps.
 
-``state`` is what ``restore`` needs to bring the environments where they are: their seeds and what
-was done since. Only an environment whose dynamics follow from these two can be restored.
+``state`` returns seeds and actions, from which ``restore`` repeats the open episodes. It works only
+for environments whose dynamics follow from these two.
 """
 
 from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,19 +23,20 @@ import numpy as np
 
 from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks
-from skillweave.envs.sync import SyncEnvs
+from skillweave.envs.infos import ActionMasks, batched_infos
+from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.notices import are_collected, notice
 from skillweave.seeding import GlobalDraws
+from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array
 
 LOOKS = 12
-"""Resets and steps in which it is seen whether environments draw from global generators."""
+"""Resets and steps in which draws from global generators are detected."""
 
 
 @dataclass(slots=True)
 class RawStep:
-    """The environments' answer, rows in the order of the ids asked for."""
+    """The result of a step, rows in the order of the requested ids."""
 
     next_obs: Array  # (n, *obs_shape)
     reward: Array  # (n,) float32
@@ -53,37 +54,40 @@ class Engine(Protocol):
     steps_made: int
     """Steps that all environments have made together."""
     time_limit: int | None
-    """Steps after which an environment itself truncates an episode; None: nobody knows."""
+    """Steps after which an environment itself truncates an episode; None: unknown."""
 
     def reset(self, seed: int) -> Array:
-        """Start all anew from one seed; observations (N, *obs_shape)."""
+        """Reset all environments from one seed; return observations (N, *obs_shape)."""
         ...
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        """Start some anew; observations (n, *obs_shape). ``seeds``: one each, where supported."""
+        """Reset some environments; return observations (n, *obs_shape).
+
+        ``seeds``: one for each, where supported.
+        """
         ...
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; the others stand still."""
+        """Step some environments; the others do not change."""
         ...
 
     def state(self) -> dict[str, Array]:
-        """Seeds, and what was done since: all that ``restore`` needs."""
+        """Return the seeds and the actions since, for ``restore``."""
         ...
 
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
-        """Play everything in ``state`` again.
+        """Repeat all actions in ``state``.
 
-        The steps are not counted: they were when they were made first.
+        The steps are not counted again.
 
         Returns:
-            The observations (N, *obs_shape) that this led to, and (k,) environments whose episodes
-            ended before they did the first time: they must be reset.
+            The resulting observations (N, *obs_shape), and the environments (k,) whose episodes
+            ended earlier than before: they must be reset.
         """
         ...
 
     def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         ...
 
     def close(self) -> None:
@@ -92,9 +96,9 @@ class Engine(Protocol):
 
 
 class GymnasiumEngine:
-    """Gymnasium environments, one after another in this process.
+    """Gymnasium environments, stepped one after another in this process.
 
-    Every episode begins from a seed of its own, so that it can be played again.
+    Every episode has its own seed, so that it can be repeated.
 
     Args:
         first: the number of the first environment, for messages.
@@ -115,17 +119,17 @@ class GymnasiumEngine:
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._all = np.arange(num_envs)
         self._root = 0
-        self._episode = np.zeros(num_envs, np.int64)  # episodes begun since the root seed
+        self._episode = np.zeros(num_envs, np.int64)  # episodes started since the root seed
         self._seed = np.zeros(num_envs, np.int64)  # of the open episode
         self._history = History(num_envs, np.asarray(empty))
 
     def reset(self, seed: int) -> Array:
-        """Start all anew from one seed; observations (N, *obs_shape)."""
+        """Reset all environments from one seed; return observations (N, *obs_shape)."""
         self._root, self._episode[:] = seed, 0
         return self.reset_some(self._all)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        """Start some anew; observations (n, *obs_shape)."""
+        """Reset some environments; return observations (n, *obs_shape)."""
         if seeds is None:
             seeds = [self._next_seed(int(i)) for i in ids]
         self._episode[ids] += 1
@@ -134,26 +138,26 @@ class GymnasiumEngine:
         return self._begin(ids)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; the others stand still."""
+        """Step some environments; the others do not change."""
         rows = self._all if ids is None else ids
         self._history.add(action, rows)
         self.steps_made += len(rows)
         return self._act(action, ids)
 
     def state(self) -> dict[str, Array]:
-        """Seeds, and what was done since."""
-        own = {"root": np.array([self._root]), "episode": self._episode, "seed": self._seed}
-        return {k: v.copy() for k, v in own.items()} | self._history.state()
+        """Return the seeds and the actions since."""
+        seeds = {"root": np.array([self._root]), "episode": self._episode, "seed": self._seed}
+        return {k: v.copy() for k, v in seeds.items()} | self._history.state()
 
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
-        """Play the open episodes again; observations (N, *obs_shape), and who ended early."""
+        """Repeat the open episodes; return observations (N, *obs_shape) and early ends (k,)."""
         n = self.num_envs
-        belongs = (("root", 1, 2**63 - 1), ("episode", n, 2**62), ("seed", n, 2**31 - 1))
-        for name, rows, most in belongs:
-            found = state[name]
-            if found.shape != (rows,) or found.dtype.kind != "i":
-                raise ValueError(f"{name} is {found.dtype} {found.shape}, not whole numbers")
-            if not ((found >= 0) & (found <= most)).all():
+        ranges = (("root", 1, 2**63 - 1), ("episode", n, 2**62), ("seed", n, 2**31 - 1))
+        for name, rows, most in ranges:
+            numbers = state[name]
+            if numbers.shape != (rows,) or numbers.dtype.kind != "i":
+                raise ValueError(f"{name} is {numbers.dtype} {numbers.shape}, not whole numbers")
+            if not ((numbers >= 0) & (numbers <= most)).all():
                 raise ValueError(f"{name} is out of its range")
         self._root = int(state["root"][0])
         self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
@@ -164,13 +168,13 @@ class GymnasiumEngine:
                 raw = self._act(action, ids)
                 obs[ids] = raw.next_obs
                 ended = ids[raw.terminated | raw.truncated]
-                if len(ended):  # what was done in them afterwards is left out
+                if len(ended):  # later actions in them are skipped
                     obs[ended] = self.reset_some(ended)
                     early.append(ended)
         return obs, np.unique(np.concatenate(early))
 
     def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         return self._masks.now
 
     def close(self) -> None:
@@ -186,16 +190,16 @@ class GymnasiumEngine:
             self._draws.begin()
         obs, info = self._envs.begin(ids, self._seed[ids])
         if self._draws.looks:
-            self._tell_draws()
+            self._notice_draws()
         self._masks.see(info, ids, obs=obs)
         return self._watch.begun(obs, ids)
 
-    def _tell_draws(self) -> None:
-        """Tell people if the environments have just drawn from global generators."""
+    def _notice_draws(self) -> None:
+        """Give a notice if the environments have just drawn from global generators."""
         if drawn := self._draws.end():
             self._draws.looks = 0
             notice(
-                f"{self._name} draws from {' and '.join(drawn)}, whose generator all of a program "
+                f"{self._name} draws from {' and '.join(drawn)}, whose generator the whole program "
                 "shares. The run seeds it, so the same seed gives the same weights; but an episode "
                 "that is open when a run is resumed cannot be repeated. Draw from self.np_random "
                 "instead, which super().reset(seed=seed) seeds"
@@ -203,13 +207,13 @@ class GymnasiumEngine:
 
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         rows = self._all if ids is None else ids
-        # A copy: environments get views of it, and may keep them.
+        # A copy: environments receive views of it, and may keep them.
         acted = np.array(action, self.action_space.dtype)
         if self._draws.looks:
             self._draws.begin()
         next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
         if self._draws.looks:
-            self._tell_draws()
+            self._notice_draws()
         self._masks.see(info, ids, terminated | truncated, next_obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
         self._watch.stepped(raw, ids)
@@ -217,23 +221,132 @@ class GymnasiumEngine:
         return raw
 
 
+class SyncEnvs:
+    """N environments in this process, of which some can be reset or stepped.
+
+    Args:
+        makers: each makes one of the N environments.
+        name: their name in messages.
+
+    Raises:
+        EnvError: the environments have different spaces, or two are the same object.
+    """
+
+    def __init__(self, makers: Sequence[Callable[[], gym.Env[Any, Any]]], name: str) -> None:
+        self.envs: list[gym.Env[Any, Any]] = []
+        try:
+            for make in makers:
+                self.envs.append(self._make(make))
+            self._check_alike(name)
+        except BaseException:
+            self.close()
+            raise
+        self.observation_space = self.envs[0].observation_space
+        self.action_space = self.envs[0].action_space
+        self._dtype, self._shape = (
+            obs_dtype(self.observation_space),
+            obs_shape(self.observation_space),
+        )
+        self._parts = self._dtype.names is not None
+        self._over = np.zeros(len(self.envs), bool)  # True where the episode has ended
+        self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+
+    def begin(self, ids: Array, seeds: Array) -> tuple[Array, dict[str, Any]]:
+        """Reset environments ``ids`` (n,) to ``seeds`` (n,).
+
+        Returns:
+            Observations (n, *obs_shape), and their batched infos.
+        """
+        obs = self._empty(len(ids))
+        infos: list[dict[str, Any]] = []
+        for row, (i, seed) in enumerate(zip(ids.tolist(), seeds, strict=True)):
+            observation, info = self.envs[i].reset(seed=int(seed))
+            put_observation(self.observation_space, obs, row, observation)
+            infos.append(info)
+        self._over[ids] = False
+        return obs, batched_infos(infos)
+
+    def act(self, action: Array, ids: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Step environments ``ids`` (n,) with ``action`` (n, ...).
+
+        The environments may keep their actions, so the array must not change afterwards.
+
+        Returns:
+            Observations, rewards, terminated, truncated, each with n rows, and batched infos.
+        """
+        assert not self._over[ids].any(), "an episode that is over must be reset first"
+        n = len(ids)
+        obs = self._empty(n)
+        infos: list[dict[str, Any]] = []
+        reward, terminated, truncated = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        # A row without axes is a NumPy scalar, which a Box does not contain.
+        each = action.tolist() if self._discrete else map(np.asarray, action)
+        for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
+            result = self.envs[i].step(one)
+            observation, reward[row], terminated[row], truncated[row], info = result
+            # At once: several environments may share one buffer of observations.
+            if self._parts:
+                put_observation(self.observation_space, obs, row, observation)
+            else:
+                obs[row] = observation
+            infos.append(info)
+        self._over[ids] = terminated | truncated
+        return obs, reward, terminated, truncated, batched_infos(infos)
+
+    def close(self) -> None:
+        """Close all environments."""
+        for env in self.envs:
+            env.close()
+
+    def _make(self, make: Callable[[], gym.Env[Any, Any]]) -> gym.Env[Any, Any]:
+        try:
+            return make()
+        except SkillweaveError as error:
+            if not (made := len(self.envs)):
+                raise
+            raise reworded(
+                error,
+                f"{error}. {made} could be made: if no more can exist at once, set "
+                f"num_envs={made} in each algorithm, the selector's too",
+            ) from error
+
+    def _empty(self, n: int) -> Array:
+        # Zeros, because the bytes between the parts of an observation are written to files.
+        return np.zeros((n, *self._shape), self._dtype)
+
+    def _check_alike(self, name: str) -> None:
+        first = self.envs[0]
+        for number, env in enumerate(self.envs):
+            for kind in ("observation_space", "action_space"):
+                if getattr(env, kind) != getattr(first, kind):
+                    raise EnvError(
+                        f"{name}: its environments differ: the {kind} of environment {number} is "
+                        f"{getattr(env, kind)}, but the one of environment 0 is "
+                        f"{getattr(first, kind)}"
+                    )
+        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
+            raise EnvError(
+                f"{name} returns the same environment each time; the function must make a new one"
+            )
+
+
 def episode_seed(root: int, row: int, episode: int) -> int:
-    """Return the seed of an episode of environment ``row``, where all were reset to ``root``."""
+    """Return the seed of an episode of environment ``row`` after a reset to ``root``."""
     node = np.random.SeedSequence(root, spawn_key=(row, episode))
     return int(node.generate_state(1, np.uint32)[0] >> 1)
 
 
 def checksums(obs: Array) -> Array:
-    """A number for each row of observations (n, *obs_shape), (n,) int64; equal rows, equal ones."""
-    found = [0] * len(obs)
+    """Return a checksum for each row of observations (n, *obs_shape), (n,) int64."""
+    sums = [0] * len(obs)
     for part in _parts(obs):
         rows = (np.ascontiguousarray(row).tobytes() for row in part)
-        found = [zlib.crc32(row, before) for row, before in zip(rows, found, strict=True)]
-    return np.array(found, np.int64)
+        sums = [zlib.crc32(row, before) for row, before in zip(rows, sums, strict=True)]
+    return np.array(sums, np.int64)
 
 
 def _parts(obs: Array) -> list[Array]:
-    """Observations (n, …) as arrays of numbers: what lies between aligned parts says nothing."""
+    """Return observations (n, …) as arrays of numbers, without the gaps between aligned parts."""
     if obs.dtype.names is None:
         return [obs]
     return [part for name in obs.dtype.names for part in _parts(obs[name])]

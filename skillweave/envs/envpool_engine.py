@@ -1,4 +1,7 @@
-"""EnvPool as an engine: C++ threads, the same dynamics, several times the speed."""
+"""The engine of EnvPool: C++ threads, the same dynamics, several times the speed.
+
+Stands alone because it is one of the two implementations of ``Engine``.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +20,21 @@ from skillweave.errors import EnvError, MissingExtra
 from skillweave.types import Array
 
 RENEW_AFTER = 100_000
-"""Steps since their seeds after which environments get new ones, as their episodes end."""
+"""Steps since the seed of a pool after which environments move to a new pool."""
 
 
 class EnvPoolEngine:
-    """Environments of a pool: EnvPool's, or what a user makes of them.
+    """Environments of a pool: EnvPool's, or one that a user wraps.
 
-    A pool takes its seeds when it is made, so an environment can be played again only from there.
-    To keep that short, a second pool is made after ``RENEW_AFTER`` steps, and each environment
-    moves there when its episode ends. The seed of each pool follows from the first one and from
-    how many pools there were, so nothing depends on when a checkpoint is written.
+    A pool is seeded when it is created, so an environment can be repeated only from there. To keep
+    that short, a second pool is created after ``RENEW_AFTER`` steps, and each environment moves to
+    it when its episode ends. A pool's seed follows from the first seed and the number of pools so
+    far, so no result depends on the time of a checkpoint.
 
     Args:
-        make: a pool.
-        name: of the environment, for messages.
-        spaces: the same environment as Gymnasium has it.
+        make: creates a pool.
+        name: the environment's name in messages.
+        spaces: the same environment of Gymnasium.
     """
 
     def __init__(
@@ -48,7 +51,7 @@ class EnvPoolEngine:
         self._made = 0  # pools since the root seed
         self._pools: list[Any] = []
         self._seeds: list[int] = []  # of the pools
-        self._place = np.zeros(num_envs, np.int64)  # in which pool each environment is
+        self._place = np.zeros(num_envs, np.int64)  # the pool of each environment
         example: Any = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._history = History(num_envs, example)
         self._masks = ActionMasks(self.action_space, num_envs)
@@ -56,14 +59,14 @@ class EnvPoolEngine:
 
     @staticmethod
     def supports(env_id: str, reference: gym.Env[Any, Any]) -> bool:
-        """Whether EnvPool is installed and has this environment with the same spaces and limit."""
+        """Return whether EnvPool is installed and has this environment (spaces, limit)."""
         try:
             envpool = installed()
         except MissingExtra:
             return False
         if env_id not in envpool.list_all_envs():
             return False
-        if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests in its own way
+        if reference.observation_space.shape is None:  # Dict, Tuple: EnvPool nests differently
             return False
         with no_precision_warnings():
             spec = envpool.make_spec(env_id)
@@ -85,11 +88,11 @@ class EnvPoolEngine:
         )
 
     def make_pool(self, seed: int) -> Any:
-        """A bare pool."""
+        """Return a bare pool."""
         return self._make(self.num_envs, self._threads, seed)
 
     def reset(self, seed: int) -> Array:
-        """Start all anew from one seed; observations (N, *obs_shape)."""
+        """Reset all environments from one seed; return observations (N, *obs_shape)."""
         self._root, self._made = seed, 1
         self._pools, self._seeds = [self.make_pool(seed)], [seed]
         self._place[:] = 0
@@ -97,7 +100,7 @@ class EnvPoolEngine:
         return self._begin(self._all)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        """Start some anew; observations (n, *obs_shape)."""
+        """Reset some environments; return observations (n, *obs_shape)."""
         if seeds is not None:
             raise EnvError("EnvPool cannot reset single environments to a seed")
         if len(self._pools) == 1 and self._history.total >= RENEW_AFTER:
@@ -113,14 +116,14 @@ class EnvPoolEngine:
         return self._begin(ids)
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; the others stand still."""
+        """Step some environments; the others do not change."""
         rows = self._all if ids is None else ids
         self._history.add(action, rows)
         self.steps_made += len(rows)
         return self._act(action, rows)
 
     def _add_pool(self) -> None:
-        """Make the next pool, with a seed of its own."""
+        """Create the next pool, with its own seed."""
         node = np.random.SeedSequence(self._root, spawn_key=(self._made,))
         seed = int(node.generate_state(1, np.uint32)[0] >> 1)
         self._made += 1
@@ -128,18 +131,18 @@ class EnvPoolEngine:
         self._seeds.append(seed)
 
     def state(self) -> dict[str, Array]:
-        """Seeds, and what was done since."""
-        own = {"seeds": np.array(self._seeds), "place": self._place.copy()}
-        own["root"] = np.array([self._root, self._made])
-        return own | self._history.state()
+        """Return the seeds and the actions since."""
+        pools = {"seeds": np.array(self._seeds), "place": self._place.copy()}
+        pools["root"] = np.array([self._root, self._made])
+        return pools | self._history.state()
 
     def restore(self, state: dict[str, Array]) -> tuple[Array, Array]:
-        """Play everything again; observations (N, *obs_shape), and who ended early."""
+        """Repeat all actions; return observations (N, *obs_shape) and early ends (k,)."""
         self._seeds = [int(seed) for seed in state["seeds"]]
         self._place = state["place"].copy()
         wrong = self._place.shape != (self.num_envs,) or not 0 < len(self._seeds) < 3
         if wrong or not ((self._place >= 0) & (self._place < len(self._seeds))).all():
-            raise ValueError("environments are said to be in pools that there are not")
+            raise ValueError("environments are in pools that do not exist")
         root = state["root"]
         if root.shape != (2,) or root.dtype.kind != "i" or not (root >= 0).all():
             raise ValueError("the first seed and the number of pools are no whole numbers")
@@ -159,7 +162,7 @@ class EnvPoolEngine:
         return obs, np.flatnonzero(early | over)
 
     def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         return self._masks.now
 
     def close(self) -> None:
@@ -180,11 +183,11 @@ class EnvPoolEngine:
             action = action.astype(np.int32)
 
         def step(pool: Any, part: Array) -> tuple[Any, ...]:
-            found: tuple[Any, ...] = pool.step(action[part], ids[part].astype(np.int32))
-            return found
+            result: tuple[Any, ...] = pool.step(action[part], ids[part].astype(np.int32))
+            return result
 
-        # An episode that terminates on the very step of its time limit arrives as truncated:
-        # EnvPool computes `terminated = done & ~truncated` itself, so this cannot be told apart.
+        # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
+        # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
         raw = RawStep(*self._in_pools(ids, step))
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
         self._watch.stepped(raw, ids)
@@ -192,17 +195,14 @@ class EnvPoolEngine:
         return raw
 
     def _in_pools(
-        self, ids: Array, ask: Callable[[Any, Array], tuple[Any, ...]]
+        self, ids: Array, call: Callable[[Any, Array], tuple[Any, ...]]
     ) -> tuple[Any, ...]:
-        """What the pools answer for environments ``ids``, in the order of the ids.
-
-        ``ask`` is given a pool and which of the ids are in it.
-        """
+        """Call ``call`` for each pool with its part of ``ids``; join the results in their order."""
         if len(self._pools) == 1:
-            return ask(self._pools[0], np.arange(len(ids)))
+            return call(self._pools[0], np.arange(len(ids)))
         parts = [np.flatnonzero(self._place[ids] == k) for k in range(len(self._pools))]
         answers = [
-            (part, ask(pool, part))
+            (part, call(pool, part))
             for pool, part in zip(self._pools, parts, strict=True)
             if len(part)
         ]
@@ -213,11 +213,11 @@ class EnvPoolEngine:
 
 
 def _joined(parts: list[tuple[Array, Any]], n: int) -> Any:
-    """Arrays, or dicts of arrays, of some rows each, as arrays of all n rows."""
+    """Join arrays, or dicts of arrays, of some rows each, to arrays of all n rows."""
     _, first = parts[0]
     if isinstance(first, dict):
         return {k: _joined([(rows, part[k]) for rows, part in parts], n) for k in first}
-    found = np.empty((n, *first.shape[1:]), first.dtype)
+    joined = np.empty((n, *first.shape[1:]), first.dtype)
     for rows, part in parts:
-        found[rows] = part
-    return found
+        joined[rows] = part
+    return joined

@@ -1,7 +1,7 @@
-"""What was done in each environment since it was seeded, so that it can be brought there again.
+"""The actions in each environment since its seed, to repeat its open episode.
 
-An environment cannot be copied, but it can be played again: the same seed and the same actions
-lead to the same state. That is how open episodes survive in a checkpoint.
+An environment cannot be copied, but it can be repeated: the same seed and the same actions lead to
+the same state. So a checkpoint can restore open episodes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from skillweave.types import Array
 
 
 class History:
-    """The actions of N environments since their seeds, and where episodes began among them.
+    """The actions of N environments since their seeds, and the starts of episodes among them.
 
     Args:
         num_envs: N.
@@ -23,39 +23,39 @@ class History:
 
     def __init__(self, num_envs: int, action: Array) -> None:
         self.length = np.zeros(num_envs, np.int64)
-        """(N,) actions since the seed."""
+        """Actions since the seed, (N,)."""
         self._action = np.zeros((64, *action.shape), action.dtype)  # (capacity, N, *action_shape)
         self._begins = np.zeros((64, num_envs), bool)  # an episode begins before this action
 
     @property
     def total(self) -> int:
-        """Actions of all environments together."""
+        """Return the number of actions of all environments."""
         return int(self.length.sum())
 
     def forget(self, ids: Array) -> None:
-        """Environments ``ids`` (n,) have been seeded: their history begins."""
+        """Clear the history of environments ``ids`` (n,), which have been seeded."""
         self._begins[: int(self.length[ids].max(initial=0)) + 1, ids] = False
         self.length[ids] = 0
 
     def begin(self, ids: Array) -> None:
-        """An episode begins in environments ``ids`` (n,), without a new seed."""
+        """Record the start of episodes in environments ``ids`` (n,), without a new seed."""
         self._begins[self.length[ids], ids] = True
 
     def add(self, action: Array, ids: Array) -> None:
-        """Actions (n, *action_shape) in environments ``ids`` (n,)."""
+        """Record actions (n, *action_shape) of environments ``ids`` (n,)."""
         at = self.length[ids]
         self._action[at, ids] = action
         self.length[ids] = at + 1
-        if int(at.max()) + 2 > len(self._action):  # there is always a row for what begins next
+        if int(at.max()) + 2 > len(self._action):  # one row stays free for the next start
             self._action = np.concatenate([self._action, np.zeros_like(self._action)])
             self._begins = np.concatenate([self._begins, np.zeros_like(self._begins)])
 
     def play(self) -> Iterator[tuple[Array, Array, Array]]:
-        """The history of all at once, action by action.
+        """Yield the history of all environments at once, action by action.
 
         Yields:
-            ids (b,) of environments in which an episode begins first, ids (n,) of those that act
-            then, and their actions (n, *action_shape). None acts after the last beginnings.
+            ids (b,) of environments in which an episode starts, ids (n,) of environments that then
+            act, and their actions (n, *action_shape). The last item has no actions.
         """
         for t in range(int(self.length.max(initial=0)) + 1):
             here = self.length >= t
@@ -63,7 +63,7 @@ class History:
             yield np.flatnonzero(self._begins[t] & here), acts, self._action[t, acts]
 
     def state(self) -> dict[str, Array]:
-        """Arrays for a file: no longer than what was done."""
+        """Return arrays for a file, no longer than the history."""
         longest = int(self.length.max(initial=0))
         done = np.arange(longest)[:, None] < self.length
         begins = np.argwhere(self._begins & (np.arange(len(self._begins))[:, None] <= self.length))
@@ -74,17 +74,17 @@ class History:
         }
 
     def load(self, state: dict[str, Array]) -> None:
-        """The inverse of ``state``.
+        """Load a history from ``state``.
 
         Raises:
-            ValueError: it is not the history of so many environments.
+            ValueError: it is not a history of N environments.
         """
         length, begins = state["length"], state["begins"]
         fits = length.shape == self.length.shape and length.dtype.kind == "i"
         if not fits or length.min(initial=0) < 0 or length.sum() != len(state["action"]):
             raise ValueError("lengths and actions of the history do not belong together")
         if begins.shape[1:] != (2,) or (begins < 0).any() or (begins[:, 0] > length.max()).any():
-            raise ValueError("the history's episodes begin where nothing was done")
+            raise ValueError("the history's episodes begin outside its actions")
         self.length = length.astype(np.int64)
         longest = int(self.length.max(initial=0))
         capacity = max(64, 1 << (longest + 1).bit_length())

@@ -1,4 +1,7 @@
-"""Notices of images whose bounds do not fit their values: networks scale images by their bounds."""
+"""Notices of images whose bounds do not fit their values, because networks scale by the bounds.
+
+Stands alone because it is one rule with its own state, which ``Watch`` only calls.
+"""
 
 from __future__ import annotations
 
@@ -16,59 +19,59 @@ from skillweave.spaces.packing import parts
 from skillweave.types import Array
 
 LOOKS = 64
-"""Batches of observations that are looked at, from the first one on."""
+"""The first batches of observations, which are checked."""
 ROWS = 4
-"""Environments of a batch that are looked at."""
+"""The environments of a batch that are checked."""
 BEYOND = 0.5
-"""How far values may lie beyond the bounds, as a share of their range."""
+"""The largest excess of values beyond the bounds, as a share of the range."""
 NARROW = 0.01
-"""The share of the range that values must use."""
+"""The least share of the range that values must use."""
 
 
 @dataclass
 class _Image:
-    """An image in observations, and the values that it had so far."""
+    """An image in observations, and the range of its values so far."""
 
     place: tuple[str, ...]  # names of the parts that lead to it
     low: Array  # (*shape) float64
     high: Array
     seen: list[float] = field(default_factory=lambda: [math.inf, -math.inf])  # least and largest
     scaled: list[float] = field(default_factory=lambda: [math.inf, -math.inf])
-    """The same of the values scaled as for a network."""
+    """Least and largest of the values scaled as for a network."""
 
     def see(self, obs: Array) -> None:
-        """Look at some observations (n, *obs_shape)."""
+        """Update the ranges with observations (n, *obs_shape)."""
         for name in self.place:
             obs = obs[name]
         values = obs[:ROWS].astype(np.float64)
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
-        for kept, array in ((self.seen, values), (self.scaled, (values - self.low) / span)):
-            kept[:] = min(kept[0], float(array.min())), max(kept[1], float(array.max()))
+        for limits, array in ((self.seen, values), (self.scaled, (values - self.low) / span)):
+            limits[:] = min(limits[0], float(array.min())), max(limits[1], float(array.max()))
 
     @property
     def is_beyond(self) -> bool:
-        """Whether values lie far beyond the bounds."""
+        """Return whether values lie far beyond the bounds."""
         return self.scaled[0] < -BEYOND or self.scaled[1] > 1.0 + BEYOND
 
     @property
     def is_narrow(self) -> bool:
-        """Whether the values differ, and use a small part of the range."""
+        """Return whether the values differ, and use a small part of the range."""
         return 0.0 < self.scaled[1] - self.scaled[0] <= NARROW
 
 
 class ImageBounds:
-    """Looks at an environment's first observations, and gives a notice where bounds do not fit.
+    """A check of an environment's first observations that gives a notice where bounds do not fit.
 
     Args:
-        name: what messages call the environment.
-        space: of one observation.
+        name: the environment's name in messages.
+        space: the space of one observation.
     """
 
     def __init__(self, name: str, space: gym.Space[Any]) -> None:
         self._name, self._images, self._looks = name, list(_images_in(space)), LOOKS
 
     def see(self, obs: Array) -> bool:
-        """Look at a batch of observations (n, *obs_shape); return whether to look at more."""
+        """Check a batch of observations (n, *obs_shape); return whether to check more."""
         if not len(obs):
             return True
         self._looks -= 1
@@ -76,11 +79,11 @@ class ImageBounds:
             image.see(obs)
             if image.is_beyond or (not self._looks and image.is_narrow):
                 self._images.remove(image)
-                self._tell(image)
+                self._notice(image)
         return self._looks > 0 and bool(self._images)
 
-    def _tell(self, image: _Image) -> None:
-        # Rounded: environments of training and of evaluations must give the same sentence.
+    def _notice(self, image: _Image) -> None:
+        # Rounded, so environments of training and of evaluations give the same sentence.
         least, largest = image.seen
         if image.scaled[1] > 1.0 + BEYOND:
             unit = _unit(largest)

@@ -1,4 +1,4 @@
-"""What environments tell beside observations: rows of a batched info, and action masks in it."""
+"""The infos of environments: rows of a batched info, action masks and success in it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from skillweave.types import Array
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Batch the infos of n environments, as Gymnasium's vectors have them.
+    """Batch the infos of n environments in the format of Gymnasium's vectors.
 
     Gymnasium casts the values of all environments to the type of the first, 0.5 to 0 for example.
-    Here an array has a type that holds all of them as they are.
+    Here an array has a type that represents all of them exactly.
 
     Returns:
         By key, an array over the n environments: of numbers; of arrays of one shape; else of
-        objects. Dicts are batched in turn. Where an environment does not give the key stands 0, or
-        None among objects, and the (n,) bool under ``_key`` is False.
+        objects. Dicts are batched in turn. Where an environment's info lacks the key, the value is
+        0, or None among objects, and the (n,) bool under ``_key`` is False.
     """
     if not any(infos):
         return {}
@@ -35,18 +35,18 @@ def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             rows, values = columns.setdefault(key, ([], []))
             rows.append(row)
             values.append(value)
-    found: dict[str, Any] = {}
+    batch: dict[str, Any] = {}
     for key, (rows, values) in columns.items():
-        found[key] = _column(rows, values, n)
+        batch[key] = _column(rows, values, n)
         if (mask := f"_{key}") not in columns:
-            here = np.zeros(n, bool)
-            here[rows] = True
-            found[mask] = here
-    return found
+            present = np.zeros(n, bool)
+            present[rows] = True
+            batch[mask] = present
+    return batch
 
 
 def _column(rows: list[int], values: list[Any], n: int) -> Any:
-    """Return the values of n environments under one key as a column; ``rows`` give one."""
+    """Return the values of n environments under one key as a column; ``rows`` have one."""
     kinds = set(map(type, values))
     if all(issubclass(kind, dict) for kind in kinds):
         inner: list[dict[str, Any]] = [{}] * n
@@ -71,7 +71,7 @@ def _column(rows: list[int], values: list[Any], n: int) -> Any:
 
 
 def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
-    """Return numbers as an array; None: no type holds all of them as they are."""
+    """Return numbers as an array; None: no type represents all of them exactly."""
     array = np.array(values)
     if array.dtype.kind not in "biufc":
         return None  # whole numbers that are too large
@@ -82,7 +82,7 @@ def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
 
 
 def _stacked(values: list[Array]) -> Array | None:
-    """Stack arrays; None: no array holds all of them as they are."""
+    """Stack arrays; None: no array represents all of them exactly."""
     first = values[0]
     if any(v.shape != first.shape for v in values):
         return None
@@ -126,16 +126,16 @@ def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     for key in info_keys(info):
         column = info[key]
         values = _single(column, n) if isinstance(column, dict) else column
-        here = info.get(f"_{key}", np.ones(n, bool))
-        for row in np.flatnonzero(here):
+        present = info.get(f"_{key}", np.ones(n, bool))
+        for row in np.flatnonzero(present):
             each[row][key] = values[row]
     return each
 
 
 def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
-    """The part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
+    """Return the part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
 
-    What is no array over the n environments is returned as it is.
+    Values that are not arrays over the n environments are returned unchanged.
     """
     return {key: _rows(value, rows, n) for key, value in info.items()}
 
@@ -148,13 +148,13 @@ def _rows(value: Any, rows: Array, n: int) -> Any:
 
 
 DISCRETE = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
-"""Spaces of actions that masks are for."""
+"""Action spaces that can have masks."""
 MASK = "action_mask"
-"""The key of infos, and of observations, under which masks are."""
+"""The key of masks in infos and observations."""
 
 
 def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> bool:
-    """Return whether observations have a part that says which actions are allowed."""
+    """Return whether observations have a part that is the action mask."""
     if not isinstance(observation_space, gym.spaces.Dict) or MASK not in observation_space.spaces:
         return False
     if not isinstance(space, DISCRETE):
@@ -163,24 +163,24 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
     return int(np.prod(shape)) == sum(action_codec(space).parts)
 
 
-def checked_mask(told: Any, space: gym.Space[Any]) -> Array:
-    """Return the mask (A,) bool that an environment or a user gives for the choices of a space.
+def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
+    """Return a mask of an environment or a user for the choices of a space as (A,) bool.
 
     Several choices may have a list each.
 
     Raises:
-        ValueError: it is no number for each choice; the message says what it is.
+        ValueError: the value does not have a number for each choice; the message shows it.
     """
     size = sum(action_codec(space).parts)
     try:
-        mask = np.asarray(told)
+        mask = np.asarray(value)
         if mask.dtype == object:
-            mask = np.concatenate([np.ravel(part) for part in told])
+            mask = np.concatenate([np.ravel(part) for part in value])
     except (TypeError, ValueError):
         mask = np.array(None)
     if mask.size != size or mask.dtype.kind not in "iubf":
         raise ValueError(
-            f"its action_mask is {short(told)}; it must be a number for each choice of {space}, "
+            f"its action_mask is {short(value)}; it must be a number for each choice of {space}, "
             f"{size} in all, 0 where it is forbidden"
         )
     allowed: Array = mask.reshape(-1) != 0
@@ -188,17 +188,17 @@ def checked_mask(told: Any, space: gym.Space[Any]) -> Array:
 
 
 class ActionMasks:
-    """The actions that N environments allow now, as their infos or observations tell.
+    """The actions that N environments allow now, from their infos or observations.
 
     Gymnasium's convention: ``info["action_mask"]`` of ``reset`` and ``step`` has a number for each
     choice, 0 where it is forbidden. For several choices at once (MultiDiscrete, MultiBinary) the
-    numbers stand one choice after another. What ``action_masks()`` says is there already
-    (``CheckedEnv``). Else a Dict's part ``action_mask`` is the mask, as PettingZoo and RLlib have
-    it. Without any, everything is allowed. A Box has no choices, so its masks are ignored.
+    numbers follow choice by choice. ``CheckedEnv`` has added the mask of ``action_masks()``. Else a
+    Dict's part ``action_mask`` is the mask, as in PettingZoo and RLlib. Without any, all actions
+    are allowed. A Box has no choices, so its masks are ignored.
 
     Args:
-        space: of actions.
-        observation_space: where masks may be.
+        space: the action space.
+        observation_space: the space of observations, which may have a mask.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class ActionMasks:
         self._observed = observation_space is not None and observes_mask(observation_space, space)
         self._parts = action_codec(space).parts if isinstance(space, DISCRETE) else ()
         self.now = now
-        """(N, A) bool; None: no environment has ever told. Never changed in place."""
+        """(N, A) bool; None: no environment has returned a mask so far. Never changed in place."""
 
     def see(
         self,
@@ -221,42 +221,42 @@ class ActionMasks:
         ended: Array | None = None,
         obs: Array | None = None,
     ) -> None:
-        """Take in the info of environments ``ids`` (n,), rows in their order; None: of all.
+        """Update the masks of environments ``ids`` (n,), rows in their order; None: of all.
 
         Args:
-            ended: (n,) bool, where the episode is over: nothing needs to be allowed there.
-            obs: (n, *obs_shape), what they show.
+            ended: (n,) bool, where the episode is over: no action needs to be allowed there.
+            obs: (n, *obs_shape), their observations.
 
         Raises:
             EnvError: a mask has another shape, or allows nothing; the message names the
                 environment.
         """
-        told = info.get("action_mask")
-        if told is None and self._observed and obs is not None:
-            told = obs[MASK].reshape(len(obs), -1)
-        if not self._parts or (told is None and self.now is None):
+        value = info.get("action_mask")
+        if value is None and self._observed and obs is not None:
+            value = obs[MASK].reshape(len(obs), -1)
+        if not self._parts or (value is None and self.now is None):
             return
         ids = np.arange(self._num_envs) if ids is None else ids
         size = sum(self._parts)
         mask = np.ones((len(ids), size), bool)
-        if told is not None:
-            here = np.asarray(info.get("_action_mask", np.ones(len(ids), bool)))
-            mask[here] = self._checked(told, (len(ids), size))[here]
+        if value is not None:
+            present = np.asarray(info.get("_action_mask", np.ones(len(ids), bool)))
+            mask[present] = self._checked(value, (len(ids), size))[present]
         starts = np.cumsum((0, *self._parts[:-1]))
         free = np.logical_or.reduceat(mask, starts, axis=1).all(axis=1)
         over = np.zeros(len(ids), bool) if ended is None else ended
         if not (free | over).all():
             raise EnvError(
                 f"environment {ids[np.flatnonzero(~free & ~over)[0]]} allows no action, though its "
-                "episode goes on: its action_mask is 0 everywhere; allow at least one action"
+                "episode continues: its action_mask is 0 everywhere; allow at least one action"
             )
         mask[~free] = True
         now = np.ones((self._num_envs, size), bool) if self.now is None else self.now.copy()
         now[ids] = mask
         self.now = now
 
-    def _checked(self, told: Any, shape: tuple[int, int]) -> Array:
-        mask = np.asarray(told)
+    def _checked(self, value: Any, shape: tuple[int, int]) -> Array:
+        mask = np.asarray(value)
         if mask.shape != shape or mask.dtype.kind not in "iubf":
             raise EnvError(
                 f"the action_mask of the environments is of {mask.dtype} and shape "
@@ -268,71 +268,71 @@ class ActionMasks:
 
 
 def told_success(info: Mapping[str, Any], n: int) -> Array | None:
-    """Whether the episodes of n environments have succeeded, by ``info["success"]``.
+    """Return the success of n environments' episodes by ``info["success"]``.
 
     Returns:
-        (n,) float64, NaN where an environment says nothing; None: none of them does.
+        (n,) float64, NaN where an environment reports none; None: no environment reports any.
     """
-    told = np.asarray(info.get("success"))
-    if told.shape == (n,) and told.dtype == object:  # None, say, until it is known
-        known = [isinstance(value, NUMBERS) for value in told]
+    success = np.asarray(info.get("success"))
+    if success.shape == (n,) and success.dtype == object:  # for example None until it is known
+        known = [isinstance(value, NUMBERS) for value in success]
         if not any(known):
             return None
-        return np.array([v != 0 if k else np.nan for v, k in zip(told, known, strict=True)], float)
-    if told.shape != (n,) or told.dtype.kind not in "biuf":
+        values = [v != 0 if k else np.nan for v, k in zip(success, known, strict=True)]
+        return np.array(values, float)
+    if success.shape != (n,) or success.dtype.kind not in "biuf":
         return None
-    here = np.asarray(info.get("_success", np.ones(n, bool)))
-    return np.where(here, told != 0, np.nan)
+    present = np.asarray(info.get("_success", np.ones(n, bool)))
+    return np.where(present, success != 0, np.nan)
 
 
 def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array | None:
     """Return the numbers under a key in the infos of environments ``ids`` (k,), of n.
 
     Returns:
-        (k,) float64, NaN where an environment gives none, or none that is finite; None: no
-        environment gives any.
+        (k,) float64, NaN where an environment has no finite number; None: no environment has one.
 
     Raises:
-        EnvError: something else than a number lies there; the message names its type.
+        EnvError: a value is not a number; the message names its type.
     """
     if key not in info:
         return None
     values = info[key]
-    here = np.asarray(info.get(f"_{key}", np.ones(n, bool)))[ids]
-    if not here.any():
+    present = np.asarray(info.get(f"_{key}", np.ones(n, bool)))[ids]
+    if not present.any():
         return None
     if not isinstance(values, np.ndarray) or values.shape[:1] != (n,):
         raise _no_number(key, f"of type {type(values).__name__}")
     if values.size > n:
         raise _no_number(key, f"an array of shape {values.shape[1:]}")
-    found = np.full(len(ids), np.nan)
-    for row in np.flatnonzero(here):
+    numbers = np.full(len(ids), np.nan)
+    for row in np.flatnonzero(present):
         value = values.reshape(n)[ids[row]]
         if value is None:
             continue
         if not isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating):
             raise _no_number(key, f"of type {type(value).__name__}")
-        found[row] = value
-    found[~np.isfinite(found)] = np.nan
-    return found
+        numbers[row] = value
+    numbers[~np.isfinite(numbers)] = np.nan
+    return numbers
 
 
 def _no_number(key: str, what: str) -> EnvError:
     return EnvError(
         f"log_info names {short(key)}, but info[{short(key)}] is {what} at the end of an episode; "
-        "let the environment give a number there, or leave the key out of log_info"
+        "let the environment set a number there, or remove the key from log_info"
     )
 
 
 def allowed_rows(mask: Array | None, rows: Array) -> Array | None:
-    """Rows of an action mask, where there is one."""
+    """Return rows of an action mask; None stays None."""
     return None if mask is None else mask[rows]
 
 
 def random_actions(
     space: gym.Space[Any], n: int, rng: np.random.Generator, mask: Array | None = None
 ) -> Array:
-    """n actions drawn at random from a space, among those that ``mask`` (n, A) allows."""
+    """Draw n actions at random from a space, among those that ``mask`` (n, A) allows."""
     space.seed(int(rng.integers(2**31)))
     drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
     if mask is None:

@@ -1,4 +1,7 @@
-"""Several engines of one kind as one."""
+"""Several engines of one kind as one, for a population's members.
+
+Stands alone because it implements the stepping part of ``Engine``.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,9 @@ from skillweave.types import Array
 
 
 class JoinedEngines:
-    """An engine whose environments are those of its parts, one part after another.
+    """An engine that concatenates the environments of its parts.
 
-    All parts have as many environments. It steps them; seeds and states are the parts' own.
+    All parts have the same number of environments. Each part keeps its own seeds and states.
     """
 
     def __init__(self, parts: Sequence[Engine]) -> None:
@@ -27,33 +30,37 @@ class JoinedEngines:
 
     @property
     def steps_made(self) -> int:
-        """Steps that all environments have made."""
+        """Return the number of steps of all environments."""
         return sum(part.steps_made for part in self.parts)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
-        """Start some anew; observations (n, *obs_shape)."""
-        assert seeds is None, "the parts have seeds of their own"
-        return _in_order(ids, [
-            (rows, self.parts[i].reset_some(own)) for i, rows, own in self._split(ids)
-        ])  # fmt: skip
+        """Reset some environments; return observations (n, *obs_shape)."""
+        assert seeds is None, "each part has its own seeds"
+        split = self._split(ids)
+        return _in_order(
+            ids, [(rows, self.parts[i].reset_some(part_ids)) for i, rows, part_ids in split]
+        )
 
     def step(self, action: Array, ids: Array | None = None) -> RawStep:
-        """Act in some environments; the others stand still."""
+        """Step some environments; the others do not change."""
         if ids is None:
             actions = np.split(action, len(self.parts))
-            steps = [part.step(own) for part, own in zip(self.parts, actions, strict=True)]
+            steps = [part.step(rows) for part, rows in zip(self.parts, actions, strict=True)]
             return _joined(steps, [self._each] * len(steps))
         split = self._split(ids)
-        steps = [self.parts[i].step(action[rows], own) for i, rows, own in split]
-        found = _joined(steps, [len(rows) for _, rows, _ in split])
+        steps = [self.parts[i].step(action[rows], part_ids) for i, rows, part_ids in split]
+        step = _joined(steps, [len(rows) for _, rows, _ in split])
         order = np.argsort(np.concatenate([rows for _, rows, _ in split]))
         return RawStep(
-            found.next_obs[order], found.reward[order], found.terminated[order],
-            found.truncated[order], info_rows(found.info, order, len(order)),
-        )  # fmt: skip
+            step.next_obs[order],
+            step.reward[order],
+            step.terminated[order],
+            step.truncated[order],
+            info_rows(step.info, order, len(order)),
+        )
 
     def mask(self) -> Array | None:
-        """(N, A) bool, the actions allowed in the latest observations; None: all always are."""
+        """Return the actions allowed in the latest observations, (N, A) bool; None: always all."""
         masks = [part.mask() for part in self.parts]
         known = next((mask for mask in masks if mask is not None), None)
         if known is None:
@@ -61,18 +68,18 @@ class JoinedEngines:
         return np.concatenate([np.ones_like(known) if mask is None else mask for mask in masks])
 
     def _split(self, ids: Array) -> list[tuple[int, Array, Array]]:
-        """For each part concerned: its number, the rows of ``ids``, and its own ids."""
-        part, own = np.divmod(ids, self._each)
+        """Return for each part with ``ids``: its number, their rows, and their ids in it."""
+        part, part_ids = np.divmod(ids, self._each)
         return [
-            (int(i), rows, own[rows])
+            (int(i), rows, part_ids[rows])
             for i in np.unique(part)
             if len(rows := np.flatnonzero(part == i))
         ]
 
 
-def _in_order(ids: Array, found: Sequence[tuple[Array, Array]]) -> Array:
-    whole = np.empty((len(ids), *found[0][1].shape[1:]), found[0][1].dtype)
-    for rows, part in found:
+def _in_order(ids: Array, parts: Sequence[tuple[Array, Array]]) -> Array:
+    whole = np.empty((len(ids), *parts[0][1].shape[1:]), parts[0][1].dtype)
+    for rows, part in parts:
         whole[rows] = part
     return whole
 

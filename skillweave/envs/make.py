@@ -1,4 +1,4 @@
-"""Which environment, and by which engine: ``EnvSpec`` and ``make_engine``."""
+"""The declaration of an environment, ``EnvSpec``, and the choice of its engine."""
 
 from __future__ import annotations
 
@@ -29,32 +29,32 @@ from skillweave.settings import AtLeastOne, Check, check_fields
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 
 MOST = 65_536
-"""Environments in one engine."""
+"""The most environments in one engine."""
 SLOW = 50e-6
-"""Seconds of a step above which environments are stepped in several processes."""
-PIECES, STEPS = 5, 50
-"""Steps that are timed to find out: so many pieces, of at most so many steps each."""
+"""Seconds of a step above which several processes step the environments."""
+PIECES = 5
+STEPS = 50
+"""The number of timed pieces, and the most steps of each, to measure the seconds of a step."""
 PIECE_SECONDS = 0.1
-"""A piece that takes longer ends."""
+"""The most seconds of a timed piece."""
 EngineName = Literal["auto", "envpool", "sync"]
 Maker = Annotated[
     str | Callable[..., gym.Env[Any, Any]],
     Check(
-        "a Gymnasium id, or a function that makes an environment (environments are made many "
-        "times over)",
+        "a Gymnasium id, or a function that makes an environment (many environments are made)",
         lambda x: not isinstance(x, gym.Env),
     ),
 ]
-"""What makes an environment."""
+"""A Gymnasium id, or a function that makes an environment."""
 Wrappers = Annotated[
     tuple[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]], ...],
     Check("a tuple of functions that take an environment and return one"),
 ]
-"""What wraps an environment, first one first."""
+"""Wrappers of an environment, in the order of application."""
 PoolMaker = Annotated[
     MakePool, Check("a function of num_envs, threads and seed that makes a pool", callable)
 ]
-"""What makes environments side by side."""
+"""A function that makes environments side by side."""
 Names = Annotated[
     ObsNames,
     Check(
@@ -66,7 +66,7 @@ Names = Annotated[
 
 
 class Spaces(NamedTuple):
-    """What an environment shows, and what it takes."""
+    """The observation space and the action space of an environment."""
 
     observation: gym.Space[Any]
     action: gym.Space[Any]
@@ -75,7 +75,7 @@ class Spaces(NamedTuple):
 @checked_names
 @dataclass(frozen=True)
 class EnvSpec:
-    """An environment to make as often as needed.
+    """The declaration of an environment, from which any number can be made.
 
     ```python
     import skillweave as sw
@@ -87,24 +87,23 @@ class EnvSpec:
         env: a Gymnasium id, or a function that makes one environment.
         kwargs: passed to ``gymnasium.make``, or to that function; not to ``pool``. A run records
             them, so to train they must be numbers, texts, lists and dicts.
-        wrappers: applied to each environment, first one first.
-        engine: envpool (C++ threads); sync (Python); auto takes EnvPool where it has the
-            environment as Gymnasium defines it, else sync.
-        pool: makes the same environments side by side, for training: EnvPool's, perhaps with
-            changes (``PoolWrapper``). Scores are of ``env``; engine sync steps ``env``, too. What
-            is kept after learning together is found out in the pool.
-        workers: processes in which environments are stepped, and acted in, while they are trained
-            in. None: one, where they stand in a pool; else it is measured when a run begins, one
-            for each core if a step takes long enough to be worth it, and if a process would not run
-            the program again (see ``multiprocessing``'s start methods). The run keeps the choice,
-            as results depend on it. The members of a population are split among them; None: they
-            stay in one.
-        obs_names: what the numbers of an observation are called in reports: a name for each, or for
-            a Dict such lists by key. None: those of the environment's attribute ``obs_names``.
+        wrappers: applied to each environment, in this order.
+        engine: envpool (C++ threads); sync (Python); auto uses EnvPool where it has the environment
+            as Gymnasium defines it, else sync.
+        pool: makes the same environments side by side, for training: EnvPool's, perhaps wrapped
+            (``PoolWrapper``). Scores are of ``env``; engine sync steps ``env``, too. The pool also
+            decides which weights are kept after learning together.
+        workers: processes that step environments and act in them during training. None: one for a
+            pool; else measured when a run begins: one for each core if steps are slow enough, and
+            if a process would not run the program again (see ``multiprocessing``'s start methods).
+            The run records the number, because results depend on it. The members of a population
+            are split among them; None: one process.
+        obs_names: names of an observation's numbers in reports: a name for each, or for a Dict such
+            lists by key. None: those of the environment's attribute ``obs_names``.
 
     Raises:
-        DeclarationError: a field is of another kind, or fields do not fit each other; the message
-            says which.
+        DeclarationError: a field has a wrong type, or fields do not fit each other; the message
+            names it.
     """
 
     env: Maker
@@ -113,7 +112,7 @@ class EnvSpec:
     engine: EngineName = "auto"
     workers: AtLeastOne | None = None
     pool: PoolMaker | None = None
-    # What numbers are called makes no other environment.
+    # Names do not make a different environment.
     obs_names: Names | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -124,7 +123,7 @@ class EnvSpec:
 
     @property
     def spaces(self) -> Spaces:
-        """The environment's spaces; one is made to read them, the first time."""
+        """Return the environment's spaces; the first time, make one to read them."""
         known: Spaces | None = vars(self).get("_spaces")
         return self.read_spaces() if known is None else known
 
@@ -133,32 +132,32 @@ class EnvSpec:
         """Make an environment, and return its spaces.
 
         Raises:
-            EnvError: it cannot be made.
+            EnvError: the environment cannot be made.
         """
         with closing(self.make()) as env:
-            found = Spaces(env.observation_space, env.action_space)
-        object.__setattr__(self, "_spaces", found)
-        return found
+            spaces = Spaces(env.observation_space, env.action_space)
+        object.__setattr__(self, "_spaces", spaces)
+        return spaces
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if k != "_spaces"}
 
     def make(self, render_mode: str | None = None, number: int | None = None) -> CheckedEnv:
-        """One environment of Gymnasium's, whose errors say its name and its ``number``.
+        """Make one environment, whose errors name it and its ``number``.
 
         Args:
             render_mode: Gymnasium's, "rgb_array" for films.
-            number: told in messages.
+            number: its number in messages.
 
         Returns:
             The environment, whose steps are checked.
 
         Raises:
-            EnvError: there is no such environment (with close matches), or it cannot be made.
-            MissingExtra: a dependency of it is not installed.
+            EnvError: the environment does not exist (with close matches), or cannot be made.
+            MissingExtra: a dependency is not installed.
         """
         try:
-            env = self._made(render_mode)
+            env = self._unchecked(render_mode)
             for wrapper in self.wrappers:
                 env = wrapper(env)
         except SkillweaveError:
@@ -168,7 +167,7 @@ class EnvSpec:
             raise EnvError(f"{self.name}{which} could not be made: {told(error)}") from error
         return CheckedEnv(env, self.name, number)
 
-    def _made(self, render_mode: str | None) -> gym.Env[Any, Any]:
+    def _unchecked(self, render_mode: str | None) -> gym.Env[Any, Any]:
         if isinstance(self.env, str):
             return self._from_registry(self.env, render_mode)
         if render_mode is None:
@@ -191,7 +190,7 @@ class EnvSpec:
                 word = "unexpected keyword argument 'render_mode'"
                 if render_mode is not None or word not in str(error):
                     raise
-                return gym.make(env_id, **self.kwargs)  # what is never seen need not know it
+                return gym.make(env_id, **self.kwargs)  # an environment that cannot be rendered
         except gym.error.DependencyNotInstalled as error:
             if "box2d" in str(error).lower():
                 raise MissingExtra(f"the environment {env_id}", "box2d") from error
@@ -204,17 +203,17 @@ class EnvSpec:
             why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, others)
             if not advice and ":" not in env_id:
                 advice = (
-                    " If a package of its own registers it, install that and import it, or write "
+                    " If another package registers it, install and import that package, or write "
                     f"its module first: 'module:{env_id}'."
                 )
             why += "" if why.endswith("?") else "."
             raise EnvError(f"no environment {short(env_id)}: {why}{advice}") from error
 
     def observation_names(self) -> ObsNames | None:
-        """Return the names of an observation's numbers; None: they have none.
+        """Return the names of an observation's numbers; None: they have no names.
 
-        They are ``obs_names``, or else what the environment's own attribute ``obs_names`` says, or
-        what Gymnasium documents of its own environments.
+        They are ``obs_names``, else the environment's attribute ``obs_names``, else the names in
+        Gymnasium's documentation of its environments.
         """
         if self.obs_names is not None:
             return self.obs_names
@@ -227,45 +226,45 @@ class EnvSpec:
 
     @property
     def name(self) -> str:
-        """The id, or the name of the function."""
+        """Return the id, or the name of the function."""
         if isinstance(self.env, str):
             return self.env
         return str(getattr(self.env, "__name__", type(self.env).__name__))
 
     @property
     def json_kwargs(self) -> dict[str, Any]:
-        """``kwargs`` as a run records them.
+        """Return ``kwargs`` in the form that a run records.
 
         Raises:
-            DeclarationError: one of them cannot be recorded; the message names it and proposes a
+            DeclarationError: a value cannot be recorded; the message names it and proposes a
                 function.
         """
-        found = {}
+        recorded = {}
         for name, value in self.kwargs.items():
             known = isinstance(self.env, str)
-            call = f"gymnasium.make({self.env!r}, " if known else f"{self._called}("
-            found[name] = as_json(
+            call = f"gymnasium.make({self.env!r}, " if known else f"{self._function_name}("
+            recorded[name] = as_json(
                 value,
                 f"{self.name}: kwargs[{name!r}]",
-                f"put it into a function, and give that as env: def make(): return {call}"
+                f"put it into a function, and pass that as env: def make(): return {call}"
                 f"{name}=...)",
             )
-        return found
+        return recorded
 
     @property
-    def _called(self) -> str:
-        """Return the name for messages of the function that makes the environment."""
+    def _function_name(self) -> str:
+        """Return the name in messages of the function that makes the environment."""
         return self.name if self.name.isidentifier() else "your_function"
 
     @property
     def is_data(self) -> bool:
-        """Whether an id and plain settings say it all, without any code of the user's."""
+        """Return whether an id and plain settings define the environment, without user code."""
         plain = not self.wrappers and self.pool is None
         return isinstance(self.env, str) and ":" not in self.env and plain
 
 
 def spec_of(declared: Any) -> EnvSpec:
-    """Return the environment of a declaration, fully specified; the same one as long as it is."""
+    """Return the ``EnvSpec`` of a declaration; the same object while ``env`` does not change."""
     if isinstance(declared.env, EnvSpec):
         return declared.env
     known: EnvSpec | None = vars(declared).get("_spec")
@@ -275,10 +274,10 @@ def spec_of(declared: Any) -> EnvSpec:
 
 
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
-    """The engine for ``num_envs`` environments of this kind.
+    """Return the engine for ``num_envs`` environments of this kind.
 
     Args:
-        threads: of EnvPool's pool; None: one for each core.
+        threads: threads of EnvPool's pool; None: one for each core.
         first: the number of the first environment, for messages.
     """
     if num_envs > MOST:
@@ -299,15 +298,15 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first:
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def workers_for(spec: EnvSpec) -> int:
-    """How many processes are to step the environments: as the spec says, else by measuring.
+    """Return the number of processes that step the environments: the spec's, or measured.
 
-    A step of one environment is timed, some hundred times where it is fast. If it is slow, there
-    is one process for each core, else all stay in this one.
+    A step of one environment is timed, a few hundred times if it is fast. If it is slow, each core
+    gets a process, else one process steps all.
     """
     if spec.workers is not None:
         return spec.workers
@@ -323,12 +322,12 @@ def workers_for(spec: EnvSpec) -> int:
 
 
 def in_pool(spec: EnvSpec, reference: gym.Env[Any, Any]) -> bool:
-    """Whether ``make_engine`` makes a pool of this environment."""
+    """Return whether ``make_engine`` makes a pool of this environment."""
     return spec.engine != "sync" and _pool_of(spec, reference) is not None
 
 
 def _pool_of(spec: EnvSpec, reference: gym.Env[Any, Any]) -> MakePool | None:
-    """What makes pools of this environment; None: there are none."""
+    """Return the function that makes pools of this environment; None: it has none."""
     if spec.pool is not None:
         return spec.pool if _fits(spec, spec.pool, reference) else None
     plain = isinstance(spec.env, str) and not spec.kwargs and not spec.wrappers
@@ -338,10 +337,10 @@ def _pool_of(spec: EnvSpec, reference: gym.Env[Any, Any]) -> MakePool | None:
 
 
 def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
-    """Whether the user's pool can be made here.
+    """Return whether the user's pool can be made.
 
     Raises:
-        EnvError: it can, but is of another environment.
+        EnvError: it is a pool of another environment.
     """
     try:
         pool = make(num_envs=1, threads=1, seed=0)
@@ -350,8 +349,8 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
     if isinstance(pool, gym.vector.VectorEnv):
         raise EnvError(
             f"{spec.name}: pool made {short(pool)}, a VectorEnv, which steps all its environments "
-            "at once; a pool must step some while the others stand still, as EnvPool does: leave "
-            "out pool, and each environment is stepped by itself"
+            "at once; a pool must step some while the others do not change, as EnvPool does: omit "
+            "pool, and each environment is stepped by itself"
         )
     for what in ("observation_space", "action_space"):
         theirs, ours = getattr(pool, what), getattr(reference, what)
@@ -359,24 +358,24 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         if not alike or theirs.dtype != ours.dtype:
             raise EnvError(
                 f"{spec.name}: its pool's {what} is {short(theirs)}, but the environment's is "
-                f"{short(ours)}; give the pool a PoolWrapper that makes them alike"
+                f"{short(ours)}; wrap the pool in a PoolWrapper that makes them equal"
             )
     return True
 
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:
-    """Seconds of a step with random actions: the least of several means, so load does not count."""
+    """Measure the seconds of a random step: the least of several means, to exclude load."""
     space, rng = env.observation_space, np.random.default_rng(0)
     masks = ActionMasks(env.action_space, 1, observation_space=space)
     discrete = isinstance(env.action_space, gym.spaces.Discrete)
     means = []
 
-    def seen(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
+    def see(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
         batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
         put_observation(space, batch, 0, obs)
         masks.see(batched_infos([info]), ended=np.array([ended]), obs=batch)
 
-    seen(*env.reset(seed=0))
+    see(*env.reset(seed=0))
     for _ in range(PIECES):
         spent, steps, until = 0.0, 0, time.perf_counter() + PIECE_SECONDS
         while steps == 0 or (steps < STEPS and time.perf_counter() < until):
@@ -384,8 +383,8 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
             began = time.perf_counter()
             obs, _, terminated, truncated, info = env.step(int(action) if discrete else action)
             spent, steps = spent + time.perf_counter() - began, steps + 1
-            seen(obs, info, terminated or truncated)
+            see(obs, info, terminated or truncated)
             if terminated or truncated:
-                seen(*env.reset())
+                see(*env.reset())
         means.append(spent / steps)
     return min(means)

@@ -15,25 +15,36 @@ ObsNames: TypeAlias = Sequence[str] | Mapping[str, Sequence[str]]
 
 GYMNASIUM: dict[str, tuple[str, ...]] = {
     "Acrobot": (
-        "cos of joint 1", "sin of joint 1", "cos of joint 2", "sin of joint 2",
-        "angular speed 1", "angular speed 2",
+        "cos of joint 1",
+        "sin of joint 1",
+        "cos of joint 2",
+        "sin of joint 2",
+        "angular speed 1",
+        "angular speed 2",
     ),
     "CartPole": ("cart position", "cart speed", "pole angle", "pole angular speed"),
     "LunarLander": (
-        "x", "y", "x speed", "y speed", "angle", "angular speed", "left leg", "right leg",
+        "x",
+        "y",
+        "x speed",
+        "y speed",
+        "angle",
+        "angular speed",
+        "left leg",
+        "right leg",
     ),
     "MountainCar": ("position", "speed"),
     "MountainCarContinuous": ("position", "speed"),
     "Pendulum": ("cos of angle", "sin of angle", "angular speed"),
-}  # fmt: skip
-"""By id without its version: names of Gymnasium's own environments, from its documentation."""
+}
+"""Names in Gymnasium's environments by id without version, from its documentation."""
 
 
 def checked_obs_names(names: object, where: str) -> ObsNames | None:
     """Return the names, if they are texts in a list, or such lists by key.
 
     Raises:
-        DeclarationError: they are something else; the message begins with ``where``.
+        DeclarationError: they are not; the message begins with ``where``.
     """
     if names is None:
         return None
@@ -51,16 +62,16 @@ def checked_obs_names(names: object, where: str) -> ObsNames | None:
 
 
 def names_in(env: gym.Env[Any, Any], env_id: str | None) -> ObsNames | None:
-    """Return the names that an environment has itself, or that Gymnasium documents.
+    """Return the names in an environment's attribute, or those that Gymnasium documents.
 
     Args:
-        env: may have an attribute ``obs_names``; a wrapper's comes before that of what it wraps.
-        env_id: its id, where no wrapper of the user's changes what is observed.
+        env: may have an attribute ``obs_names``; an outer wrapper's takes precedence.
+        env_id: its id, if no wrapper of the user changes observations.
     """
     try:
-        own = env.get_wrapper_attr("obs_names")
+        names = env.get_wrapper_attr("obs_names")
     except AttributeError:
-        own = None
-    if own is not None:
-        return checked_obs_names(own, type(env.unwrapped).__name__)
+        names = None
+    if names is not None:
+        return checked_obs_names(names, type(env.unwrapped).__name__)
     return GYMNASIUM.get((env_id or "").rpartition("-v")[0])

@@ -1,4 +1,4 @@
-"""Many environments side by side, as EnvPool steps them: ``Pool``, and what changes one."""
+"""Many environments side by side, stepped as by EnvPool: ``Pool`` and its wrappers."""
 
 from __future__ import annotations
 
@@ -16,52 +16,52 @@ from skillweave.types import Array
 
 
 class Pool(Protocol):
-    """Environments of which some can be reset, or stepped, while the others stand still.
+    """Environments of which some can be reset or stepped, while the others do not change.
 
-    What happens in one is a function of the pool's seed, its own number, and the resets and
-    actions since: so an episode can be played again after a checkpoint.
+    The dynamics of each are a function of the pool's seed, its number, and its resets and actions
+    since, so an episode can be repeated after a checkpoint.
     """
 
     observation_space: Any
-    """Of one environment."""
+    """The space of one environment."""
     action_space: Any
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """Begin episodes in environments ``ids`` (k,) int32: observations (k, …), and infos."""
+        """Reset environments ``ids`` (k,) int32; return observations (k, …) and infos."""
         ...
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Act in environments ``ids`` (k,) int32.
+        """Step environments ``ids`` (k,) int32.
 
         Args:
             action: (k, …).
 
         Returns:
-            Observations (k, …), rewards, and (k,) bool each whether the episode has terminated or
-            was truncated, and infos, whose arrays have k rows.
+            Observations (k, …), rewards (k,), terminated (k,) bool, truncated (k,) bool, and infos,
+            whose arrays have k rows.
         """
         ...
 
 
 class MakePool(Protocol):
-    """Makes a pool; the same again for the same arguments."""
+    """A function that makes a pool; equal arguments make equal pools."""
 
     def __call__(self, num_envs: int, threads: int, seed: int) -> Pool:
-        """A pool of ``num_envs`` environments.
+        """Return a pool of ``num_envs`` environments.
 
         Raises:
-            MissingExtra: what it needs is not installed.
+            MissingExtra: a package that it needs is not installed.
         """
         ...
 
 
 @checked_names
 class PoolWrapper:
-    """A pool seen otherwise: override ``see``, or ``reset`` and ``step``.
+    """A wrapper that changes a pool: override ``see``, or ``reset`` and ``step``.
 
     Args:
-        pool: what is wrapped.
-        observation_space: of one environment; None: as it was.
+        pool: the wrapped pool.
+        observation_space: the new space of one environment; None: the pool's.
     """
 
     def __init__(self, pool: Any, observation_space: gym.Space[Any] | None = None) -> None:
@@ -70,11 +70,11 @@ class PoolWrapper:
         self.action_space = pool.action_space
 
     def see(self, obs: Any, ids: Array) -> Any:
-        """What is seen of observations; here all.
+        """Convert observations; by default, return them unchanged.
 
         Args:
             obs: (k, …), of the pool.
-            ids: (k,) int32, which environments.
+            ids: (k,) int32, their environments.
 
         Returns:
             Observations (k, …) of ``observation_space``.
@@ -82,10 +82,10 @@ class PoolWrapper:
         return obs
 
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
-        """Begin episodes in some environments.
+        """Reset some environments.
 
         Args:
-            ids: (k,) int32, which environments.
+            ids: (k,) int32, the environments.
 
         Returns:
             Observations (k, …), and infos.
@@ -94,15 +94,15 @@ class PoolWrapper:
         return self.see(obs, ids), info
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Act in some environments.
+        """Step some environments.
 
         Args:
             action: (k, …).
-            ids: (k,) int32, which environments.
+            ids: (k,) int32, the environments.
 
         Returns:
-            Observations (k, …), rewards (k,), whether each episode has terminated (k,) bool or was
-            truncated (k,) bool, and infos, whose arrays have k rows.
+            Observations (k, …), rewards (k,), terminated (k,) bool, truncated (k,) bool, and infos,
+            whose arrays have k rows.
         """
         obs, reward, terminated, truncated, info = self.pool.step(action, ids)
         return self.see(obs, ids), reward, terminated, truncated, info
@@ -110,13 +110,13 @@ class PoolWrapper:
 
 @checked_names
 def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) -> Any:
-    """A pool of EnvPool's environments.
+    """Return a pool of EnvPool's environments.
 
     Args:
-        env_id: EnvPool's name of it.
+        env_id: EnvPool's id.
         num_envs: environments side by side.
-        threads: that step them.
-        seed: of all.
+        threads: threads that step them.
+        seed: the seed of all.
         **kwargs: EnvPool's settings of the environment.
 
     Returns:
@@ -124,7 +124,7 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
 
     Raises:
         MissingExtra: EnvPool is not installed.
-        EnvError: it has no such environment (with close matches).
+        EnvError: EnvPool has no such environment (with close matches).
     """
     package = installed()
     if env_id not in (known := package.list_all_envs()):
@@ -140,17 +140,17 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
 
 @contextmanager
 def no_precision_warnings() -> Iterator[None]:
-    """EnvPool states bounds in float64 for float32 spaces, and Gymnasium warns of it each time."""
+    """Hide Gymnasium's warning of EnvPool's bounds, float64 in float32 spaces."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*precision lowered.*")
         yield
 
 
 def installed() -> Any:
-    """The package ``envpool``.
+    """Return the package ``envpool``.
 
     Raises:
-        MissingExtra: it is not there.
+        MissingExtra: it is not installed.
     """
     try:
         import envpool as package

@@ -1,1 +1,1 @@
-"""Evolution: a population that learns in stacks, is judged, selected and mutated."""
+"""Evolution: a population that learns in stacks, is compared, selected and mutated."""

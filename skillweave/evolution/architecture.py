@@ -1,7 +1,7 @@
-"""Changes of a member's networks: all of them together, weights and moments alike.
+"""Changes of a member's networks, weights and moments included.
 
-A change is drawn for the settings' networks (``network`` and, where it has its own, ``critic``);
-``rebuilt`` then carries every tensor of the member's state over.
+A change is drawn for the settings' networks (``network`` and, if it has one, ``critic``);
+``rebuilt`` then converts every tensor of the member's state.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from skillweave.networks.stacked import Views
 from skillweave.networks.units import Units, channels_of, hidden_units, joint_of
 
 Alter = Callable[[Views, bool], dict[str, Tensor]]
-"""Parameters by name, and whether they are moments, to those of the changed network."""
+"""A function from parameters by name, and whether they are moments, to changed parameters."""
 Plan = Callable[[Views], Alter]
-"""What learns, by name, to what is done to it and to all that goes with it."""
+"""A function from the learning parameters by name to the change of these and their copies."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """What happens to the networks: to units of a layer, or to a whole one."""
+    """A change of the networks: of units of a layer, or of a whole layer."""
 
     kind: str  # units, channels, kernel, layer
     layer: int = 0
@@ -44,7 +44,7 @@ class Change:
 
 
 def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str) -> None:
-    """Raise a DeclarationError where networks cannot be changed as asked for."""
+    """Raise a DeclarationError where networks do not support the mutations."""
     if mutations.architecture == 0.0:
         return
     for name, network in networks_of(config).items():
@@ -68,7 +68,7 @@ def check_architecture(config: AlgorithmConfig, mutations: Mutations, where: str
 
 
 def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> Change | None:
-    """A change that fits the limits, or None where there is none."""
+    """Draw a change within the limits; return None if no change is possible."""
     config = member.config
     network: Network = config.network
     units = [
@@ -89,7 +89,7 @@ def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> 
 
 
 def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> list[Change]:
-    """Kernels that can change by a pixel while every layer's output keeps its size."""
+    """Return changes of kernels by a pixel that keep the size of every layer's output."""
     obs, found = member.algorithm(spaces).obs, []
     low, high = mutations.kernels
     for layer, kernel in enumerate(cnn.kernels):
@@ -104,20 +104,20 @@ def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> lis
                     for i in range(len(obs.images))
                 ]
             except DeclarationError:
-                continue  # larger than what is left of the image
+                continue  # larger than the remaining image
             if all(old == new for old, new in sizes):
                 found.append(change)
     return found
 
 
 def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
-    """By how much a size can grow and shrink within its limits."""
+    """Return the possible growth and shrinkage of a size within its limits."""
     grown, shrunk = min(limits[1], size + by) - size, max(limits[0], size - by) - size
     return [step for step, ok in ((grown, grown > 0), (shrunk, shrunk < 0)) if ok]
 
 
 def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
-    """Whether a layer can be added or taken away."""
+    """Return whether a layer can be added or removed."""
     network, fewest = config.network, mutations.layers[0]
     behind = len(network.hidden) - getattr(config, "dueling", False)
     if by < 0:
@@ -130,14 +130,14 @@ def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
 
 
 def _cnn(member: Member, spaces: Any) -> CNN | None:
-    """What encodes the member's images, if one architecture encodes them all."""
+    """Return the CNN of the member's images, if one architecture encodes them all."""
     (_, net), *_ = member.algorithm(spaces).parameter_groups()[0].nets
     kinds = {e.cnn for e in net.encoders.values() if isinstance(e, ImageEncoder)}
     return kinds.pop() if len(kinds) == 1 else None
 
 
 def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) -> Network:
-    """The network after a change; ``cnn`` is what encodes its images now."""
+    """Return the network after a change; ``cnn`` is its current encoder of images."""
     if change.kind == "channels":
         assert cnn is not None
         new = tuple(c + change.by * (i == change.layer) for i, c in enumerate(cnn.channels))
@@ -159,7 +159,7 @@ def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) ->
 
 
 def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generator) -> Member:
-    """The member after a change: settings, weights and moments."""
+    """Return the member after a change: settings, weights and moments."""
     old = member.algorithm(spaces)
     cnn, dueling = _cnn(member, spaces), bool(getattr(old.config, "dueling", False))
     networks: dict[str, Any] = {
@@ -182,10 +182,10 @@ def _carried(
     change: Change,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    """A family's fields in the new layout."""
+    """Return a family's fields in the new layout."""
     names = (*before.weights, *before.moments, before.count)
     lead = state[names[0]].shape[:-1]
-    # What is new begins with moments of 0 after 0 steps; the others' go on.
+    # New parameters begin with moments of 0 after 0 steps; the others keep theirs.
     count = spread_count(state[before.count], state[names[0]]).double()  # as moments are: no int
     flat = {**state, before.count: count}
     named = {k: before.layout.views(flat[k].reshape(-1, before.layout.size)) for k in names}
@@ -198,7 +198,7 @@ def _carried(
 
 
 def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
-    """What happens to a network's parameters, one plan after another."""
+    """Return the changes of a network's parameters, one after another."""
     if change.kind == "layer":
         joint, activation = joint_of(net), net.network.activation
         if change.by > 0:
@@ -216,7 +216,7 @@ def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
 
 
 def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -> Alter:
-    """More units or fewer; which, and what they compute, is the same for all of a family."""
+    """Return a change of the number of units, the same for all parameters of a family."""
     if by > 0:
         new = growth.fresh(online, units, by, generator)
         return lambda v, moments: growth.widened(v, units, by, None if moments else new)

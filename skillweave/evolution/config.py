@@ -1,4 +1,4 @@
-"""How a population evolves, as data; this module does not import torch."""
+"""Settings of evolution; this module does not import torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
 @checked_settings
 @dataclass(frozen=True)
 class Range:
-    """Where a setting may lie, and how it moves there.
+    """The range of a setting, and the scale on which it mutates.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
@@ -43,12 +43,12 @@ class Range:
             check(self, "high", self.high < 1.0, "below 1 as a complement")
 
     def to_unit(self, value: float) -> float:
-        """Where a ``value`` lies between low (0) and high (1)."""
+        """Return the position of a ``value`` between low (0) and high (1)."""
         low, high, x = (self._scaled(v) for v in (self.low, self.high, value))
         return (x - low) / (high - low)
 
     def from_unit(self, unit: float) -> float:
-        """The inverse of ``to_unit``: the value at ``unit``, kept within the range."""
+        """Return the value at position ``unit``, clipped to the range."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         x = low + min(1.0, max(0.0, unit)) * (high - low)
         value = {"linear": x, "log": math.exp(x), "complement": 1.0 - math.exp(-x)}[self.scale]
@@ -81,9 +81,9 @@ USUAL: dict[str, Range] = {
     "exploration_final_eps": Range(0.001, 0.2),
     "target_kl": Range(0.002, 0.1),
 }
-"""Every setting that can mutate, and its usual range."""
+"""All settings that can mutate, and their default ranges."""
 _MUTATED = ("learning_rate", "gamma", "gae_lambda", "clip_coef", "ent_coef", "tau")
-"""Those that do where nothing else is said: they never part a stack."""
+"""Settings that mutate by default: they never split a stack."""
 
 
 Limits = Annotated[
@@ -100,30 +100,30 @@ Activations = Annotated[
 @checked_settings
 @dataclass(frozen=True)
 class Mutations:
-    """What happens to an heir: one kind of change, by these probabilities.
+    """Probabilities of the kinds of change of an heir, of which one happens.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
     none: Fraction = 0.2
-    """Nothing."""
+    """No change."""
     hyperparameters: Fraction = 0.4
     """One setting moves within its range."""
     parameters: Fraction = 0.1
     """Gaussian noise on a share of the policy's weights."""
     architecture: Fraction = 0.2
-    """Units or a layer are added or removed; growth leaves the function as it was."""
+    """Units or a layer are added or removed; growth does not change the function."""
     activation: Fraction = 0.1
     """Another nonlinearity."""
     ranges: Mapping[str, Range] | None = None
-    """By setting; None: learning_rate, gamma and others, where the start value is usual."""
+    """Ranges by setting; None: learning_rate, gamma and others, if the start value is within."""
     strength: NonNegative = 0.1
-    """Deviation of the noise on weights, in units of the layer's weights' own."""
+    """Deviation of the noise on weights, in units of the deviation of the layer's weights."""
     share: Fraction = 0.1
     """Share of the weights that get noise."""
     step: Fraction = 0.1
-    """How far a setting moves: this share of its range, up or down."""
+    """The step of a setting, up or down, as a share of its range."""
     layer_share: Fraction = 0.2
     """Share of architecture mutations that add or remove a layer; the others change units."""
     layers: Limits = (1, 3)
@@ -133,7 +133,7 @@ class Mutations:
     channels: Limits = (8, 64)
     """Fewest and most channels of a convolution."""
     kernels: Limits = (1, 8)
-    """Smallest and largest kernel of a convolution; it changes where no output's size does."""
+    """Smallest and largest kernel of a convolution; changes keep the size of all outputs."""
     activations: Activations = ("tanh", "relu", "elu", "silu")
     """Nonlinearities to choose from."""
 
@@ -146,17 +146,17 @@ class Mutations:
             )
 
     def ranges_of(self, config: AlgorithmConfig, *, start: bool = True) -> dict[str, Range]:
-        """The ranges of an algorithm's settings.
+        """Return the ranges of an algorithm's settings.
 
         Args:
             config: the algorithm's settings.
-            start: its own values are those that members begin with, so they must lie within.
+            start: members begin with its values, so these must be within the ranges.
 
         Returns:
             By setting, its range.
 
         Raises:
-            DeclarationError: a setting that it does not have, or a range without the start value.
+            DeclarationError: a setting does not exist, or a range excludes the start value.
         """
         own = {f.name for f in fields(config)}
         learnt = {"ent_coef"} if getattr(config, "learn_ent_coef", False) else set()
@@ -176,12 +176,12 @@ class Mutations:
             if name in learnt:
                 raise DeclarationError(
                     f"Mutations.ranges: {kind} learns {name} (learn_{name}=True), so a mutation "
-                    f"would change nothing: leave it out, or set learn_{name}=False"
+                    f"would have no effect: omit it, or set learn_{name}=False"
                 )
             if name == "learning_rate" and scheduled:
                 raise DeclarationError(
                     f"Mutations.ranges: {kind}.learning_rate is a schedule, which cannot mutate: "
-                    "leave it out, or give a number"
+                    "omit it, or give a number"
                 )
             value = getattr(config, name)
             if start and (value is None or not found.low <= value <= found.high):
@@ -195,7 +195,7 @@ class Mutations:
 @checked_settings
 @dataclass(frozen=True)
 class Tournament:
-    """Each heir's parent is the best of a few members drawn at random.
+    """A selection in which each heir's parent is the best of a few members drawn at random.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
@@ -204,20 +204,20 @@ class Tournament:
     size: AtLeastOne = 2
     """Members in a tournament."""
     elitism: bool = True
-    """The best member goes on as it is."""
+    """The best member continues unchanged."""
 
 
 @checked_settings
 @dataclass(frozen=True)
 class Truncation:
-    """The worst members become heirs of the best; all others go on (Jaderberg et al. 2017).
+    """A selection that replaces the worst members by heirs of the best (Jaderberg et al. 2017).
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
     """
 
     share: Annotated[float, Check("more than 0 and at most 0.5", lambda x: 0 < x <= 0.5)] = 0.25
-    """Of the members, how many are replaced, and by how many."""
+    """The share of members that are replaced, and that are parents."""
 
 
 @checked_settings
@@ -239,18 +239,18 @@ class Evolution:
     population: AtLeastOne = 8
     """Members."""
     generations: AtLeastOne = 20
-    """How often they are compared; what is left of the budget is shared evenly between them."""
+    """The number of comparisons; the rest of the budget is shared evenly between them."""
     episodes: AtLeastOne = 10
-    """Episodes that a member's fitness is the mean return of; the same starts for all. They are
-    played in at most as many environments as a member trains in (``num_envs``)."""
+    """Episodes whose mean return is a member's fitness; all members play the same ones, in at most
+    as many environments as in training (``num_envs``)."""
     target: float | None = None
     """Fitness at which evolution ends early; None: never."""
     start: Literal["config", "random"] = "config"
-    """Members begin with the settings given, or with settings drawn from the ranges."""
+    """Members begin with the declared settings, or with settings drawn from the ranges."""
     selection: Any = field(default_factory=Tournament)
     """Tournament(), Truncation(), or your own: see ``ParentSelection``."""
     mutations: Mutations = field(default_factory=Mutations)
-    """What changes from parent to heir."""
+    """The changes from parent to heir."""
 
     def __post_init__(self) -> None:
         if isinstance(self.selection, Tournament) and self.selection.elitism:
@@ -264,7 +264,7 @@ class Evolution:
 
 
 def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
-    """Plain JSON; a selection of the user's own by its name."""
+    """Convert to plain JSON; a selection of the user becomes its name."""
     data = asdict(evolution)
     data["selection"] = {"kind": type(evolution.selection).__name__}
     if isinstance(evolution.selection, Tournament | Truncation):
@@ -273,7 +273,7 @@ def evolution_to_json(evolution: Evolution) -> dict[str, Any]:
 
 
 def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = None) -> Evolution:
-    """The inverse of ``evolution_to_json``; ``selection``: the user's own, which is not in it.
+    """Read the JSON of ``evolution_to_json``; ``selection`` is the user's, which it lacks.
 
     Raises:
         DeclarationError: an unknown field, a value of another type or out of range, or the
@@ -285,7 +285,7 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
     known: dict[str, Any] = {"Tournament": Tournament, "Truncation": Truncation}
     if kind not in known and type(selection).__name__ != kind:
         raise DeclarationError(
-            f"{where} evolves by a selection of your own, {kind[:60]}; give it: "
+            f"{where} evolves by a selection of your own, {kind[:60]}; pass it: "
             f"resume(..., evolve=Evolution(selection={kind[:60]}(), ...))"
         )
     if kind in known:
@@ -295,6 +295,6 @@ def evolution_from_json(data: Mapping[str, Any], where: str, selection: Any = No
 
 
 class _Selection(TypedDict):
-    """How a selection begins in JSON; the rest are its settings."""
+    """The name of a selection in JSON; further fields are its settings."""
 
     kind: str

@@ -14,12 +14,11 @@ from skillweave.training.scene import Scene
 class FitnessArena:
     """Environments in which one member after another plays the same episodes.
 
-    There are at most as many environments as in a member's training: more episodes are played in
-    several rounds.
+    They are at most as many as in a member's training: more episodes are played in several rounds.
 
     Args:
-        scene: where members learn.
-        episodes: of each member.
+        scene: the task that members learn.
+        episodes: the number of episodes of each member.
         num_envs: environments of a member's training.
     """
 
@@ -30,16 +29,20 @@ class FitnessArena:
 
     @property
     def steps_made(self) -> int:
-        """Environment steps that all members have made here together."""
+        """Return the number of steps of all members in these environments."""
         return self._collector.engine.steps_made
 
     def score(self, policy: AgentPolicy, seeds: Seeds) -> float:
         """Return a policy's mean return of the episodes of these seeds; −inf if not finite."""
         arena, total = self._collector, self._episodes
-        returns = np.concatenate([
-            episodes_of(policy, arena, seeds, first, min(arena.num_envs, total - first))[:, RETURN]
-            for first in range(0, total, arena.num_envs)
-        ])  # fmt: skip
+        returns = np.concatenate(
+            [
+                episodes_of(policy, arena, seeds, first, min(arena.num_envs, total - first))[
+                    :, RETURN
+                ]
+                for first in range(0, total, arena.num_envs)
+            ]
+        )
         return float(returns.mean()) if np.isfinite(returns).all() else -np.inf
 
     def close(self) -> None:

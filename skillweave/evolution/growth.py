@@ -1,7 +1,8 @@
 """Networks that grow and shrink: units and layers are added to named parameters, or removed.
 
-Growth leaves the function as it was (Net2Net, Chen et al. 2016, in the form of zero outgoing
-weights): new units are read with weight zero, a new layer computes the identity.
+Stands alone because it is the mathematics of growth, on tensors alone. Growth does not change the
+function (Net2Net, Chen et al. 2016, with zero outgoing weights): new units are read with weight
+zero, a new layer computes the identity.
 
 Letters in shapes: R rows, one per network (a member, or a member's critic).
 """
@@ -25,11 +26,11 @@ PAIRED: tuple[Activation, ...] = ("silu", "gelu")
 
 
 def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) -> dict[str, Tensor]:
-    """Parameters that compute ``extra`` new units, by name: He-normal weights, biases zero.
+    """Draw parameters of ``extra`` new units, by name: He-normal weights, biases zero.
 
-    The deviations of noisy weights are the mean of those that there are.
+    The deviations of noisy weights are the mean of the existing ones.
     """
-    found = {}
+    parameters = {}
     for part in units.own:
         old = named[part.name]
         shape = list(old.shape)
@@ -40,12 +41,12 @@ def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) ->
             new = torch.randn(shape, generator=generator, **FLOAT) * (2.0 / inputs) ** 0.5
         elif part.name.endswith("_sigma"):
             new = new + old.mean()
-        found[part.name] = new
-    return found
+        parameters[part.name] = new
+    return parameters
 
 
 def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
-    """With ``extra`` more units, which nobody reads yet; ``new`` None: of moments, zeros."""
+    """Add ``extra`` units with outgoing weights of zero; ``new`` None: zeros, for moments."""
     found = dict(named)
     for part in (*units.own, *units.onward):
         old = found[part.name]
@@ -59,7 +60,7 @@ def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[s
 
 
 def most_read(named: Views, units: Units, count: int) -> Tensor:
-    """The ``count`` units with the largest outgoing weights, (R, count), in order."""
+    """Return the ``count`` units with the largest outgoing weights, (R, count), in order."""
     total: Tensor | None = None
     for part in units.onward:
         weight = named[part.name].abs().movedim(part.axis, 1)
@@ -72,7 +73,7 @@ def most_read(named: Views, units: Units, count: int) -> Tensor:
 
 
 def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
-    """With the units ``kept`` (R, m) alone."""
+    """Keep only the units ``kept`` (R, m)."""
     found = dict(named)
     rows = len(kept)
     for part in (*units.own, *units.onward):
@@ -93,9 +94,9 @@ def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
 
 
 def with_kernel(named: Views, name: str, by: int) -> dict[str, Tensor]:
-    """With filters (R, out, in, k, k) larger by rows and columns of zeros, or smaller, at the end.
+    """Add rows and columns of zeros at the end of filters (R, out, in, k, k), or remove some.
 
-    Where no layer's output changes its size, larger filters compute the same.
+    If no layer's output changes its size, larger filters compute the same function.
     """
     return {**named, name: torch.nn.functional.pad(named[name], (0, by, 0, by))}
 
@@ -103,7 +104,7 @@ def with_kernel(named: Views, name: str, by: int) -> dict[str, Tensor]:
 def deepened(
     named: Views, joint: Joint, activation: Activation, *, moments: bool
 ) -> dict[str, Tensor]:
-    """With one more hidden layer, the identity; of moments, zeros where something is new."""
+    """Add a hidden layer that is the identity; in moments, new entries are zeros."""
     paired = activation in PAIRED
     found = _renamed(named, joint, 1)
     readers = [tuple(_moved(n, joint, 1) for n in pair) for pair in joint.readers]
@@ -122,7 +123,7 @@ def deepened(
         for sigma in ("", "_sigma") if f"{name}_sigma" in found else ("",):
             old = found[name + sigma]
             if activation == "elu" and not moments and not sigma:
-                # elu(x + 1) = x + 1 for all that an elu puts out; the reader takes it back.
+                # elu(x + 1) = x + 1 for any output x of an elu; the reader subtracts the 1.
                 found[offset] = found[offset] - old.sum(-2, keepdim=True)
             if paired:
                 other = torch.zeros_like(old) if moments or sigma else -old
@@ -131,9 +132,9 @@ def deepened(
 
 
 def shallower(named: Views, joint: Joint, *, moments: bool) -> dict[str, Tensor]:
-    """Without the last hidden layer: what read it reads the layer before, through its weights.
+    """Remove the last hidden layer: its readers read the layer before, through its weights.
 
-    As if the layer were linear; of moments zeros, as the readers are new.
+    As if the layer were linear; moments become zeros, because the readers are new.
     """
     last = f"{joint.prefix}.{joint.depth - 1}"
     weight, bias = named[f"{last}.weight"], named[f"{last}.bias"]
@@ -158,7 +159,7 @@ def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:
 
 
 def _moved(name: str, joint: Joint, by: int) -> str:
-    """A head counts as the layer behind the hidden ones: its number moves with their depth."""
+    """Return a parameter's new name: the head is the layer after the hidden ones."""
     head = f"{joint.prefix}.{joint.depth}."
     if not name.startswith(head):
         return name

@@ -1,4 +1,7 @@
-"""``lineage.jsonl``: who descends from whom, what changed, and how good it was."""
+"""Lines of ``lineage.jsonl``: each member's parent, changes and fitness.
+
+Stands alone because it is the content of a file, which ``stage`` writes.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ def lineage_of(
     evolution: Evolution,
     best: int | None,
 ) -> list[dict[str, Any]]:
-    """A generation's lines; ``best``: the number of the best so far, if it is one of these."""
+    """Return a generation's lines; ``best``: the best member's number, if it is among them."""
     return [
         {
             "stage": stage,
@@ -42,9 +45,9 @@ def lineage_of(
 
 
 def settings_of(config: AlgorithmConfig, evolution: Evolution) -> dict[str, Any]:
-    """What evolution may change of a member's settings, by name."""
+    """Return the settings of a member that evolution may change, by name."""
     ranges = evolution.mutations.ranges_of(config, start=False)
-    found: dict[str, Any] = {name: getattr(config, name) for name in ranges}
+    settings: dict[str, Any] = {name: getattr(config, name) for name in ranges}
     network: Network = config.network
-    found |= {"hidden": list(network.hidden), "activation": network.activation}
-    return found
+    settings |= {"hidden": list(network.hidden), "activation": network.activation}
+    return settings

@@ -1,4 +1,4 @@
-"""What changes from a parent to its heir: a setting, weights, the architecture, an activation."""
+"""Mutations from a parent to its heir: a setting, weights, the architecture, an activation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Spaces = tuple[Any, Any]
 def mutate(
     member: Member, mutations: Mutations, spaces: Spaces, rng: np.random.Generator
 ) -> Member:
-    """A child of the member, which says what mutation it has; "none" where none is possible."""
+    """Return a child of the member with one mutation, or "none" if no mutation is possible."""
     kind = str(rng.choice(KINDS, p=np.array([getattr(mutations, k) for k in KINDS])))
     if kind == "hyperparameters":
         changed = _move_setting(member, mutations, rng)
@@ -43,34 +43,34 @@ def mutate(
 
 
 def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[Any, Any]]:
-    """Settings that differ, by dotted name, with their old and new values."""
-    found: dict[str, tuple[Any, Any]] = {}
+    """Return the old and new values of settings that differ, by dotted name."""
+    changes: dict[str, tuple[Any, Any]] = {}
     for f in fields(old):
         a, b = getattr(old, f.name), getattr(new, f.name)
         if a == b:
             continue
         if isinstance(a, Network) and isinstance(b, Network):
             parts = {k.name: (getattr(a, k.name), getattr(b, k.name)) for k in fields(a)}
-            found |= {f"{f.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
+            changes |= {f"{f.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
         else:
-            found[f.name] = (a, b)
-    return found
+            changes[f.name] = (a, b)
+    return changes
 
 
 def with_settings(member: Member, **settings: Any) -> Member:
-    """A copy of the member with other settings, in its state too where they stand there."""
-    found = copy(member)
-    found.config = replace(member.config, **settings)
+    """Return a copy of the member with other settings, also in the tensors of its state."""
+    changed = copy(member)
+    changed.config = replace(member.config, **settings)
     for name, value in settings.items():
-        if hasattr(found.state, name):
-            getattr(found.state, name).fill_(setting_number(value))
-    return found
+        if hasattr(changed.state, name):
+            getattr(changed.state, name).fill_(setting_number(value))
+    return changed
 
 
 def random_config(
     config: AlgorithmConfig, mutations: Mutations, rng: np.random.Generator
 ) -> AlgorithmConfig:
-    """Settings, architecture and activation drawn evenly from what mutations may reach."""
+    """Draw settings, architecture and activation uniformly from the ranges of mutations."""
     for _ in range(100):
         drawn = {
             name: _valued(config, name, within.from_unit(rng.random()))
@@ -81,7 +81,7 @@ def random_config(
         try:
             return replace(config, **drawn)
         except SkillweaveError:
-            continue  # they do not fit together: a batch larger than a rollout
+            continue  # they are not compatible: a batch larger than a rollout
     raise DeclarationError("Mutations.ranges: 100 settings drawn from them did not fit together")
 
 
@@ -111,14 +111,14 @@ def check_mutations(config: AlgorithmConfig, evolution: Evolution, where: str) -
 
 
 def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Member:
-    """One setting up or down; a whole number by at least one."""
+    """Move one setting up or down; a whole number by at least one."""
     ranges = by.ranges_of(member.config, start=False)
     for name in rng.permutation(sorted(ranges)):
         within, old = ranges[name], getattr(member.config, name)
         if old is None:
             continue
         sign = 1 if rng.random() < 0.5 else -1
-        for way in (sign, -sign):  # the other way where this one ends
+        for way in (sign, -sign):  # the other direction at the end of a range
             at = within.to_unit(min(within.high, max(within.low, old)))
             new = _valued(member.config, name, within.from_unit(at + way * by.step))
             if isinstance(old, int) and new == old:
@@ -128,22 +128,22 @@ def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Me
             try:
                 return with_settings(member, **{str(name): new})
             except SkillweaveError:
-                continue  # it does not fit the others
+                continue  # it is not compatible with the others
     return member
 
 
 def _valued(config: AlgorithmConfig, name: str, value: float) -> Any:
-    """A number of the kind that the setting has."""
+    """Convert a number to the type of the setting."""
     return round(value) if isinstance(getattr(config, name), int) else float(value)
 
 
 def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Generator) -> Member:
-    """Noise on a share of what acts, the same on its slow copy."""
+    """Add noise to a share of the acting weights, and the same to their slow copy."""
     algorithm = member.algorithm(spaces)
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    found = copy(member)
-    online = algorithm.layout.views(found.state.params)
-    noise = torch.zeros_like(found.state.params)
+    noisy = copy(member)
+    online = algorithm.layout.views(noisy.state.params)
+    noise = torch.zeros_like(noisy.state.params)
     for name, view in algorithm.layout.views(noise).items():
         if name in algorithm.acting.shapes:
             scale = online[name].square().mean().sqrt() * by.strength
@@ -152,12 +152,12 @@ def _add_noise(member: Member, by: Mutations, spaces: Spaces, rng: np.random.Gen
     if not bool(noise.any()):
         return member
     for name in algorithm.parameter_groups()[0].weights:
-        getattr(found.state, name).add_(noise)
-    return found
+        getattr(noisy.state, name).add_(noise)
+    return noisy
 
 
 def _change_activation(member: Member, by: Mutations, rng: np.random.Generator) -> Member:
-    """Another nonlinearity, in all networks."""
+    """Change the nonlinearity in all networks."""
     others = [a for a in by.activations if a != member.config.network.activation]
     if not others:
         return member
@@ -166,6 +166,6 @@ def _change_activation(member: Member, by: Mutations, rng: np.random.Generator) 
         name: replace(network, activation=chosen)
         for name, network in networks_of(member.config).items()
     }
-    found = copy(member)
-    found.config = replace(member.config, **networks)
-    return found
+    changed = copy(member)
+    changed.config = replace(member.config, **networks)
+    return changed

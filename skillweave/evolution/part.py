@@ -1,4 +1,4 @@
-"""Where members of a population act and train between two comparisons."""
+"""The environments of a population's members, and their training between two comparisons."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
-"""Is told the steps of all members in this generation so far, and the metrics of an update."""
+"""Receives the steps of all members in this generation so far, and the metrics of an update."""
 
 
 class Part:
-    """Places of a population, and how members train there: all of them, or some of several parts.
+    """A part of a population: places, each with environments in which a member trains.
 
-    A function of members, seeds and its state.
+    Results are a function of members, seeds and its state.
 
     Args:
-        scene: where members learn.
+        scene: the task that members learn.
         config: settings of any member.
-        seeds: the stage's.
-        count: places.
-        first: the number of the first of them, in the population.
+        seeds: the stage's seeds.
+        count: the number of places.
+        first: the number of the first place in the population.
     """
 
     steps_elsewhere = 0
-    """Environment steps of measuring fitness that were made in other processes."""
+    """Environment steps of fitness measurements in other processes."""
 
     def __init__(
         self, scene: Scene, config: AlgorithmConfig, seeds: Seeds, count: int, first: int = 0
@@ -57,7 +57,7 @@ class Part:
         self._seeds, self._first, each = seeds, first, config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
         self.places: list[Collector] = []
-        """Where members act: an heir goes on with its place's open episodes."""
+        """The collectors in which members act: an heir continues its place's open episodes."""
         try:
             for i in range(first, first + count):
                 place = scene.learners_collector(each, None, i * each, self.replays)
@@ -68,9 +68,9 @@ class Part:
         self.num_envs = count * each
         self.episodes = Episodes(scene.log_info)
         self.rounds = 0
-        """Of the loop in which all members learn from one store."""
+        """Rounds of the loop in which all members learn from one store."""
         self.store: ReplayStore | None = None
-        self._kept: dict[str, Tensor] = {}  # what its learner counts
+        self._kept: dict[str, Tensor] = {}  # counts of its learner
         self._made: dict[AlgorithmConfig, Algorithm] = {}
 
     def train(
@@ -98,9 +98,10 @@ class Part:
         seeds: Seeds,
         on_tick: OnGenerationTick,
     ) -> None:
-        """A stack's rollouts are its own, so stacks learn one after another.
+        """Train stack after stack, for algorithms with rollouts.
 
-        A recurrent member begins a generation without memory: another network made what there was.
+        A recurrent member begins a generation with an empty state, because the open one is of
+        another network.
         """
         first = spent = 0
         for i, group in enumerate(groups, self._first):
@@ -109,11 +110,16 @@ class Part:
             places = self.places[first : first + count]
             joined = self._together(places, [stack])
             end = train(
-                RolloutLearner(stack, seeds / i), Collectors([joined], count), self.episodes,
-                seeds / i, until * count, resume_from=Progress(steps=start),
-                schedule_steps=schedule_steps * count, skip_diverged=True,
+                RolloutLearner(stack, seeds / i),
+                Collectors([joined], count),
+                self.episodes,
+                seeds / i,
+                until * count,
+                resume_from=Progress(steps=start),
+                schedule_steps=schedule_steps * count,
+                skip_diverged=True,
                 on_tick=_telling(on_tick, spent - start),
-            )  # fmt: skip
+            )
             parted(joined, places)
             self._unstack(stack, group)
             spent, first = spent + end.steps - start, first + count
@@ -127,7 +133,7 @@ class Part:
         seeds: Seeds,
         on_tick: OnGenerationTick,
     ) -> None:
-        """All stacks act at once and learn from one store."""
+        """Train all stacks at once from one store."""
         members = [m for group in groups for m in group]
         stacks = [self._stack(group) for group in groups]
         start, count = sum(m.steps for m in members), len(members)
@@ -139,10 +145,16 @@ class Part:
             learner.load(self._kept)
         joined = self._together(self.places, stacks)
         end = train(
-            learner, Collectors([joined], count), self.episodes, seeds, until * count,
-            resume_from=Progress(self.rounds, start), schedule_steps=schedule_steps * count,
-            skip_diverged=True, on_tick=_telling(on_tick, -start),
-        )  # fmt: skip
+            learner,
+            Collectors([joined], count),
+            self.episodes,
+            seeds,
+            until * count,
+            resume_from=Progress(self.rounds, start),
+            schedule_steps=schedule_steps * count,
+            skip_diverged=True,
+            on_tick=_telling(on_tick, -start),
+        )
         parted(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
             self._unstack(stack, group)
@@ -151,16 +163,16 @@ class Part:
         _count(members, end.steps - start)
 
     def _stack(self, group: list[Member]) -> Stack:
-        """Members as one stack, on the device that they learn on."""
+        """Join members to one stack, on the device of learning."""
         algorithm, state = join(group, self.spaces, self._made)
         return Stack(algorithm, state_to(state, resolve_device(algorithm.config.device)))
 
     def _unstack(self, stack: Stack, group: list[Member]) -> None:
-        """Give each member its part of what a stack has learnt."""
+        """Copy each member's part of a stack's state to the member."""
         split(stack.algorithm, state_to(stack.state, "cpu"), group, self.spaces)
 
     def _together(self, places: Sequence[Collector], stacks: Sequence[Stack]) -> Collector:
-        """The places as one collector, in which the stacks act."""
+        """Return the places as one collector, in which the stacks act."""
         engine: Any = JoinedEngines([place.engine for place in places])
         acting = Acting([(s.algorithm, s.members) for s in stacks], engine.num_envs)
         return joined_from(places, engine, acting)
@@ -171,30 +183,33 @@ class Part:
 
     @property
     def tally(self) -> EpisodeTally:
-        """Which logged keys of ``info`` occurred."""
+        """Return the tally of logged keys of ``info``."""
         return self.episodes.tally
 
     def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
-        """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
-        return np.array([
-            -np.inf if has_diverged(m) else arena.score(policy_of(m, self.spaces), seeds)
-            for m in members
-        ])  # fmt: skip
+        """Return each member's mean return in the same episodes; −inf if it has diverged."""
+        return np.array(
+            [
+                -np.inf if has_diverged(m) else arena.score(policy_of(m, self.spaces), seeds)
+                for m in members
+            ]
+        )
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint needs of the environments and the counts. It changes nothing."""
-        found = prefixed("episodes", self.episodes.state())
+        """Return the state of environments and counts for a checkpoint."""
+        arrays = prefixed("episodes", self.episodes.state())
         for i, place in enumerate(self.places):
-            found |= prefixed(str(i), place.state())
-        return {k: to_tensor(np.array(v)) for k, v in found.items()} | prefixed("kept", self._kept)
+            arrays |= prefixed(str(i), place.state())
+        tensors = {k: to_tensor(np.array(v)) for k, v in arrays.items()}
+        return tensors | prefixed("kept", self._kept)
 
     def restore(
         self, saved: dict[str, Tensor], members: Sequence[Member], store: dict[str, Tensor]
     ) -> Array:
-        """Stand where ``state`` was asked; (k,) environments that begin anew.
+        """Restore a ``state``; return the environments that were reset, (k,).
 
         Args:
-            store: what the replay buffer kept; empty where there is none.
+            store: the content of the replay buffer; empty if it has none.
         """
         self._kept = unprefixed("kept", saved)
         if self._kept:
@@ -204,13 +219,13 @@ class Part:
         if store:
             self.store = self._make_store(members)
             self.store.load(store)
-        return self._begun_anew([
-            place.restore(unprefixed(str(i), arrays)) for i, place in enumerate(self.places)
-        ])  # fmt: skip
+        return self._reset_columns(
+            [place.restore(unprefixed(str(i), arrays)) for i, place in enumerate(self.places)]
+        )
 
-    def _begun_anew(self, ids: Sequence[Array]) -> Array:
-        """Environments of each place, as columns; their open trajectories end here."""
-        columns = np.concatenate([own + i * self.places[0].num_envs for i, own in enumerate(ids)])
+    def _reset_columns(self, ids: Sequence[Array]) -> Array:
+        """Return environments of each place as columns; end their open trajectories."""
+        columns = np.concatenate([rows + i * self.places[0].num_envs for i, rows in enumerate(ids)])
         if self.store is not None:
             self.store.cut(columns)
         if "returns" in self._kept:
@@ -232,26 +247,26 @@ def too_many(error: SkillweaveError, needed: str) -> EnvError:
 
 
 def spaces_of(scene: Scene) -> tuple[Any, Any]:
-    """What algorithms are made for: (observation space, action space)."""
+    """Return the spaces of the algorithms: (observation space, action space)."""
     return scene.observation_space, scene.action_space
 
 
 def _telling(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
-    """Tells the ticks of one loop in terms of the generation, ``before`` steps later."""
+    """Return a listener that adds ``before`` steps to the ticks of one loop."""
     return lambda tick: on_tick(before + tick.steps, tick.metrics)
 
 
 def _count(members: Sequence[Member], steps: int) -> None:
-    """Give each of the members its part of the steps that they took together."""
+    """Divide the steps of a loop among the members."""
     for i, member in enumerate(members):
         member.steps += (steps + i) // len(members)
 
 
 def policy_of(member: Member, spaces: tuple[Any, Any]) -> AgentPolicy:
-    """What a member has learnt."""
+    """Return a member's policy."""
     return AgentPolicy.of(member.algorithm(spaces), member.state)
 
 
 def has_diverged(member: Member) -> bool:
-    """Whether a number that it has learnt is not finite."""
+    """Return whether a learnt number is not finite."""
     return not all(bool(torch.isfinite(v).all()) for v in vars(member.state).values())

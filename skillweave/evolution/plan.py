@@ -1,4 +1,4 @@
-"""Which stages of a run evolve, and how that is asked for."""
+"""The argument ``evolve``: the stages of a run that evolve."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 from skillweave.training.woven import agents_of
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
-"""A population for every stage, or for those named."""
+"""A population for every stage, or for the named ones."""
 
 
 def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
-    """Say in a manifest's stages which are to evolve, and count all members' steps.
+    """Record in a manifest's stages which ones evolve, and count all members' steps.
 
     Raises:
-        DeclarationError: no such stage, or a mutation does not fit an agent.
+        DeclarationError: a stage does not exist, or a mutation does not fit an agent.
     """
     for name, how in _by_stage([p["name"] for p in stages], evolve).items():
         entry = next(p for p in stages if p["name"] == name)
         if "together" in entry:
             raise DeclarationError(
                 f"stage {name!r}: {' and '.join(entry['learns'])} learn together there, so it "
-                "cannot evolve; name the stages that are to: evolve={'a_skill': Evolution(...)}"
+                "cannot evolve; name the stages that should: evolve={'a_skill': Evolution(...)}"
             )
         if "guide_kl" in entry:
             raise DeclarationError(
                 f"stage {name!r}: the guide has a target_kl, and populations are not kept near a "
-                "guide; leave it out (restrict=True works), or name other stages: evolve={...}"
+                "guide; omit it (restrict=True works), or name other stages: evolve={...}"
             )
         check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
         entry["evolution"] = evolution_to_json(how)
@@ -48,9 +48,9 @@ def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
 
 
 def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
-    """Raise an EnvError where a stage evolves, and there cannot be two environments at once.
+    """Raise an EnvError where a stage evolves, but two environments cannot exist at once.
 
-    Stages before it would be trained in vain.
+    Otherwise the stages before it would be trained for nothing.
     """
     evolving = [entry for entry in stages if entry.get("evolution")]
     if not evolving:
@@ -64,10 +64,10 @@ def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
 
 
 def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HERE) -> MakeLearner:
-    """Who learns in a stage: a population where its entry says so, else one agent.
+    """Return a function that makes a stage's learner: a population, or one agent.
 
-    ``evolve`` holds selections of the user's own, which a run knows by name only.
-    ``where`` collectors run, and parts of populations.
+    ``evolve`` has selections of the user, of which a run records only names. ``where`` is the
+    placement of collectors and parts of populations.
 
     Raises:
         DeclarationError: ``evolve`` names a stage that is not among ``stages``.
@@ -84,7 +84,7 @@ def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HE
 
 
 def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:
-    """The stages that are to evolve."""
+    """Return the stages that evolve."""
     if evolve is None:
         return {}
     if isinstance(evolve, Evolution):

@@ -1,7 +1,7 @@
-"""A population: it trains side by side in stacks, is compared, and becomes its own next generation.
+"""A population: members that train in stacks, are compared, and become the next generation.
 
-Between generations a member is a thing of its own; see ``stacks`` for how they learn together, and
-``part`` for where.
+Stands alone because a population has no files, which are the concern of ``stage``. Between
+generations members are independent; ``stacks`` joins them for learning in a ``part``.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from skillweave.types import Array
 
 
 class Population:
-    """Members, where they learn, and how they evolve.
+    """A population: its members, their part, and their evolution.
 
-    Members of one stack stand side by side in ``members``.
+    Members of one stack are adjacent in ``members``.
 
     Args:
-        scene: where they learn.
+        scene: the task that they learn.
         part: trains them; None: all in this process.
     """
 
@@ -57,13 +57,14 @@ class Population:
         seeds: Seeds,
         part: Part | Parts | None = None,
     ) -> Population:
-        """The first generation, each member with weights of its own."""
+        """Create the first generation, each member with its own weights."""
         members, spaces = [], spaces_of(scene)
         for i in range(evolution.population):
-            own = config
+            settings = config
             if evolution.start == "random":
-                own = random_config(config, evolution.mutations, (seeds / "start" / i).numpy())
-            member = Member(i, own, None)
+                rng = (seeds / "start" / i).numpy()
+                settings = random_config(config, evolution.mutations, rng)
+            member = Member(i, settings, None)
             member.state = member.algorithm(spaces).init([seeds / "member" / i])
             members.append(member)
         ordered = [m for group in grouped(members, spaces) for m in group]
@@ -71,9 +72,9 @@ class Population:
 
     @property
     def steps(self) -> int:
-        """Environment steps of all members and of their ancestors, each as often as it has heirs.
+        """Return the steps of all members and their ancestors, each as often as it has heirs.
 
-        What was really spent is counted by the stage.
+        The stage counts the steps that were really spent.
         """
         return sum(m.steps for m in self.members)
 
@@ -84,15 +85,15 @@ class Population:
         self.part.train(self.members, until, schedule_steps, seeds, on_tick)
 
     def fitness(self, arena: FitnessArena, seeds: Seeds) -> Array:
-        """Mean return of each member's episodes, from the same starts; −inf if it has diverged."""
+        """Return each member's mean return in the same episodes; −inf if it has diverged."""
         return self.part.fitness(self.members, arena, seeds)
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint needs of the environments. It changes nothing."""
+        """Return the state of the environments for a checkpoint."""
         return self.part.state()
 
     def resume(self, saved: dict[str, Tensor], store: dict[str, Tensor]) -> Array:
-        """Stand where ``state`` was called; (k,) environments that begin anew."""
+        """Restore a ``state``; return the environments that were reset, (k,)."""
         return self.part.restore(saved, self.members, store)
 
     def close(self) -> None:
@@ -100,11 +101,11 @@ class Population:
         self.part.close()
 
     def policy(self, member: Member) -> AgentPolicy:
-        """What a member has learnt."""
+        """Return a member's policy."""
         return policy_of(member, self.spaces)
 
     def evolve(self, fitness: Array, seeds: Seeds) -> None:
-        """Become the next generation."""
+        """Replace the members by the next generation."""
         rng = (seeds / "select").numpy()
         heirs = select(self.evolution, fitness, rng)
         places: dict[int, int] = {}

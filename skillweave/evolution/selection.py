@@ -1,4 +1,4 @@
-"""Who is parent to whom: the protocol, tournaments, and truncation."""
+"""Selection of parents: the protocol, tournaments, and truncation."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from skillweave.types import Array
 @checked_names
 @dataclass(frozen=True)
 class Heir:
-    """A place in the next generation: which member it comes from, and whether it may change."""
+    """A place in the next generation: its parent, and whether it mutates."""
 
     parent: int  # a row of the generation before
-    mutates: bool  # whether it may change; else it is the parent as it was
+    mutates: bool  # False: it is an unchanged copy of the parent
 
 
 class ParentSelection(Protocol):
-    """How the next generation follows from this one's fitness; give your own to ``Evolution``."""
+    """A rule that selects the next generation by fitness; pass your own to ``Evolution``."""
 
     def select(self, fitness: Array, rng: np.random.Generator) -> list[Heir]:
-        """One heir for each member.
+        """Return one heir for each member.
 
         Args:
-            fitness: (P,); the higher the better, −inf for members that have diverged.
-            rng: the only source of chance, so that a run can be resumed.
+            fitness: (P,); higher is better, −inf for members that have diverged.
+            rng: the only source of randomness, so that a run can be resumed.
 
         Returns:
-            P heirs, each a parent's row and whether it mutates.
+            P heirs, each with its parent's row and whether it mutates.
         """
         ...
 
 
 def select(evolution: Evolution, fitness: Array, rng: np.random.Generator) -> list[Heir]:
-    """The next generation, by the selection asked for; nobody is heir to a diverged member.
+    """Select the next generation by the declared rule, without heirs of diverged members.
 
     Raises:
-        TrainingError: all members have diverged, or a selection of the user's own is wrong.
+        TrainingError: all members have diverged, or a user's selection is wrong.
     """
     if not np.isfinite(fitness).any():
         raise TrainingError(

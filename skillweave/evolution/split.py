@@ -1,7 +1,7 @@
-"""A population in several parts, each of which trains at a worker: a process, or an actor of Ray.
+"""A population in several parts, each at a worker: a process, or an actor of Ray.
 
-A part is a ``Part``: its places stay at its worker, members go there and come back in each
-generation. What members become depends on how many parts there are, and not on where they are.
+A part is a ``Part``: its places stay at its worker, members are sent there and back in each
+generation. Results depend on the number of parts, but not on their workers.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from skillweave.training.scene import Scene
 from skillweave.types import Array
 
 Sent = tuple[int, dict[str, Any], int, dict[str, Array]]
-"""A member on its way: number, settings as JSON, steps, tensors of its state."""
+"""A member as a message: number, settings as JSON, steps, tensors of its state."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a part is to train; see ``Part.train``."""
+    """A part's task of training; see ``Part.train``."""
 
     members: Sequence[Sent]
     until: int
@@ -44,7 +44,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Trained:
-    """What came of it."""
+    """The result of a part's training."""
 
     states: list[dict[str, Array]]
     steps: list[int]
@@ -54,14 +54,14 @@ class Trained:
 
 
 class Parts:
-    """Several parts as one.
+    """Several parts with the interface of one.
 
     Args:
-        make_workers: says where they are.
-        scene, config, seeds: as of ``Part``.
-        count: places.
-        parts: how many; their sizes differ by one at most.
-        episodes: of which a member's fitness is the mean return.
+        make_workers: creates their workers.
+        scene, config, seeds: see ``Part``.
+        count: the number of places.
+        parts: the number of parts; their sizes differ by at most one.
+        episodes: episodes whose mean return is a member's fitness.
     """
 
     store = None
@@ -81,9 +81,9 @@ class Parts:
         self.num_envs = count * config.num_envs
         self._each = config.num_envs
         self.steps_elsewhere = 0
-        """Environment steps of measuring fitness that were made in other processes."""
+        """Environment steps of fitness measurements in other processes."""
         self.tally = EpisodeTally()
-        """Which logged keys of ``info`` occurred."""
+        """The tally of logged keys of ``info``."""
         make = partial(_stationed, scene, _alone(config), seeds, self._bounds, episodes)
         self._workers, self._closed = make_workers(make, parts, scene.name), False
 
@@ -95,7 +95,7 @@ class Parts:
         seeds: Seeds,
         on_tick: OnGenerationTick,
     ) -> None:
-        """Train members until each has ``until`` steps; ticks are told when all parts are done."""
+        """Train members until each has ``until`` steps; report ticks when all parts are done."""
         groups = self._divided(members)
         tasks = [Training(_sent(group), until, schedule_steps, seeds) for group in groups]
         before, self.tally = 0, EpisodeTally()
@@ -108,26 +108,26 @@ class Parts:
                 member.state, member.steps = type(member.state)(**_tensors(state)), steps
 
     def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
-        """As ``Part.fitness``, in arenas of the parts' own."""
+        """Return fitness as ``Part.fitness`` does, each part in its own arena."""
         tasks = [(_sent(group), seeds) for group in self._divided(members)]
-        found = self._workers.ask("fitness", tasks, kept=False)
-        self.steps_elsewhere += sum(steps for _, steps in found)
-        return np.concatenate([fitness for fitness, _ in found])
+        results = self._workers.ask("fitness", tasks, kept=False)
+        self.steps_elsewhere += sum(steps for _, steps in results)
+        return np.concatenate([fitness for fitness, _ in results])
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a checkpoint needs of the environments. It changes nothing."""
+        """Return the state of the environments for a checkpoint."""
         return _tensors(joined_states(self._workers.states()))
 
     def restore(
         self, saved: dict[str, Tensor], members: Sequence[Member], store: dict[str, Tensor]
     ) -> Array:
-        """Stand where ``state`` was asked; (k,) environments that begin anew."""
+        """Restore a ``state``; return the environments that were reset, (k,)."""
         arrays = {k: v.numpy() for k, v in saved.items()}
         states = split_states(arrays, len(self._bounds) - 1)
         return self._columns(self._workers.stand(states))
 
     def close(self) -> None:
-        """End the workers, once."""
+        """End the workers, if they run."""
         if not self._closed:
             self._closed = True
             self._workers.close()
@@ -136,14 +136,14 @@ class Parts:
         return [members[first:end] for first, end in pairwise(self._bounds)]
 
     def _columns(self, ids: Sequence[Array]) -> Array:
-        """Environments of each part as those of the population."""
-        return np.concatenate([
-            own + first * self._each for own, first in zip(ids, self._bounds[:-1], strict=True)
-        ])  # fmt: skip
+        """Convert numbers of environments in each part to those of the population."""
+        return np.concatenate(
+            [rows + first * self._each for rows, first in zip(ids, self._bounds[:-1], strict=True)]
+        )
 
 
 class StationedPart:
-    """A part where its worker is: it speaks of plain data alone."""
+    """A part at its worker; arguments and results are plain data."""
 
     def __init__(self, part: Part, arena: FitnessArena) -> None:
         self._part, self._arena = part, arena
@@ -158,18 +158,18 @@ class StationedPart:
         return Trained(states, steps, ticks, self._part.tally)
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
-        """Their fitness, and the environment steps that it took."""
+        """Return the members' fitness, and the environment steps of its measurement."""
         before = self._arena.steps_made
         members = _received(task[0], self._part.spaces)
-        found = self._part.fitness(members, self._arena, task[1])
-        return found, self._arena.steps_made - before
+        fitness = self._part.fitness(members, self._arena, task[1])
+        return fitness, self._arena.steps_made - before
 
     def state(self) -> dict[str, Array]:
-        """What ``restore`` needs."""
+        """Return the state for ``restore``."""
         return {k: v.numpy() for k, v in self._part.state().items()}
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` was asked."""
+        """Restore a ``state``; return the environments that were reset."""
         return self._part.restore(_tensors(state), (), {})
 
     def close(self) -> None:
@@ -194,7 +194,7 @@ def _stationed(
 
 
 def _alone(config: AlgorithmConfig) -> AlgorithmConfig:
-    """Settings as at a worker, which has one core; weights do not depend on threads."""
+    """Return settings for a worker, which has one core; weights do not depend on threads."""
     return replace(config, threads=1, device="cpu")
 
 
@@ -205,12 +205,12 @@ def _sent(members: Sequence[Member]) -> list[Sent]:
 
 
 def _received(members: Sequence[Sent], spaces: tuple[Any, Any]) -> list[Member]:
-    found = []
-    for number, told, steps, state in members:
-        config = config_from_json(told)
+    received = []
+    for number, settings, steps, state in members:
+        config = config_from_json(settings)
         kind = make_algorithm(config, *spaces).state_type
-        found.append(Member(number, config, kind(**_tensors(state)), steps))
-    return found
+        received.append(Member(number, config, kind(**_tensors(state)), steps))
+    return received
 
 
 def _arrays(state: Any) -> dict[str, Array]:
@@ -218,5 +218,5 @@ def _arrays(state: Any) -> dict[str, Array]:
 
 
 def _tensors(arrays: Mapping[str, Array]) -> dict[str, Tensor]:
-    """Copies: arrays of Ray's object store cannot be written to."""
+    """Copy arrays to tensors, because arrays of Ray's object store are read-only."""
     return {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}

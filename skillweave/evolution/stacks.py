@@ -1,9 +1,9 @@
-"""Stacks: members that share one set of tensors while they learn (contract 5).
+"""Stacks: members that share one set of tensors while they learn.
 
-Between generations every member is a thing of its own; ``join`` puts members of one architecture
-into a stack, ``split`` takes them out again. Members whose hidden layers differ in width are padded
-with zeros to the widest: a unit with no weights in and none out stays at zero for ever, whatever
-the others learn, so a padded member is the member alone, but for the last bits of its numbers.
+Between generations members are independent; ``join`` puts members of one architecture into a stack,
+``split`` takes them out again. Members whose hidden layers differ in width are padded with zeros to
+the widest: a unit without incoming and outgoing weights always stays at zero, so a padded member
+learns as it would alone, except for the last bits of its numbers.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
 
 SETTLED = 1 << 15
-"""Steps after which Adam's corrections are exactly 1: 0.999 to this power is below float32's ε."""
+"""Steps after which Adam's corrections are 1: 0.999 to this power is below float32's ε."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a member comes from: its parent, and what changed, each setting's old and new value."""
+    """The origin of a member: its parent, and the old and new values of changed settings."""
 
     parent: int | None = None
     mutation: str = "start"
@@ -38,7 +38,7 @@ class Origin:
 
 @dataclass
 class Member:
-    """One agent of a population, with settings and architecture of its own."""
+    """An agent of a population, with its own settings and architecture."""
 
     number: int
     config: AlgorithmConfig
@@ -47,26 +47,26 @@ class Member:
     origin: Origin = field(default_factory=lambda: Origin())
 
     def algorithm(self, spaces: tuple[Any, Any]) -> Algorithm:
-        """The algorithm it learns by, on (observation space, action space)."""
+        """Create its algorithm on (observation space, action space)."""
         return make_algorithm(self.config, *spaces)
 
 
 def networks_of(config: AlgorithmConfig) -> dict[str, Network]:
-    """The architectures that settings hold, by field."""
-    found = {name: getattr(config, name, None) for name in ("network", "critic")}
-    return {name: network for name, network in found.items() if isinstance(network, Network)}
+    """Return the architectures in settings, by field."""
+    values = {name: getattr(config, name, None) for name in ("network", "critic")}
+    return {name: network for name, network in values.items() if isinstance(network, Network)}
 
 
 def copy(member: Member) -> Member:
-    """The same member with tensors of its own."""
+    """Copy a member and its tensors."""
     state = {k: v.clone() for k, v in vars(member.state).items()}
     return replace(member, state=type(member.state)(**state))
 
 
 def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConfig:
-    """What members must have in common to share a stack: all but ``settings`` and widths.
+    """Return the settings that members of a stack share: all except ``settings`` and widths.
 
-    Layer norm divides by what all units of a layer do, so there widths count, too.
+    Layer norm divides by a statistic of all units of a layer, so with it widths count, too.
     """
     kind = type(config)
     changes: dict[str, Any] = {k: kind.__dataclass_fields__[k].default for k in settings}
@@ -79,7 +79,7 @@ def stack_key(config: AlgorithmConfig, settings: Sequence[str]) -> AlgorithmConf
 
 
 def grouped(members: Sequence[Member], spaces: tuple[Any, Any]) -> list[list[Member]]:
-    """Members by the stack that they share, in the order in which stacks first appear."""
+    """Group members by their stack, in the order in which stacks first appear."""
     groups: dict[AlgorithmConfig, list[Member]] = {}
     for member in members:
         key = stack_key(member.config, member.algorithm(spaces).member_hyperparameters)
@@ -92,9 +92,9 @@ def join(
     spaces: tuple[Any, Any],
     made: dict[AlgorithmConfig, Algorithm] | None = None,
 ) -> tuple[Algorithm, Any]:
-    """The algorithm of the widest of all, and one state of P members; copies.
+    """Return the algorithm of the widest network, and one state of P members; copies.
 
-    Algorithms are kept in ``made``: what one of them has compiled need not be compiled again.
+    ``made`` caches algorithms, so that a compiled one need not be compiled again.
     """
     first = members[0]
     key = stack_key(first.config, first.algorithm(spaces).member_hyperparameters)
@@ -111,13 +111,13 @@ def join(
         f for f in algorithm.parameter_groups() if any(_count(m, f).ndim > 1 for m in members)
     ]
     for member in members:
-        own = member.algorithm(spaces).layouts()
+        layouts = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(member.state, f.name) for f in fields(member.state)}
-        tensors |= {k: pad(v, own[k], wide[k]) for k, v in tensors.items() if k in wide}
+        tensors |= {k: pad(v, layouts[k], wide[k]) for k, v in tensors.items() if k in wide}
         for f in uneven:
             like = f.weights[0]
             each = spread_count(_count(member, f), getattr(member.state, like))
-            tensors[f.count] = pad(each, own[like], wide[like])
+            tensors[f.count] = pad(each, layouts[like], wide[like])
         padded.append(tensors)
     joined = {k: torch.cat([p[k] for p in padded]) for k in padded[0]}
     return algorithm, algorithm.state_type(**joined)
@@ -126,28 +126,28 @@ def join(
 def split(
     algorithm: Algorithm, state: Any, members: Sequence[Member], spaces: tuple[Any, Any]
 ) -> None:
-    """Give each member its part of a stack's state: the inverse of ``join``; copies."""
+    """Copy each member's part of a stack's state to the member; the inverse of ``join``."""
     wide = algorithm.layouts()
     for i, member in enumerate(members):
-        own = member.algorithm(spaces).layouts()
+        layouts = member.algorithm(spaces).layouts()
         tensors = {f.name: getattr(state, f.name)[i : i + 1].clone() for f in fields(state)}
-        tensors |= {k: crop(v, wide[k], own[k]) for k, v in tensors.items() if k in wide}
+        tensors |= {k: crop(v, wide[k], layouts[k]) for k, v in tensors.items() if k in wide}
         for f in algorithm.parameter_groups():
             if (count := tensors[f.count]).ndim > 1:
                 like = f.weights[0]
-                tensors[f.count] = even_count(crop(count, wide[like], own[like]))
+                tensors[f.count] = even_count(crop(count, wide[like], layouts[like]))
         member.state = algorithm.state_type(**tensors)
 
 
 def spread_count(count: Tensor, like: Tensor) -> Tensor:
-    """Adam's steps of each parameter (P, …, D), as those of a member (P,) or as they are."""
+    """Return Adam's steps of each parameter (P, …, D), expanded from those of members (P,)."""
     return count.view(*count.shape, *[1] * (like.ndim - count.ndim)).expand_as(like)
 
 
 def even_count(count: Tensor) -> Tensor:
-    """Adam's steps (P,) where all parameters of each member have one age, else as they are.
+    """Return Adam's steps as (P,) if all parameters of each member have one age, else unchanged.
 
-    Ages count as one, too, where all have taken so many steps that nothing is left to correct.
+    Ages also count as equal if all are so large that Adam's corrections are 1.
     """
     rows = count.flatten(1)
     oldest = rows.amax(1)
@@ -161,7 +161,7 @@ def _count(member: Member, family: ParameterGroup) -> Tensor:
 
 
 def pad(flat: Tensor, own: Layout, wide: Layout) -> Tensor:
-    """Parameters (…, D) in a wider layout (…, D′), zero where there was nothing."""
+    """Pad parameters (…, D) with zeros to a wider layout (…, D′)."""
     rows = flat.reshape(-1, flat.shape[-1])
     found = rows.new_zeros(len(rows), wide.size)
     into = wide.views(found)
@@ -171,7 +171,7 @@ def pad(flat: Tensor, own: Layout, wide: Layout) -> Tensor:
 
 
 def crop(flat: Tensor, wide: Layout, own: Layout) -> Tensor:
-    """Parameters (…, D′) in the narrower layout (…, D) that they were padded from."""
+    """Crop parameters (…, D′) to the narrower layout (…, D)."""
     rows = flat.reshape(-1, flat.shape[-1])
     found = rows.new_zeros(len(rows), own.size)
     outof = wide.views(rows)
@@ -181,7 +181,7 @@ def crop(flat: Tensor, wide: Layout, own: Layout) -> Tensor:
 
 
 def _corner(view: Tensor) -> tuple[slice, ...]:
-    """The first entries along each axis, as many as ``view`` has."""
+    """Return the first entries along each axis, as many as ``view`` has."""
     return tuple(slice(n) for n in view.shape)
 
 

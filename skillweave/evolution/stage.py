@@ -1,7 +1,8 @@
 """A stage in which a population evolves, generation by generation, in a run directory.
 
-Beside what every stage writes, ``lineage.jsonl`` gets a line for each member of each generation.
-A generation is one piece: a run that was killed goes on from the last complete one.
+Stands alone because ``plan`` is the declaration of evolving stages, without training. The stage
+also writes a line to ``lineage.jsonl`` for each member of each generation. A killed run resumes
+from the last complete generation.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ from skillweave.types import Array, prefixed, unprefixed
 
 @dataclass
 class Best:
-    """The best member so far: its policy is what the stage ends with.
+    """The best member so far, with whose policy the stage ends.
 
-    Fitness is that of the latest generation's episodes.
+    Its fitness is measured in the latest generation's episodes.
     """
 
     fitness: float
@@ -47,11 +48,11 @@ class Best:
 
 
 class EvolvingPopulation:
-    """The learner of a stage whose entry says that a population evolves.
+    """The learner of a stage in which a population evolves.
 
     Args:
-        selection: the user's own, which the run knows by name only.
-        where: parts of the population train, if the stage's entry says that there are several.
+        selection: the user's selection, of which the run records only the name.
+        where: the placement of the parts, if the stage's entry has several.
 
     Raises:
         DeclarationError: the selection is missing or wrong.
@@ -61,18 +62,18 @@ class EvolvingPopulation:
 
     def __init__(self, stage: StageRun, selection: Any = None, where: Where = HERE) -> None:
         self.stage, self.run, self.seeds = stage, stage.run, stage.seeds
-        told = f"{stage.run.path}: stage {stage.name!r}"
-        self.evolution = evolution_from_json(stage.entry["evolution"], told, selection)
+        label = f"{stage.run.path}: stage {stage.name!r}"
+        self.evolution = evolution_from_json(stage.entry["evolution"], label, selection)
         self.config, self.budget, self.target = stage.config, stage.budget, stage.target
         self.best: Best | None = None
         self.done = 0
-        """Complete generations."""
+        """The number of complete generations."""
         self.fitness_steps = 0
-        """Environment steps that the latest measurement of fitness took."""
+        """Environment steps of the latest measurement of fitness."""
         self._open, self._where = ExitStack(), where
 
     def open(self) -> None:
-        """Make the environments where fitness is measured."""
+        """Create the environments of fitness measurements."""
         self.arena = FitnessArena(self.stage.scene, self.evolution.episodes, self.config.num_envs)
         self._open.callback(self.arena.close)
         self.spaces = spaces_of(self.stage.scene)
@@ -81,7 +82,7 @@ class EvolvingPopulation:
             self._open.callback(self.parts.close)
 
     def go_on(self, state: None, extra: dict[str, Tensor], log: StageLog) -> None:
-        """Stand where a checkpoint says: its members are in ``extra``."""
+        """Restore a checkpoint, whose members are in ``extra``."""
         self.log = log
         if extra:
             self._restore(log.at, extra)
@@ -95,17 +96,22 @@ class EvolvingPopulation:
         self._started: float = time.perf_counter() - log.at["seconds"]
 
     def _parts(self) -> Parts | None:
-        """Where members train, if not in this process."""
+        """Return the parts at workers; None: members train in this process."""
         parts, evolution = int(self.stage.entry.get("workers", 1)), self.evolution
         if parts <= 1:
             return None
         return Parts(
-            self._where.workers, self.stage.scene, self.config, self.seeds, evolution.population,
-            parts, evolution.episodes,
-        )  # fmt: skip
+            self._where.workers,
+            self.stage.scene,
+            self.config,
+            self.seeds,
+            evolution.population,
+            parts,
+            evolution.episodes,
+        )
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
-        """Train generation after generation; the best policy, by the stage's name.
+        """Train all generations; return the best policy, by the stage's name.
 
         Raises:
             TrainingError: every member diverged.
@@ -119,7 +125,7 @@ class EvolvingPopulation:
         return {self.stage.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
-        """None: its best member is known by its policy alone."""
+        """Return no states: only the policy of the best member is kept."""
         return {}
 
     def close(self) -> None:
@@ -128,9 +134,9 @@ class EvolvingPopulation:
 
     @property
     def over(self) -> bool:
-        """Whether all generations are complete, or it ends before.
+        """Return whether all generations are complete, or the stage ends before.
 
-        The target is reached, the budget is spent, or a callback has asked for it.
+        It ends when the target is reached, the budget is spent, or a callback requests it.
         """
         spent = self.done > 0 and self.log.at["steps"] >= self.budget
         early = self._good or spent or self.log.stop_requested
@@ -138,12 +144,12 @@ class EvolvingPopulation:
 
     @property
     def _good(self) -> bool:
-        """Whether the target is reached."""
+        """Return whether the target is reached."""
         target, best = self.target, self.best
         return target is not None and best is not None and best.fitness >= target.at_least
 
     def generation(self) -> None:
-        """Train, compare, write down, evolve, and save."""
+        """Train, compare, log, evolve and save."""
         before = self.log.at["steps"]
 
         def on_tick(steps: int, metrics: dict[str, float]) -> None:
@@ -164,18 +170,18 @@ class EvolvingPopulation:
         self.log.tell_absent(self.population.part.tally, over=False)
         self.log.tell_endless(self.population.part.tally)
         if self.log.stop_requested:
-            return  # no checkpoint: a run resumed from the one before comes here again
+            return  # no checkpoint: a run resumed from the previous one arrives here again
         if not self.over:
             self.population.evolve(fitness, seeds)
         self._save()
 
     @property
     def _measured(self) -> int:
-        """Environment steps that measuring fitness has taken in this process's time."""
+        """Return the environment steps of fitness measurements since this process began."""
         return self.arena.steps_made + self.population.part.steps_elsewhere
 
     def _finish(self) -> AgentPolicy:
-        """The policy that the stage ends with."""
+        """Return the final policy of the stage."""
         assert self.best is not None
         asked = self.evolution.generations
         if self._good:
@@ -193,9 +199,10 @@ class EvolvingPopulation:
         return self.best.policy
 
     def _until(self, spent: int) -> tuple[int, int]:
-        """Steps of each member at this generation's end, and when schedules end.
+        """Return the steps of each member at this generation's end, and the end of schedules.
 
-        The budget counts measuring fitness too, which takes as many steps as the last time.
+        The budget includes fitness measurements, which are assumed to take as many steps as the
+        last one.
         """
         left, members = self.evolution.generations - self.done, len(self.population.members)
         now = self.population.steps // members
@@ -210,14 +217,14 @@ class EvolvingPopulation:
         """Keep the best policy so far: the old one plays this generation's episodes, too."""
         if self.best is not None:
             self.best.fitness = self.arena.score(self.best.policy, seeds)
-        # Of equals the latest: it has learnt for longer.
+        # The latest of equal ones: it has learnt for longer.
         if self.best is None or fitness.max() >= self.best.fitness:
             member = self.population.members[int(fitness.argmax())]
             policy = self.population.policy(member)
             self.best = Best(float(fitness.max()), member.number, self.done, policy)
 
     def _note(self, fitness: Array) -> None:
-        """Write the generation down, and tell."""
+        """Log the generation, and report it."""
         members = self.population.members
         best = self.best.number if self.best and self.best.generation == self.done else None
         self.run.lineage.append(
@@ -237,7 +244,7 @@ class EvolvingPopulation:
         )
 
     def _save(self) -> None:
-        """A checkpoint of the whole population, as it is to go on."""
+        """Write a checkpoint of the whole population, to continue from."""
         tensors = prefixed("collector", self.population.state())
         for i, member in enumerate(self.population.members):
             tensors |= prefixed(str(i), vars(member.state))
@@ -259,34 +266,34 @@ class EvolvingPopulation:
         self.log.save(None, tensors, **header)
 
     def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
-        """Bring the environments, and what was seen in them, back to where a checkpoint was."""
+        """Restore the environments and their episodes from a checkpoint."""
         population, saved = self.population, unprefixed("collector", tensors)
         store = unprefixed("store", tensors)
         ids = resumed(self.log, lambda: population.resume(saved, store))
         self.log.tell_begun_anew(len(ids), population.part.num_envs)
 
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
-        """Stand where a checkpoint says."""
+        """Restore the population from a checkpoint."""
         where = str(self.run.path)
         self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
         if best := at.get("best"):
             policy = AgentPolicy.from_file(unprefixed("best", tensors), best["policy"], where)
             self.best = Best(best["fitness"], best["number"], best["generation"], policy)
         members = [
-            self._restored(told, unprefixed(str(i), tensors), f"{where}: member {i}")
-            for i, told in enumerate(at["members"])
+            self._restored(entry, unprefixed(str(i), tensors), f"{where}: member {i}")
+            for i, entry in enumerate(at["members"])
         ]
         scene = self.stage.scene
         self.population = Population(members, self.evolution, scene, self.seeds, self.parts)
         self.population.part.rounds = at["rounds"]
         self.population.next_number = at["next_number"]
 
-    def _restored(self, told: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
-        """A member of a checkpoint.
+    def _restored(self, entry: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
+        """Return a member of a checkpoint.
 
         Heirs have parents that had not diverged. The last generation has no heirs.
         """
-        member = _member_from_json(told)
+        member = _member_from_json(entry)
         algorithm = make_algorithm(member.config, *self.spaces)
         like, groups = algorithm.init([self.seeds]), algorithm.parameter_groups()
         member.state = state_from(tensors, like, where, groups, may_diverge=self.over)
@@ -302,11 +309,11 @@ def _member_to_json(member: Member) -> dict[str, Any]:
     }
 
 
-def _member_from_json(told: dict[str, Any]) -> Member:
-    origin = dict(told["origin"])
+def _member_from_json(entry: dict[str, Any]) -> Member:
+    origin = dict(entry["origin"])
     origin["changes"] = {k: tuple(v) for k, v in origin["changes"].items()}
-    config = config_from_json(told["config"])
-    return Member(told["number"], config, None, told["steps"], Origin(**origin))
+    config = config_from_json(entry["config"])
+    return Member(entry["number"], config, None, entry["steps"], Origin(**origin))
 
 
 def _short(value: Any) -> str:

@@ -1,1 +1,1 @@
-"""Stacked networks: every parameter has a leading member axis P (contract 5)."""
+"""Stacked networks: every parameter has a leading member axis P."""

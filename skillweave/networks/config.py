@@ -12,14 +12,14 @@ from skillweave.settings import Check, Count, check, checked_settings
 
 T = TypeVar("T")
 WIDEST = 65_536
-"""Units of a layer."""
+"""The most units of a layer."""
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 Width = Annotated[int, Check(f"at least 1 and at most {WIDEST:,}", lambda x: 1 <= x <= WIDEST)]
 """Units of a layer, channels, or pixels of a kernel."""
 Places = Annotated[
     tuple[Count, ...],
     Check(
-        "a tuple of places in an observation, from 0 on, each once: sees=(0, 1, 4)",
+        "a tuple of places in an observation, from 0, each once: sees=(0, 1, 4)",
         lambda x: 0 < len(x) == len(set(x)),
     ),
 ]
@@ -31,13 +31,13 @@ EncoderValue = Annotated[
         "registered encoder"
     ),
 ]
-"""An encoder as the user gives it."""
+"""An encoder as the user passes it."""
 
 
 @checked_settings
 @dataclass(frozen=True)
 class CNN:
-    """How images become features; ``CNN()`` is Nature's (Mnih et al. 2015).
+    """A convolutional network for images; ``CNN()`` is Nature's (Mnih et al. 2015).
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
@@ -60,15 +60,15 @@ class CNN:
         if self.kind == "plain" and len(sizes) > 1:
             raise DeclarationError(
                 f"CNN.channels, kernels and strides have {len(self.channels)}, "
-                f"{len(self.kernels)} and {len(self.strides)} entries; they must be as many"
+                f"{len(self.kernels)} and {len(self.strides)} entries; give the same number of each"
             )
 
     @classmethod
     def impala(cls, channels: tuple[int, ...] = (16, 32, 32)) -> CNN:
-        """The residual network of IMPALA (Espeholt et al. 2018, fig. 3).
+        """Return the residual network of IMPALA (Espeholt et al. 2018, fig. 3).
 
         Args:
-            channels: of each of its blocks.
+            channels: the channels of each block.
 
         Returns:
             The settings.
@@ -77,7 +77,7 @@ class CNN:
 
     @classmethod
     def small(cls) -> CNN:
-        """One 3×3 layer of 16 channels, for images of about ten pixels (Young & Tian 2019).
+        """Return one 3×3 layer of 16 channels, for images of about ten pixels (Young & Tian 2019).
 
         Returns:
             The settings.
@@ -88,7 +88,7 @@ class CNN:
 @checked_settings
 @dataclass(frozen=True)
 class RNN:
-    """A memory after the hidden layers.
+    """A recurrent layer after the hidden layers.
 
     Raises:
         DeclarationError: a setting is wrong or out of its range; the message names it.
@@ -99,16 +99,16 @@ class RNN:
     kind: Literal["lstm", "gru"] = "lstm"
     """lstm (Hochreiter & Schmidhuber 1997) or gru (Cho et al. 2014)."""
     size: Width = 64
-    """Numbers that it outputs."""
+    """Width of its output."""
 
 
 @checked_settings
 @dataclass(frozen=True)
 class Network:
-    """Images through a CNN, everything else as it is, then hidden layers, then a memory.
+    """A network: a CNN for images, then hidden layers on all numbers, then a recurrent layer.
 
-    Dict and Tuple observations need nothing more: their parts are joined before the hidden
-    layers. Lists are taken as tuples, and a dict as the settings that it names.
+    Dict and Tuple observations need no setting: their parts are joined before the hidden layers.
+    Lists count as tuples, and a dict as the settings that it names.
 
     ```python
     import skillweave as sw
@@ -132,26 +132,26 @@ class Network:
     layer_norm: bool = False
     """Normalise each hidden layer before its nonlinearity."""
     cnn: CNN | None = None
-    """How images are encoded; None: CNN() from 36 pixels upwards, CNN.small() below, with a smaller
-    kernel where an image has less than 3 pixels."""
+    """The encoder of images; None: CNN() from 36 pixels upwards, CNN.small() below, with a smaller
+    kernel where an image has fewer than 3 pixels."""
     rnn: RNN | None = None
-    """A memory, for PPO; None: the policy sees one observation at a time."""
+    """A recurrent layer, for PPO; None: the policy sees one observation at a time."""
     encoder: EncoderValue | None = None
     """A network of your own in front of the hidden layers: a function ``f(observation_space)`` that
     returns a ``torch.nn.Module``, or such a class. Its ``forward`` turns observations (B, *shape)
     into features (B, F), as a features extractor of Stable-Baselines3 does. The space describes
-    what ``forward`` gets, all of it float32: numbers as the algorithm's ``normalize_obs`` leaves
-    them, images as (C, H, W) from 0 to 1, choices one-hot, a Dict or Tuple as a dict or tuple. Its
+    the input of ``forward``, all of it float32: numbers after the algorithm's ``normalize_obs``,
+    images as (C, H, W) from 0 to 1, choices one-hot, a Dict or Tuple as a dict or tuple. Its
     parameters are learnt and saved with the policy; a run records its name, and needs its code to
-    be loaded. Or the name of an encoder that was registered; see ``register_encoder``."""
+    be loaded. Or the name of a registered encoder; see ``register_encoder``."""
     sees: Places | None = None
-    """Which numbers of the observation it sees, by their places; None: all. The places are those of
-    the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without images,
-    which are seen in any case. For a skill that is not to know of the task around it."""
+    """The places of the numbers that the network sees in the observation; None: all. Places count
+    in the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without
+    images, which are always seen. For a skill that must not depend on the task around it."""
     planes: Literal["first", "last"] | None = None
-    """The axis of an image that holds its channels, or a board's planes; None: the shape says it,
-    as (8, 8, 111) and (3, 210, 160) do. For the images whose shape does not say it, (3, 3, 3) for
-    example; where each shape does, for all."""
+    """The axis of an image that holds its channels, or a board's planes; None: derived from the
+    shape, as of (8, 8, 111) and (3, 210, 160). Applies to images of ambiguous shape, such as
+    (3, 3, 3); if no shape is ambiguous, to all."""
 
     def __post_init__(self) -> None:
         if self.encoder is not None:
@@ -170,18 +170,18 @@ def check_critic(config: Any) -> None:
 
 
 def _encoder(value: Any) -> str:
-    """Return the name of an encoder; of a function of the user one that leads to it."""
+    """Return the name of an encoder; for a function of the user, a name that leads to it."""
     if not isinstance(value, str) and hasattr(value, "state_dict") and not isinstance(value, type):
         raise DeclarationError(
             f"Network.encoder is a {type(value).__name__}, a module; give the class, or a function "
-            "f(observation_space) that makes the module, because each network gets one of its own"
+            "f(observation_space) that makes the module, because each network needs its own"
         )
-    found: str = named(value, "Network.encoder")
-    return found
+    name: str = named(value, "Network.encoder")
+    return name
 
 
 def seeing_all(algorithm: T) -> T:
-    """The same settings of an algorithm, with networks that see the whole observation."""
+    """Return an algorithm's settings with networks that see the whole observation."""
     networks = {k: getattr(algorithm, k, None) for k in ("network", "critic")}
     seeing = {k: replace(v, sees=None) for k, v in networks.items() if isinstance(v, Network)}
     return replace(algorithm, **seeing)  # type: ignore[type-var]

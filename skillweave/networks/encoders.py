@@ -1,4 +1,4 @@
-"""Images to features, for P members at once: a convolution with P groups is a stack of P."""
+"""Encoders of observations for P members at once; a convolution with P groups is a stack of P."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from torch.nn import functional as F
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.named import Named, known_names
+from skillweave.networks.cells import CellsEncoder
 from skillweave.networks.config import CNN, Activation
-from skillweave.networks.stacked import ACTIVATIONS, Views, orthogonal_
+from skillweave.networks.own import ModuleEncoder
+from skillweave.networks.stacked import ACTIVATIONS, Inputs, Views, orthogonal_
 from skillweave.spaces import ObsCodec
-
-Inputs = Mapping[str, Tensor]
-"""What a network takes in: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""
 
 
 class Encoder(Protocol):
-    """A custom encoder: observations to features, with parameters of its own.
+    """A custom encoder: a map from observations to features, with its own parameters.
 
-    It is made once for an observation space by the function given to ``register_encoder``, and
-    holds no parameters: those arrive under the names that ``shapes`` gave, each with the member
-    axis P in front, as everything here does.
+    The function passed to ``register_encoder`` creates it once for an observation space. It holds
+    no parameters: they are arguments of each call, under the names in ``shapes``, each with the
+    member axis P in front.
     """
 
     size: int
@@ -39,13 +38,13 @@ class Encoder(Protocol):
         """Fill fresh parameters in place.
 
         Args:
-            views: of its parameters, each (P, *shape).
+            views: views of its parameters, each (P, *shape).
             generators: one for each of P members.
         """
         ...
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
-        """Inputs to features (P, B, F)."""
+        """Map inputs to features (P, B, F)."""
         ...
 
 
@@ -54,28 +53,24 @@ _REGISTERED: dict[str, Callable[[ObsCodec], Encoder]] = {}
 
 @checked_names
 def register_encoder(name: str, make: Callable[[ObsCodec], Encoder]) -> None:
-    """Make a custom encoder known, for ``Network(encoder=name)``.
+    """Register a custom encoder for ``Network(encoder=name)``.
 
     Args:
-        name: what settings call it; the latest of a name counts.
-        make: given what is known of an observation space, makes the encoder for it.
+        name: its name in settings; a later registration replaces an earlier one.
+        make: creates the encoder from the codec of an observation space.
     """
     _REGISTERED[name] = make
 
 
 def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
-    """A registered encoder, or one of a module of the user, on one observation space.
+    """Create a registered encoder, or one of a module of the user, on one observation space.
 
     Raises:
-        DeclarationError: it was not registered, or is a function that was not given.
+        DeclarationError: the encoder is not registered, or its function is not loaded.
     """
     if isinstance(name, Named):
-        from skillweave.networks.own import ModuleEncoder
-
         return ModuleEncoder(obs, name)
     if name == "cells" and name not in _REGISTERED:
-        from skillweave.networks.cells import CellsEncoder
-
         return CellsEncoder(obs)
     if name not in _REGISTERED and ":" in name:
         raise DeclarationError(
@@ -93,12 +88,12 @@ def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
 
 
 class ImageEncoder:
-    """One image of an observation through a CNN."""
+    """A CNN that encodes one image of an observation."""
 
     def __init__(self, obs: ObsCodec, index: int, cnn: CNN | None, activation: Activation) -> None:
         self._obs, self._index = obs, index
         channels, height, width = obs.images[index]
-        self.cnn = cnn or _usual(min(height, width))
+        self.cnn = cnn or _default_cnn(min(height, width))
         self._activation = ACTIVATIONS[activation]
         self.shapes: dict[str, tuple[int, ...]] = {}
         self.sizes: list[tuple[int, int]] = []
@@ -116,8 +111,8 @@ class ImageEncoder:
                     raise DeclarationError(
                         f"Network.cnn does not fit images of {obs.images[index]} (channels, "
                         f"height, width): layer {i} has a kernel of {kernel} pixels, but only "
-                        f"{height}×{width} are left; leave out cnn, which is then CNN.small() or "
-                        "CNN() as fits, or use smaller kernels or fewer layers"
+                        f"{height}×{width} are left; omit cnn, then CNN.small() or CNN() is chosen "
+                        "by size, or use smaller kernels or fewer layers"
                     )
                 self._layer(str(i), channels, out, kernel)
                 height, width = ((x - kernel) // stride + 1 for x in (height, width))
@@ -129,7 +124,7 @@ class ImageEncoder:
         self.shapes |= {f"{name}.weight": (n_out, n_in, kernel, kernel), f"{name}.bias": (n_out,)}
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Orthogonal filters, gain √2, biases zero."""
+        """Draw orthogonal filters, gain √2; set biases to zero."""
         for name, view in views.items():
             if name.endswith("weight"):
                 orthogonal_(view, math.sqrt(2.0), generators)
@@ -137,7 +132,7 @@ class ImageEncoder:
                 view.zero_()
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
-        """Pixels as they came, (P, B, C, H, W), to features (P, B, F)."""
+        """Map raw pixels (P, B, C, H, W) to features (P, B, F)."""
         image = inputs[f"image.{self._index}"]
         members, batch = image.shape[:2]
         x = self._obs.pixels(image, self._index)
@@ -157,8 +152,8 @@ class ImageEncoder:
         return x.reshape(batch, members, -1).transpose(0, 1)
 
 
-def _usual(side: int) -> CNN:
-    """Return the CNN for images whose shorter side has so many pixels, if none is given."""
+def _default_cnn(side: int) -> CNN:
+    """Return the default CNN for images whose shorter side has ``side`` pixels."""
     if side >= 36:
         return CNN()
     small = CNN.small()
@@ -172,13 +167,12 @@ def _conv(views: Views, name: str, x: Tensor, stride: int = 1, padding: int = 0)
 
 
 def part(views: Views, prefix: str) -> dict[str, Tensor]:
-    """The parameters under a prefix, by their names within it."""
-    cut = len(prefix) + 1
-    return {k[cut:]: v for k, v in views.items() if k.startswith(prefix + ".")}
+    """Return the parameters under a prefix, by their names within it."""
+    return {k.removeprefix(f"{prefix}."): v for k, v in views.items() if k.startswith(f"{prefix}.")}
 
 
 def under(prefix: str, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """The same names with a prefix before them."""
+    """Return the shapes with a prefix before their names."""
     return {f"{prefix}.{k}": v for k, v in shapes.items()}
 
 

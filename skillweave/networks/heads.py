@@ -1,4 +1,4 @@
-"""Action heads: what a policy network's last layer means."""
+"""Action heads: the meaning of a policy network's outputs as parameters of a distribution."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ from skillweave.types import Array
 LOG_STD = (-5.0, 2.0)
 """Range of a log deviation that depends on the state."""
 WIDEST = 1.0
-"""The deviation of bounded actions beyond which the entropy bonus counts against it; their range
-spans [−1, 1]."""
+"""The deviation of bounded actions beyond which the entropy bonus becomes a cost; their range spans
+[−1, 1]."""
 
 
 class ActionHead:
-    """What a head (..., width) means.
+    """The action distribution whose parameters (..., width) a network computes.
 
-    Of discrete actions it is logits; of a Box the mean, and perhaps the log deviation after it.
-    Actions are (...) int64 for Discrete, (..., K) int64 for MultiDiscrete and MultiBinary,
-    (..., A) float in policy units for a Box. A squashed Box action is kept as it was before tanh,
-    where its log-probability is exact; ``to_env`` applies tanh.
+    For discrete actions they are logits; for a Box the mean, and perhaps the log deviation after
+    it. Actions are (...) int64 for Discrete, (..., K) int64 for MultiDiscrete and MultiBinary,
+    (..., A) float in policy units for a Box. A squashed Box action is stored before tanh, where its
+    log-probability is exact; ``to_env`` applies tanh.
 
     Args:
-        codec: of the action space.
-        std: whether a Box's deviation is a parameter or part of the head.
-        squash: whether a Box's actions go through tanh.
+        codec: the codec of the action space.
+        std: "parameter": a Box's deviation is a parameter; "state": the network computes it.
+        squash: apply tanh to a Box's actions.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class ActionHead:
         self.std_in_head = std == "state" and not codec.discrete
         self.width = codec.size * (2 if self.std_in_head else 1)
         widest = max(codec.parts, default=0)
-        # Where the parts' logits stand in a row (K, widest): parts of different sizes are padded.
+        # The columns of each part's logits (K, widest): parts of different sizes are padded.
         rows, start = [], 0
         for n in codec.parts:
             rows.append([start + min(i, n - 1) for i in range(widest)])
@@ -63,22 +63,22 @@ class ActionHead:
         self._columns = Constant(torch.tensor(rows, **INT))
         exists = [[i < n for i in range(widest)] for n in codec.parts]
         self._exists = Constant(torch.tensor(exists, **BOOL))
-        # Which dimensions of a Box have two bounds, and so units in which they span [−1, 1].
+        # The dimensions of a Box with two bounds, whose units therefore span [−1, 1].
         bounded = [] if codec.discrete else codec.span[2].tolist()
         self._narrows = any(bounded) and not self.squash
         self._bounded = Constant(torch.tensor(bounded, **BOOL))
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are discrete."""
+        """Return whether actions are discrete."""
         return self.codec.discrete
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
-        """Noise for calls of ``act``.
+        """Draw noise for calls of ``act``.
 
         Args:
             generators: one for each of P members.
-            steps: how many calls.
+            steps: the number of calls.
             batch: environments of each member.
 
         Returns:
@@ -92,10 +92,10 @@ class ActionHead:
         return torch.stack(drawn, dim=1)
 
     def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
-        """The actions that a head means.
+        """Return greedy or sampled actions of the distribution.
 
         Args:
-            head: (..., width), logits masked already.
+            head: dist_params (..., width), logits already masked.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
             noise: one step of ``noise``; None: act greedily.
@@ -113,14 +113,14 @@ class ActionHead:
     def stats(
         self, head: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """How likely actions are, and how spread out the distribution is.
+        """Compute log-probabilities of actions and the entropy of the distribution.
 
         Args:
-            head: (..., width), what a network's last layer says.
+            head: dist_params (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
             mask: (..., A) bool, allowed actions; None: all.
-            action: (...) or (..., A), what was done.
+            action: (...) or (..., A), the actions.
 
         Returns:
             Log-probability and entropy in nats, each (...).
@@ -135,21 +135,21 @@ class ActionHead:
         log_prob, entropy = normal_stats(mean, log_std, action)
         if self.squash:
             log_prob = log_prob - tanh_log_det(action).sum(-1)
-            # No closed form: one sample, the action, moved along with mean and deviation.
+            # No closed form: estimated with one sample, the action, as a function of mean and std.
             z = ((action - mean) * (-log_std).exp()).detach()
             entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
         return log_prob, entropy
 
     def surplus(self, head: Tensor, log_std: Tensor | None) -> Tensor | None:
-        """What is too much of the entropy, in nats, (...); None: nothing.
+        """Compute the cost of too much entropy, in nats, (...); None: no cost.
 
-        A normal's entropy grows with its deviation without end. A bonus for it would widen the
-        deviation for ever where rewards are rare, until the mean does not matter. Actions of a
-        bounded range are clipped to it: with a deviation of 1 (``WIDEST``) a third of them, with 2
-        two thirds. So a wider normal explores no more, and each nat beyond counts against it.
+        A normal's entropy grows with its deviation without limit. Where rewards are rare, a bonus
+        for it would widen the deviation forever, until the mean has no effect. Bounded actions are
+        clipped to their range: with a deviation of 1 (``WIDEST``) a third of them, with 2 two
+        thirds. So a wider normal explores no more, and each nat beyond is a cost.
 
         Args:
-            head: (..., width), what a network's last layer says.
+            head: dist_params (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
         """
@@ -167,14 +167,14 @@ class ActionHead:
         other_log_std: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """KL(p ‖ q), p by the first head and q by the other, before any squashing.
+        """Compute KL(p ‖ q) before any squashing, p of ``head`` and q of ``other``.
 
         Args:
-            head: (..., width), what a network's last layer says.
+            head: dist_params (..., width) of p.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
-            other: (..., width), the head of q.
-            other_log_std: as ``log_std``, of q.
+            other: dist_params (..., width) of q.
+            other_log_std: ``log_std`` of q.
             mask: (..., A) bool, allowed actions; None: all.
 
         Returns:
@@ -188,9 +188,10 @@ class ActionHead:
         return categorical_kl(self._parts(head), self._parts(other)).sum(-1)
 
     def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
-        """A head under which Discrete or Box actions have exactly these log-probabilities (...).
+        """Return dist_params under which actions have exactly these log-probabilities (...).
 
-        For a caller who knows what was done and how likely it was, but not the distribution.
+        For a caller with actions and their probabilities, but without the distribution; for
+        Discrete and Box.
 
         Args:
             action: (...) int64 or (..., A).
@@ -208,10 +209,10 @@ class ActionHead:
         return action - away.sqrt()[..., None] * log_std.exp()
 
     def moments(self, head: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Mean and log deviation of a Box's normal, each (..., A) or broadcast to it.
+        """Return mean and log deviation of a Box's normal, each (..., A) or broadcast to it.
 
         Args:
-            head: (..., width), what a network's last layer says.
+            head: dist_params (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
         """
@@ -222,13 +223,13 @@ class ActionHead:
         return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
-        """An ``action`` (n, …) in policy units as the environment's."""
+        """Convert actions (n, …) from policy units to the environment's."""
         return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
 
     def _parts(self, logits: Tensor) -> Tensor:
-        """Logits (..., ΣN) to (..., K, widest); what does not exist has the smallest number."""
+        """Spread logits (..., ΣN) to (..., K, widest); padding has the smallest number."""
         return mask_logits(self._spread(logits), self._exists.on(logits.device))
 
     def _spread(self, x: Tensor) -> Tensor:
-        """(..., ΣN) to (..., K, widest), the last entry of short parts repeated."""
+        """Spread (..., ΣN) to (..., K, widest), the last entry of short parts repeated."""
         return x[..., self._columns.on(x.device)]

@@ -1,4 +1,4 @@
-"""A whole network: encoders, hidden layers, memory, head; each call is given parameters."""
+"""A whole network: encoders, hidden layers, recurrent layer, head; parameters are arguments."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from skillweave.spaces import ObsCodec
 
 
 class Net:
-    """One architecture on one observation space.
+    """A network of one architecture on one observation space.
 
     Args:
         name: the prefix of its parameters' names.
-        obs: of the observation space.
+        obs: the codec of the observation space.
         network: its architecture.
         outputs: width of the head; None: no head, the last hidden layer is the output.
-        extra: width of what is given beside the observation (a critic's action).
+        extra: width of the input beside the observation (a critic's action).
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Net:
         self._sees = None if network.sees is None else Constant(_places(network.sees, obs.size))
         seen = obs.size if network.sees is None else len(network.sees)
         self.features = seen if self._vector else 0
-        """Where the features of the encoders begin in what the first layer reads."""
+        """The first column of the encoders' features in the input of the first layer."""
         width = self.features + extra
         width += sum(e.size for e in self.encoders.values())
         self.shapes: dict[str, tuple[int, ...]] = {}
@@ -57,7 +57,7 @@ class Net:
         self.head = f"{name}.{depth}" if network.rnn is None else f"{name}.head"
         """Prefix of the head's parameters."""
         self.memory_size = 0 if network.rnn is None else rnn_memory_size(network.rnn)
-        """M, the width of its memory; 0: it has none."""
+        """M, the width of the recurrent state; 0: the network has none."""
         if network.rnn is None:
             self.shapes |= mlp_shapes(name, width, network, outputs)
             self.width = outputs or (network.hidden[-1] if network.hidden else width)
@@ -70,11 +70,11 @@ class Net:
             self.width = outputs or 1
 
     def init_(self, views: Views, head_gain: float, generators: list[torch.Generator]) -> None:
-        """Fresh parameters, in place.
+        """Draw fresh parameters, in place.
 
         Args:
-            views: of its parameters, each (P, *shape).
-            head_gain: gain of the head's weights; near 0: all outputs begin alike.
+            views: views of its parameters, each (P, *shape).
+            head_gain: gain of the head's weights; near 0: all initial outputs are nearly equal.
             generators: one for each of P members.
         """
         for prefix, encoder in self.encoders.items():
@@ -86,19 +86,19 @@ class Net:
             views[f"{self.head}.bias"].zero_()
 
     def __call__(self, views: Views, inputs: Inputs, extra: Tensor | None = None) -> Tensor:
-        """Inputs (P, B, …) to (P, B, out), for networks without memory."""
+        """Map inputs (P, B, …) to (P, B, out), for networks without a recurrent layer."""
         return mlp(views, self.name, self.network, self._joined(views, inputs, extra))
 
     def step(self, views: Views, inputs: Inputs, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """One step with memory.
+        """Run a recurrent network for one step.
 
         Args:
-            views: of its parameters, each (P, *shape).
+            views: views of its parameters, each (P, *shape).
             inputs: (P, B, …) each.
-            memory: (P, B, M).
+            memory: recurrent state (P, B, M).
 
         Returns:
-            The output (P, B, out) and the memory after it (P, B, M).
+            The output (P, B, out) and the recurrent state after it (P, B, M).
         """
         rnn, name = self.network.rnn, f"{self.name}.rnn"
         assert rnn is not None
@@ -109,16 +109,16 @@ class Net:
     def sequence(
         self, views: Views, inputs: Inputs, memory: Tensor, starts: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """T steps with memory.
+        """Run a recurrent network for T steps.
 
         Args:
-            views: of its parameters, each (P, *shape).
+            views: views of its parameters, each (P, *shape).
             inputs: (P, T, B, …) each.
-            memory: (P, B, M), before the first step.
-            starts: (P, T, B) bool, where an episode begins.
+            memory: recurrent state (P, B, M) before the first step.
+            starts: (P, T, B) bool, True where an episode begins.
 
         Returns:
-            Outputs (P, T, B, out) and the memory after each step (P, T, B, M).
+            Outputs (P, T, B, out) and the recurrent state after each step (P, T, B, M).
         """
         rnn, steps = self.network.rnn, starts.shape[1:]
         assert rnn is not None
@@ -132,7 +132,7 @@ class Net:
         return torch.baddbmm(bias, x, weight)
 
     def _seen(self, vector: Tensor) -> Tensor:
-        """The numbers (P, B, O) that this network is given."""
+        """Select the numbers (P, B, O) that this network sees."""
         return (
             vector if self._sees is None else vector.index_select(-1, self._sees.on(vector.device))
         )
@@ -147,14 +147,14 @@ class Net:
 
 
 def _places(sees: tuple[int, ...], size: int) -> Tensor:
-    """Places of an observation of so many numbers.
+    """Return the places that a network sees in an observation of ``size`` numbers.
 
     Raises:
-        DeclarationError: there are fewer numbers.
+        DeclarationError: the observation has fewer numbers.
     """
     if max(sees) >= size:
-        there = "has no number beside its images" if not size else f"has {size} (0 to {size - 1})"
+        numbers = "has no number beside its images" if not size else f"has {size} (0 to {size - 1})"
         raise DeclarationError(
-            f"Network.sees names the number {max(sees)} of an observation, but it {there}"
+            f"Network.sees names the number {max(sees)} of an observation, but it {numbers}"
         )
     return torch.tensor(sees, **INT)

@@ -1,4 +1,4 @@
-"""Networks of action values: perhaps dueling, perhaps with noisy weights, perhaps of atoms."""
+"""Networks of action values, optionally dueling, with noisy weights, or with atoms."""
 
 from __future__ import annotations
 
@@ -9,20 +9,19 @@ import torch
 from torch import Tensor
 
 from skillweave.networks.config import Network
-from skillweave.networks.encoders import Inputs
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes
+from skillweave.networks.stacked import Inputs, Views, mlp, mlp_init_, mlp_shapes
 from skillweave.spaces import ObsCodec
 
 
 class QNet:
-    """Values of A actions, each of ``atoms`` numbers; perhaps dueling, perhaps with noisy weights.
+    """A network of A action values, each of ``atoms`` numbers; dueling and noisy are optional.
 
-    Dueling: the last hidden layer is two, one below the state's value and one below the actions'
-    advantages; ``Q = V + A − mean A`` (Wang et al. 2016, eq. 9), atom by atom in C51.
+    Dueling: the last hidden layer is split in two, one for the state's value and one for the
+    actions' advantages; ``Q = V + A − mean A`` (Wang et al. 2016, eq. 9), atom by atom in C51.
 
-    Noisy: parameters are the means of the weights of hidden layers and heads; beside each stands
-    a ``…_sigma`` (Fortunato et al. 2018). Without noise it is the network of the means.
+    Noisy: parameters are the means of the weights of hidden layers and heads; each also has a
+    ``…_sigma`` (Fortunato et al. 2018). Without noise, the network uses the means.
     """
 
     def __init__(
@@ -50,18 +49,18 @@ class QNet:
             self.shapes |= mlp_shapes(name, self.trunk.width, stream, outputs)
         self._noisy = []
         if noisy:
-            own = mlp_shapes("q", 1, self.trunk.network, None if dueling else 1)
+            layers = mlp_shapes("q", 1, self.trunk.network, None if dueling else 1)
             for name, stream, outputs in self.streams:
-                own |= mlp_shapes(name, 1, stream, outputs)
-            self._noisy = [k.removesuffix(".weight") for k in own if k.endswith(".weight")]
+                layers |= mlp_shapes(name, 1, stream, outputs)
+            self._noisy = [k.removesuffix(".weight") for k in layers if k.endswith(".weight")]
         for layer in self._noisy:
             for kind in ("weight", "bias"):
                 self.shapes[f"{layer}.{kind}_sigma"] = self.shapes[f"{layer}.{kind}"]
         self.noise_size = sum(sum(self.shapes[f"{k}.weight"]) for k in self._noisy)
-        """Random numbers that one draw of the weights' noise needs; 0: they have none."""
+        """Random numbers in one draw of the weights' noise; 0: the weights have no noise."""
 
     def init_(self, views: Views, generators: list[torch.Generator]) -> None:
-        """Fresh parameters in place, one generator per member."""
+        """Draw fresh parameters in place, one generator per member."""
         self.trunk.init_(views, 1.0, generators)
         for name, stream, _ in self.streams:
             mlp_init_(views, name, stream, 1.0, generators)
@@ -74,7 +73,7 @@ class QNet:
                 views[f"{layer}.{kind}_sigma"].fill_(0.5 * bound)
 
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
-        """Inputs (P, B, …) to (P, B, A, atoms): values, or logits of the atoms."""
+        """Map inputs (P, B, …) to (P, B, A, atoms): values, or logits of the atoms."""
         x = self.trunk(views, inputs)
         if not self.streams:
             return x.view(*x.shape[:2], self._actions, self._atoms)
@@ -83,9 +82,9 @@ class QNet:
         return value[..., None, :] + (advantage - advantage.mean(2, keepdim=True))
 
     def perturbed(self, views: Views, noise: Tensor) -> dict[str, Tensor]:
-        """The views with noise (P, K), standard normal: factorised, ``f(x) = sgn(x)·√|x|``."""
-        scaled = noise.sign() * noise.abs().sqrt()
-        found, at = dict(views), 0
+        """Return weights with factorised noise, from standard normal numbers (P, K)."""
+        scaled = noise.sign() * noise.abs().sqrt()  # f(x) = sgn(x)·√|x|
+        weights, at = dict(views), 0
         for layer in self._noisy:
             n_in, n_out = self.shapes[f"{layer}.weight"]
             rows, columns = (
@@ -95,5 +94,5 @@ class QNet:
             at += n_in + n_out
             for kind, eps in (("weight", rows * columns), ("bias", columns)):
                 mean, sigma = views[f"{layer}.{kind}"], views[f"{layer}.{kind}_sigma"]
-                found[f"{layer}.{kind}"] = torch.addcmul(mean, sigma, eps)
-        return found
+                weights[f"{layer}.{kind}"] = torch.addcmul(mean, sigma, eps)
+        return weights

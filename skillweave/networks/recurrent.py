@@ -1,4 +1,7 @@
-"""LSTM and GRU cells for P members at once, and sequences of them that start anew where told."""
+"""LSTM and GRU cells for P members at once, and sequences with resets at episode starts.
+
+Stands alone because it has the equations of the cells, which ``net`` only calls.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,12 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 def rnn_memory_size(rnn: RNN) -> int:
-    """M, the numbers that one environment's memory holds: h, and an LSTM's c after it."""
+    """Return M, the size of one environment's recurrent state: h, and an LSTM's c after it."""
     return rnn.size * (2 if rnn.kind == "lstm" else 1)
 
 
 def rnn_shapes(prefix: str, inputs: int, rnn: RNN) -> Shapes:
-    """Parameters of a cell: ``input`` (in, gates·H), ``state`` (H, gates·H), and biases."""
+    """Return a cell's parameter shapes: ``input`` (in, gates·H), ``state`` (H, gates·H), biases."""
     width = rnn.size * (4 if rnn.kind == "lstm" else 3)
     return {
         f"{prefix}.input": (inputs, width),
@@ -28,7 +31,7 @@ def rnn_shapes(prefix: str, inputs: int, rnn: RNN) -> Shapes:
 
 
 def rnn_init_(views: Views, prefix: str, generators: list[torch.Generator]) -> None:
-    """Orthogonal weights, biases zero, as in CleanRL's recurrent PPO."""
+    """Draw orthogonal weights, set biases to zero, as in CleanRL's recurrent PPO."""
     for name in ("input", "state"):
         orthogonal_(views[f"{prefix}.{name}"], 1.0, generators)
     for name in ("bias", "state_bias"):
@@ -36,14 +39,14 @@ def rnn_init_(views: Views, prefix: str, generators: list[torch.Generator]) -> N
 
 
 def project(views: Views, prefix: str, x: Tensor) -> Tensor:
-    """The inputs' share of the gates, (P, B, in) to (P, B, gates·H): all steps at once."""
+    """Return the inputs' part of the gates, (P, B, in) to (P, B, gates·H): all steps at once."""
     return torch.baddbmm(views[f"{prefix}.bias"], x, views[f"{prefix}.input"])
 
 
 def cell(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> Tensor:
-    """One step: projected inputs (P, B, gates·H) and memory (P, B, M) to the new memory.
+    """Step: map projected inputs (P, B, gates·H) and recurrent state (P, B, M) to the next state.
 
-    The output is the memory's first H numbers. Gates as in torch.nn.LSTMCell and GRUCell.
+    The output is the state's first H numbers. Gates as in torch.nn.LSTMCell and GRUCell.
     """
     size = rnn.size
     h = memory[..., :size]
@@ -61,12 +64,12 @@ def cell(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> 
 def sequence(
     views: Views, prefix: str, rnn: RNN, x: Tensor, memory: Tensor, starts: Tensor
 ) -> Tensor:
-    """Memories after each of T steps, (P, T, B, M).
+    """Return the recurrent states after each of T steps, (P, T, B, M).
 
     Args:
         x: (P, T, B, in).
-        memory: (P, B, M), before the first step.
-        starts: (P, T, B) bool, an episode begins at this step: its memory begins at zero.
+        memory: recurrent state (P, B, M) before the first step.
+        starts: (P, T, B) bool, an episode begins at this step: its recurrent state is zero.
     """
     gates = project(views, prefix, x.flatten(1, 2)).unflatten(1, x.shape[1:3])
     keep = (~starts).unsqueeze(-1)

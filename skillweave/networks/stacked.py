@@ -1,7 +1,7 @@
 """Stacked layers: P members of one architecture as one set of tensors.
 
-All parameters of a network stand in one flat tensor (P, D); ``Layout`` knows which columns are
-which. So cloning, clipping, Adam, saving and selecting members are one operation each.
+All parameters of a network are in one flat tensor (P, D); ``Layout`` names its columns. So cloning,
+clipping, Adam, saving and selecting members are one operation each.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from skillweave.ops.device import FLOAT
 
 Views = Mapping[str, Tensor]
 """Named parameters, each (P, *shape)."""
+Inputs = Mapping[str, Tensor]
+"""Inputs of a network: ``vector`` (P, B, O) float and ``image.<i>`` (P, B, C, H, W), raw."""
 
 ACTIVATIONS: dict[Activation, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh_,
-    "relu": torch.relu_,  # in place: nothing else reads what goes in
+    "relu": torch.relu_,  # in place: nothing else reads its input
     "elu": F.elu,
     "silu": F.silu,
     "gelu": F.gelu,
@@ -38,40 +40,40 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """D, the number of parameters of one member."""
+        """Return D, the number of parameters of one member."""
         return sum(math.prod(s) for s in self.shapes.values())
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
-        """Windows into ``flat`` (P, D), each (P, *shape); writing to one writes to ``flat``."""
+        """Return windows into ``flat`` (P, D), each (P, *shape); writes to one change ``flat``."""
         parts = flat.split([math.prod(s) for s in self.shapes.values()], dim=1)
         named = zip(self.shapes.items(), parts, strict=True)
         return {name: part.view(-1, *shape) for (name, shape), part in named}
 
     def leaves(self, flat: Tensor) -> dict[str, Tensor]:
-        """Windows into ``flat`` (P, D) as ``views``, each (P, *shape) a leaf of a gradient."""
+        """Return windows into ``flat`` (P, D) as ``views`` does, each a leaf of a gradient."""
         return {k: v.detach().requires_grad_() for k, v in self.views(flat).items()}
 
     def gradient(self, loss: Tensor, leaves: Views) -> Tensor:
-        """The gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for what it does not depend on."""
+        """Return the gradient (P, D) of ``loss`` (P,) by ``leaves``; 0 for unused leaves."""
         # Members do not mix: the gradient of the sum is each member's own.
-        found = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
+        gradients = torch.autograd.grad(loss.sum(), list(leaves.values()), allow_unused=True)
         flat = [
             torch.zeros_like(leaf).flatten(1) if g is None else g.flatten(1)
-            for g, leaf in zip(found, leaves.values(), strict=True)
+            for g, leaf in zip(gradients, leaves.values(), strict=True)
         ]
         return torch.cat(flat, dim=1)
 
     def flatten(self, named: Mapping[str, Tensor]) -> Tensor:
-        """The inverse of ``views``: (P, D) from ``named`` tensors (P, *shape), copied."""
+        """Copy ``named`` tensors (P, *shape) into one (P, D); the inverse of ``views``."""
         return torch.cat([named[name].flatten(1) for name in self.shapes], dim=1)
 
 
 def mlp_shapes(
     prefix: str, inputs: int, net: Network, outputs: int | None
 ) -> dict[str, tuple[int, ...]]:
-    """Parameter names and shapes of hidden layers and head; weights (in, out), biases (1, out).
+    """Return names and shapes of hidden layers and head; weights (in, out), biases (1, out).
 
-    ``outputs`` None: there is no head.
+    ``outputs`` None: the network has no head.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     widths = (inputs, *net.hidden) if outputs is None else (inputs, *net.hidden, outputs)
@@ -85,9 +87,9 @@ def mlp_shapes(
 
 
 def orthogonal_(weight: Tensor, gain: float, generators: list[torch.Generator]) -> None:
-    """Orthogonal matrices in place, (P, in, ...), one generator per member.
+    """Draw orthogonal matrices in place, (P, in, ...), one generator per member (Saxe et al. 2014).
 
-    So a member's weights do not depend on its neighbours. Saxe et al. 2014.
+    So a member's weights do not depend on its neighbours.
     """
     for member, generator in enumerate(generators):
         fresh = torch.empty(weight.shape[1:], **FLOAT)
@@ -98,7 +100,7 @@ def orthogonal_(weight: Tensor, gain: float, generators: list[torch.Generator]) 
 def mlp_init_(
     views: Views, prefix: str, net: Network, head_gain: float, generators: list[torch.Generator]
 ) -> None:
-    """Orthogonal weights in place, gain √2 (``head_gain`` for the head), biases zero."""
+    """Draw orthogonal weights in place, gain √2 (``head_gain`` for the head), biases zero."""
     for i in range(_depth(views, prefix)):
         gain = head_gain if i == len(net.hidden) else math.sqrt(2.0)
         orthogonal_(views[f"{prefix}.{i}.weight"], gain, generators)
@@ -109,7 +111,7 @@ def mlp_init_(
 
 
 def mlp(views: Views, prefix: str, net: Network, x: Tensor) -> Tensor:
-    """(P, B, in) to (P, B, out); without a head in the views, the last hidden layer."""
+    """Map (P, B, in) to (P, B, out); without a head in the views, to the last hidden layer."""
     activation = ACTIVATIONS[net.activation]
     for i in range(len(net.hidden)):
         x = torch.baddbmm(views[f"{prefix}.{i}.bias"], x, views[f"{prefix}.{i}.weight"])
@@ -129,7 +131,7 @@ def _depth(views: Views, prefix: str) -> int:
 
 
 def take_rows(x: Tensor, rows: Tensor) -> Tensor:
-    """Rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
+    """Select rows of each member: x (P, B, ...), rows (P, K) to (P, K, ...)."""
     if x.shape[0] == 1:
         return x[0].index_select(0, rows[0])[None]
     return x[torch.arange(x.shape[0], device=x.device)[:, None], rows]

@@ -1,4 +1,4 @@
-"""Where the units of a network lie in its parameters: what growth needs to know, and nobody else.
+"""The positions of a network's units in its parameters, for growth.
 
 A unit is a number of a hidden layer, or a channel of a convolution.
 """
@@ -15,7 +15,7 @@ from skillweave.networks.qnet import QNet
 
 @dataclass(frozen=True)
 class Part:
-    """Where a layer's units lie in a parameter: unit u from ``start + u·block`` on of an axis."""
+    """The position of a layer's units in a parameter: unit u at ``start + u·block`` of an axis."""
 
     name: str
     axis: int  # from the end: negative
@@ -25,7 +25,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Units:
-    """Units that stand side by side: what computes them, and what reads them."""
+    """Units of one layer: the parameters that compute them, and those that read them."""
 
     count: int
     own: tuple[Part, ...]
@@ -35,7 +35,7 @@ class Units:
 def units_of(
     shapes: Mapping[str, tuple[int, ...]], count: int, layer: str, readers: Sequence[str]
 ) -> Units:
-    """The units of a layer of weights (in, out), read by the weights named; noise goes along."""
+    """Return the units of a layer of weights (in, out) that ``readers`` read, noise included."""
     names = (f"{name}{sigma}" for name in readers for sigma in ("", "_sigma"))
     return Units(
         count,
@@ -46,16 +46,16 @@ def units_of(
 
 @dataclass(frozen=True)
 class Joint:
-    """Where a layer can be added or taken away: behind the last hidden layer."""
+    """The place behind the last hidden layer, where a layer can be added or removed."""
 
     prefix: str
     depth: int
-    readers: tuple[tuple[str, str], ...]  # weight and bias of what reads it
+    readers: tuple[tuple[str, str], ...]  # weight and bias of each layer that reads it
     kinds: tuple[str, ...]  # parameters of a layer: weight, bias, and perhaps their sigmas
 
 
 def hidden_units(net: Net | QNet, layer: int) -> list[Units]:
-    """The units of a hidden layer; of the last of a dueling network, one group per stream."""
+    """Return the units of a hidden layer; in a dueling network the last has a group per stream."""
     trunk = net.trunk if isinstance(net, QNet) else net
     if layer < len(trunk.network.hidden):
         prefix = f"{trunk.name}.{layer}"
@@ -69,28 +69,29 @@ def hidden_units(net: Net | QNet, layer: int) -> list[Units]:
 
 
 def channels_of(net: Net | QNet, layer: int) -> list[Units]:
-    """The channels of a convolution, or of a stage, of every image; several groups."""
+    """Return the channels of a convolution, or of a stage, of every image; several groups."""
     trunk = net.trunk if isinstance(net, QNet) else net
-    found, start = [], trunk.features
+    groups: list[Units] = []
+    start = trunk.features
     for prefix, encoder in net.encoders.items():
         if isinstance(encoder, ImageEncoder):
             onward = tuple((name, start) for name in _readers_of(net, -1))
-            found += _encoder_units(encoder, layer, prefix, onward)
+            groups += _encoder_units(encoder, layer, prefix, onward)
         start += encoder.size
-    return found
+    return groups
 
 
 def joint_of(net: Net | QNet) -> Joint:
-    """Where the last hidden layer (of a dueling network, of its trunk) meets what reads it."""
+    """Return the joint between the last hidden layer (of the trunk, if dueling) and its readers."""
     trunk = net.trunk if isinstance(net, QNet) else net
     depth = len(trunk.network.hidden)
-    cut = len(prefix := f"{trunk.name}.{depth - 1}.")
-    kinds = tuple(k[cut:] for k in net.shapes if k.startswith(prefix))
+    prefix = f"{trunk.name}.{depth - 1}."
+    kinds = tuple(k.removeprefix(prefix) for k in net.shapes if k.startswith(prefix))
     return Joint(trunk.name, depth, _readers(net), kinds)
 
 
 def _readers(net: Net | QNet) -> tuple[tuple[str, str], ...]:
-    """Weights and biases of what reads the last hidden layer."""
+    """Return weights and biases of the layers that read the last hidden layer."""
     if isinstance(net, QNet):
         streams = tuple((f"{name}.0.weight", f"{name}.0.bias") for name, _, _ in net.streams)
         return streams or _readers(net.trunk)
@@ -100,7 +101,7 @@ def _readers(net: Net | QNet) -> tuple[tuple[str, str], ...]:
 
 
 def _readers_of(net: Net | QNet, layer: int) -> tuple[str, ...]:
-    """Weights that read a hidden layer; -1: the inputs."""
+    """Return the weights that read a hidden layer; -1: the inputs."""
     trunk = net.trunk if isinstance(net, QNet) else net
     if layer + 1 < len(trunk.network.hidden):
         return (f"{trunk.name}.{layer + 1}.weight",)
@@ -110,11 +111,11 @@ def _readers_of(net: Net | QNet, layer: int) -> tuple[str, ...]:
 def _encoder_units(
     encoder: ImageEncoder, layer: int, prefix: str, onward: Sequence[tuple[str, int]]
 ) -> list[Units]:
-    """The channels of a convolution or of a stage, in groups that have filters of their own.
+    """Return the channels of a convolution or of a stage, in groups with separate filters.
 
     Args:
-        prefix: of the encoder's parameters, in the network.
-        onward: weights that read the features, and where those begin in them.
+        prefix: the prefix of the encoder's parameters in the network.
+        onward: weights that read the features, and the features' first row in them.
     """
     cnn = encoder.cnn
     count, last = cnn.channels[layer], layer == len(cnn.channels) - 1
@@ -130,7 +131,7 @@ def _encoder_units(
     if cnn.kind == "plain":
         return [Units(count, own(str(layer)), after if last else read(str(layer + 1)))]
     s, after = layer, after if last else read(f"{layer + 1}.in")
-    return [  # what runs through the stage, and what lies within each of its blocks
+    return [  # the channels through the whole stage, and those within each of its blocks
         Units(count, own(f"{s}.in", f"{s}.0.1", f"{s}.1.1"), read(f"{s}.0.0", f"{s}.1.0") + after),
         Units(count, own(f"{s}.0.0"), read(f"{s}.0.1")),
         Units(count, own(f"{s}.1.0"), read(f"{s}.1.1")),

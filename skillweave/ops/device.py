@@ -1,4 +1,4 @@
-"""Where tensors live: on the CPU, or on an accelerator that works while Python goes on.
+"""Devices of tensors: the CPU, or an accelerator that works while Python continues.
 
 Generators stay on the CPU, so that a seed gives the same numbers on every device.
 """
@@ -17,37 +17,37 @@ from skillweave.errors import DeclarationError
 FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
 BOOL: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
-"""Types of new tensors: the defaults of PyTorch are the user's (``torch.set_default_dtype``)."""
+"""Types of new tensors: the user may have changed PyTorch's (``torch.set_default_dtype``)."""
 DEVICES = ("cpu", "cuda", "auto")
-"""Names of devices that settings know."""
+"""Valid device names of settings."""
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device of this name; "auto" is a GPU where there is one, else the CPU.
+    """Return the device of this name; "auto" is a GPU where there is one, else the CPU.
 
     Raises:
-        DeclarationError: the name is unknown, or PyTorch finds no such device here.
+        DeclarationError: the name is unknown, or PyTorch finds no such device.
     """
     if name not in DEVICES:
         raise DeclarationError(f"device is {name!r}; it must be one of {', '.join(DEVICES)}")
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
+    available = torch.cuda.is_available()
+    if name == "cuda" and not available:
         raise DeclarationError(
             f"device is 'cuda', but torch {torch.__version__} finds no CUDA device here; "
-            "use 'cpu', or 'auto', which takes a GPU only where there is one"
+            "use 'cpu', or 'auto', which uses a GPU only if one is available"
         )
-    return torch.device("cuda" if there and name != "cpu" else "cpu")
+    return torch.device("cuda" if available and name != "cpu" else "cpu")
 
 
 class Constant:
-    """A tensor that never changes, with a copy on every device that has asked for it."""
+    """A tensor that never changes, with a copy on each device that used it."""
 
     def __init__(self, value: Tensor) -> None:
         self._value = value
         self._copies: dict[torch.device, Tensor] = {}
 
     def on(self, device: torch.device) -> Tensor:
-        """The tensor on this device."""
+        """Return the tensor on this device."""
         if device == self._value.device:
             return self._value
         if device not in self._copies:
@@ -56,27 +56,24 @@ class Constant:
 
 
 def on_host(*numbers: Tensor) -> list[int]:
-    """Whole numbers of tensors () that the shape of what follows depends on.
+    """Return whole numbers of tensors (), on which shapes of later tensors depend.
 
-    The host waits for the device here. Nothing else in an update does.
+    The host waits for the device here, and nowhere else in an update.
     """
     return [int(n) for n in torch.stack(numbers).tolist()]
 
 
 def all_false(flags: Tensor) -> bool:
-    """Whether all are False, as far as that is known without waiting for an accelerator.
-
-    On the CPU, where looking costs nothing, it is the answer; elsewhere it is always False.
-    """
+    """Return whether all flags are False; on an accelerator return False, without waiting."""
     return flags.device.type == "cpu" and not bool(flags.any())
 
 
 @contextmanager
 def normal_tensors() -> Iterator[None]:
-    """Leave ``torch.inference_mode``, whose tensors cannot be learnt with, and ``torch.autocast``.
+    """Leave ``torch.inference_mode``, whose tensors cannot learn, and ``torch.autocast``.
 
-    The modes are of this thread, and of the user: they may surround the whole training. After
-    inference mode no gradients are made.
+    The user may have set these modes around the whole training; they apply to one thread. Out of
+    inference mode, gradients are disabled.
     """
     with ExitStack() as stack:
         for device in ("cpu", "cuda"):
@@ -90,7 +87,7 @@ def normal_tensors() -> Iterator[None]:
 
 @contextmanager
 def usual_defaults() -> Iterator[None]:
-    """Set the defaults of PyTorch as they are when Python starts, for code that relies on them."""
+    """Restore PyTorch's initial defaults within the block, for code that relies on them."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:

@@ -16,7 +16,7 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 def mask_logits(
     logits: Float[Tensor, "*batch A"], mask: Bool[Tensor, "*#batch A"] | None
 ) -> Float[Tensor, "*batch A"]:
-    """Logits with forbidden actions at the smallest finite number.
+    """Set the logits of forbidden actions to the smallest finite number.
 
     A finite number keeps entropy and gradients finite (Huang & Ontañón 2022).
 
@@ -33,7 +33,7 @@ def mask_logits(
 
 
 def with_epsilon(logits: Tensor, mask: Tensor | None, epsilon: Tensor) -> Tensor:
-    """Logits (..., A) of ``(1 − ε)·softmax + ε·uniform`` over what ``mask`` (..., A) allows.
+    """Return logits (..., A) of ``(1 − ε)·softmax + ε·uniform`` over actions that ``mask`` allows.
 
     Args:
         epsilon: ε, of a shape that broadcasts with (..., A).
@@ -45,22 +45,22 @@ def with_epsilon(logits: Tensor, mask: Tensor | None, epsilon: Tensor) -> Tensor
 
 
 def categorical_kl(logits: Tensor, other: Tensor) -> Tensor:
-    """KL(p ‖ q) of categoricals with these logits, masked alike; (..., A) to (...)."""
+    """Compute KL(p ‖ q) of categoricals, their logits masked alike; (..., A) to (...)."""
     log_p = logits.log_softmax(-1)
     log_q = other.log_softmax(-1).clamp_min(-200.0)
     return (log_p.exp() * (log_p.clamp_min(-200.0) - log_q)).sum(-1)
 
 
 def normal_kl(mean: Tensor, log_std: Tensor, other: Tensor, other_log_std: Tensor) -> Tensor:
-    """KL(p ‖ q) of independent normals, q the other; (..., A) to (...)."""
+    """Compute KL(p ‖ q) of independent normals, q the other; (..., A) to (...)."""
     variance, other_variance = (2.0 * log_std).exp(), (2.0 * other_log_std).exp()
     moved = (mean - other).square()
-    found = other_log_std - log_std + 0.5 * ((variance + moved) / other_variance - 1.0)
-    return found.sum(-1)
+    kl = other_log_std - log_std + 0.5 * ((variance + moved) / other_variance - 1.0)
+    return kl.sum(-1)
 
 
 def gumbel(uniform: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Gumbel noise ``−log(−log u)`` from uniform noise in [0, 1); any shape."""
+    """Convert uniform noise in [0, 1) to Gumbel noise ``−log(−log u)``; any shape."""
     tiny = torch.finfo(uniform.dtype).tiny
     exponential = (-torch.log(uniform.clamp_min(tiny))).clamp_min(tiny)
     return -torch.log(exponential)
@@ -69,14 +69,14 @@ def gumbel(uniform: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 def categorical_sample(
     logits: Float[Tensor, "*#batch A"], noise: Float[Tensor, "*#batch A"]
 ) -> Int[Tensor, "*batch"]:
-    """A sample by the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
+    """Sample with the Gumbel-max trick; logits and Gumbel noise (..., A) to (...) int64."""
     return torch.argmax(logits + noise, dim=-1)
 
 
 def categorical_stats(
     logits: Float[Tensor, "*batch A"], action: Int[Tensor, "*batch"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Log-probability of ``action`` and entropy; (..., A), (...) int64 to (...), (...)."""
+    """Compute log-probability of ``action`` and entropy; (..., A), (...) int64 to (...), (...)."""
     log_p = torch.log_softmax(logits, dim=-1)
     chosen = log_p.gather(-1, action.unsqueeze(-1)).squeeze(-1)
     return chosen, -(log_p.exp() * log_p).sum(-1)
@@ -87,7 +87,7 @@ def normal_stats(
     log_std: Float[Tensor, "*#batch A"],
     action: Float[Tensor, "*batch A"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Log-density and entropy of independent normals; (..., A) to (...), (...)."""
+    """Compute log-density and entropy of independent normals; (..., A) to (...), (...)."""
     z = (action - mean) * torch.exp(-log_std)
     log_prob = (-0.5 * z.square() - log_std - _HALF_LOG_TWO_PI).sum(-1)
     entropy = (log_std + 0.5 + _HALF_LOG_TWO_PI).expand_as(mean).sum(-1)
@@ -104,23 +104,23 @@ class _ClampInward(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         (x,), (low, high) = ctx.saved_tensors, ctx.bounds
-        # A step goes against the gradient.
+        # A gradient step moves against the gradient.
         outward = ((x < low) & (grad > 0.0)) | ((x > high) & (grad < 0.0))
         return grad.masked_fill(outward, 0.0), None, None
 
 
 def clamp_inward(x: Float[Tensor, "*shape"], low: float, high: float) -> Float[Tensor, "*shape"]:
-    """``x.clamp(low, high)``, but what lies outside still learns to come back; any shape.
+    """Clamp ``x`` to [low, high], with a gradient that leads back from outside; any shape.
 
-    A clamp has no gradient outside its bounds, so what got there would stay for ever. Here only
-    the part that leads further out is zero ("zeroing gradients", Hausknecht & Stone 2016, sec. 5).
+    A clamp has no gradient outside its bounds, so a number there would stay forever. Here only the
+    part that leads further out is zero ("zeroing gradients", Hausknecht & Stone 2016, sec. 5).
     """
-    found: Tensor = _ClampInward.apply(x, low, high)  # type: ignore[no-untyped-call]
-    return found
+    clamped: Tensor = _ClampInward.apply(x, low, high)  # type: ignore[no-untyped-call]
+    return clamped
 
 
 def tanh_log_det(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """``log(1 − tanh²(x))``, the log-derivative of tanh, without cancellation; any shape.
+    """Compute ``log(1 − tanh²(x))``, the log-derivative of tanh, without cancellation; any shape.
 
     ``2·(log 2 − x − softplus(−2x))``, as in the SAC authors' code (Haarnoja et al. 2018, app. C).
     """
@@ -128,15 +128,15 @@ def tanh_log_det(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 
 def masked_log_probs(logits: Tensor, mask: Tensor | None) -> Tensor:
-    """Log-probabilities of discrete actions; logits and mask (..., A) to (..., A).
+    """Compute log-probabilities of discrete actions; logits and mask (..., A) to (..., A).
 
-    Of forbidden actions it is a number whose exp is 0, but whose product with one is finite.
+    For forbidden actions, the exp of the number is 0, but its products are finite.
     """
     return mask_logits(logits, mask).log_softmax(-1).clamp_min(-200.0)
 
 
 def squashed_sample(mean: Tensor, log_std: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-    """Actions ``tanh(mean + std·z)`` and their log-density (Haarnoja et al. 2018, app. C).
+    """Return actions ``tanh(mean + std·z)`` and log-density (Haarnoja et al. 2018, app. C).
 
     Args:
         mean, log_std, z: (..., A), z standard normal.
@@ -150,16 +150,16 @@ def squashed_sample(mean: Tensor, log_std: Tensor, z: Tensor) -> tuple[Tensor, T
 
 
 def squashed_entropy(mean: Tensor, log_std: Tensor) -> Tensor:
-    """The entropy of ``tanh`` of normals, about: (..., A) to (...).
+    """Approximate the entropy of ``tanh`` of normals: (..., A) to (...).
 
-    The entropy of the normals plus ``log(1 − tanh²)`` at their means. Exact is its expectation,
-    which has no closed form.
+    The entropy of the normals plus ``log(1 − tanh²)`` at their means. The exact term is its
+    expectation, which has no closed form.
     """
     return (log_std + 0.5 + _HALF_LOG_TWO_PI + tanh_log_det(mean)).sum(-1)
 
 
 def smoothed_action(action: Tensor, noise: Tensor, std: Tensor, bound: Tensor) -> Tensor:
-    """An action in [−1, 1] moved by clipped noise: target policy smoothing (TD3, eq. 14).
+    """Add clipped noise to an action in [−1, 1]: target policy smoothing (TD3, eq. 14).
 
     Args:
         action, noise: (P, B, A), noise standard normal.

@@ -14,16 +14,16 @@ from skillweave.ops.moments import masked_mean
 from skillweave.shapes import Float
 
 LARGEST_LOG_RATIO = 20.0
-"""Ratios of probabilities are at most e to this: where a policy has hardly any deviation left, an
-action of an older one can be so unlikely that the ratio is not finite."""
+"""The largest log of a ratio of probabilities. Where a policy's deviation is nearly 0, an action of
+an older policy can be so unlikely that the ratio is not finite."""
 
 
 def likelihood_ratio(
     log_prob: Float[Tensor, "P B"], other: Float[Tensor, "P B"]
 ) -> Float[Tensor, "P B"]:
-    """The probability of actions ÷ that by another policy, at most e²⁰; log-probabilities (P, B).
+    """Return the ratio of two policies' probabilities, from log-probabilities (P, B).
 
-    Beyond, it has no gradient.
+    It is at most e²⁰, beyond which it has no gradient.
     """
     return torch.exp((log_prob - other).clamp_max(LARGEST_LOG_RATIO))
 
@@ -36,10 +36,11 @@ def ppo_policy_loss(
     weight: Float[Tensor, "P B"] | None = None,
     valid: Tensor | None = None,
 ) -> Float[Tensor, " P"]:
-    """Clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]`` (Schulman et al. 2017, eq. 7).
+    """Compute PPO's clipped surrogate, ``−E[w·min(ρA, clip(ρ, 1−ε, 1+ε)A)]``.
 
-    ρ is the ratio to the policy from which clipping counts. Where another policy acted, w is the
-    ratio of the two: the decoupled objective of Hilton, Cobbe & Schulman 2022, sec. 3.
+    Schulman et al. 2017, eq. 7. ρ is the ratio to the policy that clipping refers to. Where another
+    policy acted, w is the ratio of these two: the decoupled objective of Hilton, Cobbe & Schulman
+    2022, sec. 3.
 
     Args:
         log_prob, old_log_prob, advantage: (P, B).
@@ -64,9 +65,9 @@ def value_loss(
     clip: Float[Tensor, " P"] | None = None,
     valid: Tensor | None = None,
 ) -> Float[Tensor, " P"]:
-    """Half the mean squared error, optionally with PPO's value clipping.
+    """Compute half the mean squared error, optionally with PPO's value clipping.
 
-    With ``clip`` (P,) the error is the larger of that of the value and that of the value
+    With ``clip`` (P,) the error is the larger of two: the value's, and the error of the value
     clipped to ``old_value ± clip`` (the original PPO code; Engstrom et al. 2020, sec. 3).
 
     Args:
@@ -90,9 +91,9 @@ def approximate_kl(
     weight: Float[Tensor, "P B"] | None = None,
     valid: Tensor | None = None,
 ) -> Float[Tensor, " P"]:
-    """``E[w·((ρ − 1) − log ρ)]``, the low-variance estimator k3 of KL(old‖new); (P, B) to (P,).
+    """Estimate KL(old‖new) as ``E[w·((ρ − 1) − log ρ)]``, k3 of low variance; (P, B) to (P,).
 
-    Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as of
+    Schulman 2020, "Approximating KL divergence". ``weight`` and ``valid`` as in
     ``ppo_policy_loss``: samples of another policy count as often as the old one would draw them.
     """
     log_ratio = (log_prob - old_log_prob).clamp_max(LARGEST_LOG_RATIO)
@@ -103,19 +104,19 @@ def approximate_kl(
 def td_loss(
     value: Float[Tensor, "*#batch"], target: Float[Tensor, "*#batch"], kind: str
 ) -> Float[Tensor, "*batch"]:
-    """Huber (threshold 1; Mnih et al. 2015) or half squared error of each sample; any shape."""
+    """Compute each sample's Huber (threshold 1; Mnih et al. 2015) or half squared error."""
     if kind == "huber":
         return torch.nn.functional.smooth_l1_loss(value, target, reduction="none")
     return 0.5 * (value - target).square()
 
 
 def weighted_mean(loss: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over the batch, (P, B) to (P,), with the weights of prioritised replay."""
+    """Compute the mean over the batch, (P, B) to (P,), weighted by prioritised replay."""
     return loss.mean(1) if weight is None else (loss * weight).mean(1)
 
 
 def critic_loss(q: Tensor, target: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Values of K critics (P, K, B) against one target (P, B): half the squared error.
+    """Compute half the squared error of K critics' values (P, K, B) to one target (P, B).
 
     Returns:
         Loss (P,), summed over the critics; detached, the error of each sample (P, B) and the mean
@@ -128,7 +129,7 @@ def critic_loss(q: Tensor, target: Tensor, weight: Tensor | None) -> tuple[Tenso
 
 
 def expected_soft_value(log_p: Tensor, q: Tensor, alpha: Tensor) -> Tensor:
-    """``Σₐ π(a)·(Q(a) − α·log π(a))`` of discrete actions (Christodoulou 2019, eq. 10).
+    """Compute ``Σₐ π(a)·(Q(a) − α·log π(a))`` of discrete actions (Christodoulou 2019, eq. 10).
 
     Args:
         log_p, q: (P, B, A); alpha: (P, 1).
@@ -140,9 +141,9 @@ def expected_soft_value(log_p: Tensor, q: Tensor, alpha: Tensor) -> Tensor:
 
 
 def masked_entropy_target(target: float, mask: Tensor | None) -> Tensor | float:
-    """An entropy to aim at where masks (P, B, A) allow only some of A discrete actions.
+    """Return the target entropy where masks (P, B, A) allow only some of A discrete actions.
 
-    Of m actions it is ``target·log m / log A``, here the mean over the batch, (P,).
+    For m allowed actions it is ``target·log m / log A``; returned is the mean over the batch, (P,).
     """
     if mask is None or mask.shape[-1] == 1:
         return target
@@ -151,7 +152,7 @@ def masked_entropy_target(target: float, mask: Tensor | None) -> Tensor | float:
 
 
 def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
-    """The distribution of ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
+    """Project ``r + discount·Z`` on the atoms of Z (Bellemare et al. 2017, eq. 7).
 
     Args:
         p: (P, B, N), probabilities of ``atoms`` (N,), which are evenly spaced.
@@ -162,6 +163,6 @@ def categorical_projection(p: Tensor, atoms: Tensor, reward: Tensor, discount: T
     """
     low, high, width = atoms[0], atoms[-1], atoms[1] - atoms[0]
     moved = (reward[..., None] + discount[..., None] * atoms).clamp(low, high)
-    # Atom j's mass falls on the two atoms next to where it moved: a triangle around each.
+    # Atom j's mass is split between the two atoms next to its new position: a triangle around each.
     share = (1.0 - (moved[..., None, :] - atoms[:, None]).abs() / width).clamp_min(0.0)
     return (share * p[..., None, :]).sum(-1)

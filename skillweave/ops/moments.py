@@ -1,6 +1,6 @@
 """Means and variances of each member, of all samples or of the valid ones, and over time.
 
-``valid`` is True or 1 where a sample counts; None: all do. Where nothing counts, the mean is 0.
+``valid`` is True or 1 where a sample counts; None: all count. Without valid samples the mean is 0.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from torch import Tensor
 
 
 def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
-    """The mean of the valid samples of each member.
+    """Return the mean of the valid samples of each member.
 
     Args:
         x: (P, ...).
         valid: (P, ...) bool; None: all count.
 
     Returns:
-        (P,); 0 where nothing counts.
+        (P,); 0 for a member without valid samples.
     """
     if valid is None:
         return x.flatten(1).mean(1)
@@ -26,7 +26,7 @@ def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Variance (of the samples, not of what they are drawn from) and mean; (P, ...) to (P,)."""
+    """Compute the biased variance and the mean of each member; (P, ...) to (P,)."""
     if valid is None:
         variance, mean = torch.var_mean(x.flatten(1), dim=1, unbiased=False)
         return variance, mean
@@ -38,13 +38,13 @@ def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Ten
 def normalise(
     x: Tensor, valid: Tensor | None = None, eps: float = 1e-8, min_std: float = 0.0
 ) -> Tensor:
-    """Zero mean and unit deviation over all axes but the first.
+    """Normalise to zero mean and unit deviation over all axes but the first.
 
     Args:
         x: (P, ...).
-        valid: (P, ...) bool, what mean and deviation are taken over; None: all.
+        valid: (P, ...) bool, the samples of mean and deviation; None: all.
         eps: added to the deviation.
-        min_std: where the deviation is smaller, ``x`` is divided by this instead.
+        min_std: the least divisor: it replaces a smaller deviation.
 
     Returns:
         (P, ...).
@@ -54,9 +54,9 @@ def normalise(
 
 
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
-    """``1 − Var(target − value) / Var(target)`` of each member; (P, ...) to (P,).
+    """Compute ``1 − Var(target − value) / Var(target)`` of each member; (P, ...) to (P,).
 
-    0 where the target is constant: there is nothing to explain.
+    0 where the target is constant.
     """
     residual, _ = masked_var_mean(target - value, valid)
     whole, _ = masked_var_mean(target, valid)
@@ -66,7 +66,7 @@ def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = Non
 def merge_moments(
     mean: Tensor, var: Tensor, count: Tensor, batch: Tensor, valid: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Running mean and variance after a batch (Chan, Golub & LeVeque 1979, eq. 2.1).
+    """Update a running mean and variance with a batch (Chan, Golub & LeVeque 1979, eq. 2.1).
 
     Args:
         mean, var: (P, O); count: (P,); batch: (P, B, O).

@@ -13,18 +13,18 @@ from skillweave.ops.device import all_false
 from skillweave.shapes import Bool, Float, Int
 
 FEWEST_FUSED = 2048
-"""Parameters of a member from which on torch's own Adam takes less time than single operations."""
+"""Parameters of a member from which torch's own Adam is faster than single operations."""
 
 
 State = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Parameters, their gradient, mu, nu and count, as ``adam_`` has them."""
+"""Parameters, gradient, mu, nu and count of ``adam_``."""
 Betas = tuple[float, float]
 
 
 def clip_grad_norm_(
     grad: Float[Tensor, "P D"], max_norm: Float[Tensor, " P"]
 ) -> Float[Tensor, " P"]:
-    """Scale each member's gradient to at most a norm.
+    """Scale each member's gradient down to ``max_norm`` where it is larger.
 
     Args:
         grad: (P, D), changed in place.
@@ -51,20 +51,20 @@ def adam_(
     eps: float = 1e-5,
     active: Bool[Tensor, " P"] | None = None,
 ) -> None:
-    """One Adam step in place (Kingma & Ba 2015, algorithm 1, in its efficient form).
+    """Take one Adam step in place (Kingma & Ba 2015, algorithm 1, in its efficient form).
 
     Args:
         params: (P, D), changed in place.
         grad: (P, D).
         mu: (P, D), mean of gradients; zero at the start.
         nu: (P, D), mean of their squares; zero at the start.
-        count: (P,) or (P, …) int64, steps taken so far: a member's, or each parameter's own, where
-            some are younger than others.
+        count: (P,) or (P, …) int64, steps so far: of a member, or of each parameter if some are
+            younger than others.
         learning_rate: (P,).
         beta1: decay of ``mu``.
         beta2: decay of ``nu``.
         eps: keeps the division from 0.
-        active: (P,) bool; members at False are left exactly as they are.
+        active: (P,) bool; members at False do not change.
     """
     state, betas = (params, grad, mu, nu, count), (beta1, beta2)
     if _can_be_fused(state):
@@ -74,9 +74,10 @@ def adam_(
 
 
 def _can_be_fused(state: State) -> bool:
-    """Torch's operation takes one age for a tensor, and does not check that it is contiguous.
+    """Return whether torch's fused Adam can be used: it needs one age and contiguous tensors.
 
-    It must not depend on how many members there are: one is then the same alone and among others.
+    The answer must not depend on the number of members, so a member learns the same alone and among
+    others.
     """
     *tensors, count = state
     params = tensors[0]
@@ -89,7 +90,7 @@ def _can_be_fused(state: State) -> bool:
 def _fused_(
     state: State, learning_rate: Tensor, betas: Betas, eps: float, active: Tensor | None
 ) -> None:
-    """By torch's own operation, which reads and writes everything once."""
+    """Take the step with torch's own operation, which reads and writes everything once."""
     *tensors, count = state
     members = list(range(len(count))) if active is None else active.nonzero()[:, 0].tolist()
     rates, by_rate = learning_rate.expand(len(count)).tolist(), defaultdict(list)
@@ -99,12 +100,23 @@ def _fused_(
     steps = count.to(torch.float32).unbind()
     rows = [x.unbind() for x in tensors]
     fused: Any = torch._fused_adam_
-    for rate, those in by_rate.items():
-        params, grad, mu, nu, taken = [[x[i] for i in those] for x in (*rows, steps)]
+    for rate, same_rate in by_rate.items():
+        params, grad, mu, nu, ages = [[x[i] for i in same_rate] for x in (*rows, steps)]
         fused(
-            params, grad, mu, nu, [], taken, lr=rate, beta1=betas[0], beta2=betas[1], eps=eps,
-            weight_decay=0.0, amsgrad=False, maximize=False,
-        )  # fmt: skip
+            params,
+            grad,
+            mu,
+            nu,
+            [],
+            ages,
+            lr=rate,
+            beta1=betas[0],
+            beta2=betas[1],
+            eps=eps,
+            weight_decay=0.0,
+            amsgrad=False,
+            maximize=False,
+        )
     for changed in (state[0], state[2], state[3]):  # else an old graph's gradient would be wrong
         if not changed.is_inference():
             torch.autograd.graph.increment_version(changed)
@@ -113,7 +125,7 @@ def _fused_(
 def _formula_(
     state: State, learning_rate: Tensor, betas: Betas, eps: float, active: Tensor | None
 ) -> None:
-    """The same step by single operations, wherever torch's own cannot be used or is slower."""
+    """Take the step with single operations, where torch's own cannot be used or is slower."""
     params, grad, mu, nu, count = state
     if active is not None and (torch.compiler.is_compiling() or not all_false(~active)):
         before = [x.clone() for x in (params, mu, nu, count)]
@@ -142,7 +154,7 @@ def kl_adapted_rate(
     low: float,
     high: float,
 ) -> Float[Tensor, " P"]:
-    """Learning rate divided by 1.5 where the KL is over 2·target, times 1.5 where under half.
+    """Divide the learning rate by 1.5 where the KL exceeds 2·target; multiply where under half.
 
     Schulman et al. 2017, sec. 4 (there for the KL penalty); the factor as in rl_games. All (P,).
     """

@@ -16,7 +16,7 @@ def gae(
     last: Bool[Tensor, "P T B"],
     gae_lambda: Float[Tensor, " P"],
 ) -> Float[Tensor, "P T B"]:
-    """Generalised advantage estimates, exact for semi-MDPs and time limits.
+    """Compute generalised advantage estimates, exact for semi-MDPs and time limits.
 
     ``δ = r + discount·V(next) − V``; ``A = δ + discount·λ·(1 − last)·A⁺``
     (Schulman et al. 2016, eq. 16, with the discount as data: γ^τ after a call of τ steps).
@@ -53,13 +53,13 @@ def gae(
 
 
 def td_target(reward: Tensor, discount: Tensor, value: Tensor) -> Tensor:
-    """``r + discount·V(s′)``, what a value is learnt from (Sutton 1988); all of any one shape."""
+    """Return ``r + discount·V(s′)``, the target of a value (Sutton 1988); all of one shape."""
     return reward + discounted(discount, value)
 
 
 def discounted(discount: Tensor, value: Tensor) -> Tensor:
-    """``discount·value``, but 0 where ``discount`` is 0; both of any one shape.
+    """Return ``discount·value``, but 0 where ``discount`` is 0; both of one shape.
 
-    Not a product: what a terminal observation is worth may be anything, and 0·NaN is NaN.
+    Not a product: the value of a terminal observation may be any number, and 0·NaN is NaN.
     """
     return torch.where(discount == 0.0, 0.0, discount * value)

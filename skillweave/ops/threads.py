@@ -1,4 +1,4 @@
-"""The number of torch's threads, and a thread that works beside the one that collects."""
+"""The number of torch's threads, and a worker thread beside the one that collects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Use ``count`` torch threads within the block, and as many as before after it."""
+    """Use ``count`` torch threads within the block, and the previous number after it."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -26,14 +26,14 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 class WorkThread:
-    """A thread that does jobs one after another; it starts with the first.
+    """A thread that runs jobs one after another; it starts with the first job.
 
-    An executor of ``concurrent.futures`` takes no jobs once the main thread has ended, while other
+    An executor of ``concurrent.futures`` accepts no jobs after the main thread has ended, but other
     threads of the program may still train.
 
     Args:
-        name: of the thread.
-        threads: that torch may use in it.
+        name: the thread's name.
+        threads: the number of threads that torch may use in it.
     """
 
     def __init__(self, name: str, threads: int) -> None:
@@ -58,13 +58,13 @@ class WorkThread:
         return future
 
     def close(self) -> None:
-        """Finish the jobs, and end the thread."""
+        """Finish all jobs, then end the thread."""
         if self._thread is not None:
             self._jobs.put(None)
             self._thread.join()
 
     def _work(self) -> None:
-        torch.set_num_threads(self._threads)  # torch counts threads for each thread
+        torch.set_num_threads(self._threads)  # torch's number of threads is a setting per thread
         while (job := self._jobs.get()) is not None:
             job()
             del job  # its future holds the result

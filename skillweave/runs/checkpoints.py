@@ -1,4 +1,4 @@
-"""The checkpoints of the stage under way: the latest, and the one before it."""
+"""The checkpoints of the stage in training: the latest, and the one before it."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from skillweave.runs.files import move, read_header, read_tensors, remove, write
 
 
 class Checkpoints:
-    """Two files in a run; at every moment one of them is whole."""
+    """Two files in a run, of which one is complete at any moment."""
 
     def __init__(self, directory: Path) -> None:
         names = "checkpoint.new", "checkpoint", "checkpoint.previous"
         self._files = [directory / f"{name}.safetensors" for name in names]
 
     def save(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-        """Write the latest; the one that was becomes the one before.
+        """Write the latest checkpoint; the previous latest one stays beside it.
 
         Raises:
-            RunError: the disk is full or cannot be written; there still is a whole one.
+            RunError: the disk is full or cannot be written; a complete one still exists.
         """
         fresh, latest, before = self._files
         write_tensors(fresh, tensors, header, make_directories=False)
@@ -42,14 +42,14 @@ class Checkpoints:
     def load(
         self, stage: str, schema: Any, check: Callable[[dict[str, Any], Path], None]
     ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
-        """Tensors and header of a stage's latest good one, and its file; None: there is none yet.
+        """Return tensors, header and file of a stage's latest good checkpoint; None: it has none.
 
         Args:
-            schema: of its header.
-            check: given a header and its file, raises where they do not belong here.
+            schema: the schema of its header.
+            check: raises where a header and its file do not belong to this run.
 
         Raises:
-            RunError: there are some of this stage, but none is good.
+            RunError: checkpoints of this stage exist, but all are damaged.
         """
         problems = []
         for path in self._files[1:]:
@@ -69,49 +69,49 @@ class Checkpoints:
             )
         return None
 
-    def told(self) -> dict[str, Any]:
-        """The header of the one that a resumed run goes on from; empty where there is none."""
+    def latest_header(self) -> dict[str, Any]:
+        """Return the header of the checkpoint that a resumed run loads; empty: it has none."""
         fresh, latest, before = self._files
-        for path in (latest, fresh, before):  # as ``clear`` and ``load`` take them
+        for path in (latest, fresh, before):  # the order of ``clear`` and ``load``
             with suppress(RunError):
                 return read_header(path)
         return {}
 
     def any(self) -> bool:
-        """Return whether there is one."""
+        """Return whether a checkpoint exists."""
         return any(map(os.path.lexists, self._files))
 
     def keep(self, path: Path) -> None:
-        """Move the latest to ``path``, if there is one, and remove the others.
+        """Move the latest to ``path``, if it exists, and remove the others.
 
         Raises:
-            RunError: it cannot be moved, or the others cannot be removed.
+            RunError: a file cannot be moved or removed.
         """
         if self._files[1].exists():
             move(self._files[1], path)
         self.drop()
 
     def drop_previous(self) -> bool:
-        """Remove the one before the latest, if there is a latest; return whether it was there."""
+        """Remove the one before the latest, if both exist; return whether it was removed."""
         _, latest, before = self._files
-        there = latest.exists() and before.exists()
-        if there:
+        both = latest.exists() and before.exists()
+        if both:
             remove(before)
-        return there
+        return both
 
     def drop(self) -> None:
-        """Remove them: their stage is done, and ``run.json`` says so."""
+        """Remove all checkpoints, after ``run.json`` marks their stage as done."""
         for path in self._files:
             remove(path)
 
     def clear(self, done: Sequence[str]) -> None:
-        """Put in order what a killed process left; ``done`` are the stages that need none."""
+        """Clean up after a killed process; ``done`` are the stages that need no checkpoint."""
         fresh, latest, _ = self._files
-        if fresh.exists() and not latest.exists():  # killed between two renames: it is whole
+        if fresh.exists() and not latest.exists():  # killed between two renames: it is complete
             move(fresh, latest)
         remove(fresh)
         for path in self._files:
-            with suppress(RunError):  # a damaged one is told when it is needed
+            with suppress(RunError):  # a damaged one raises when it is needed
                 if path.exists() and read_header(path).get("stage") in done:
-                    read_tensors(path)  # not on the word of a damaged header
+                    read_tensors(path)  # a header alone may be damaged
                     remove(path)

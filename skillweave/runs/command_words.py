@@ -1,4 +1,4 @@
-"""Commands and lines of Python that messages print, for people to paste."""
+"""Commands and lines of Python that messages print, for users to paste."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skillweave.messages import shown_path
 from skillweave.runs.checkpoints import Checkpoints
 
 Caller = Literal["command line", "hierarchy", "agent", "train_agent"]
-"""What the user called: a command, or a function of Python."""
+"""The user's entry point: a command, or a Python function."""
 _CALLER: ContextVar[Caller | None] = ContextVar("CALLER", default=None)
 _BEGINS = {
     "hierarchy": "hierarchy.train(",
@@ -23,8 +23,8 @@ _BEGINS = {
 }
 
 
-class Told(Protocol):
-    """A run: where it is, and what it says."""
+class RunLike(Protocol):
+    """A run: its directory and its manifest."""
 
     path: Path
     manifest: dict[str, Any]
@@ -32,7 +32,7 @@ class Told(Protocol):
 
 @contextmanager
 def called_by(caller: Caller) -> Iterator[None]:
-    """Let messages print what fits the caller; the outermost caller counts."""
+    """Set the caller that messages are printed for; the outermost caller counts."""
     before = _CALLER.set(_CALLER.get() or caller)
     try:
         yield
@@ -45,19 +45,19 @@ def from_command_line() -> bool:
     return _CALLER.get() == "command line"
 
 
-def command_words(name: str, run: Told) -> str:
-    """Return a command for a run, with the user's own file where it needs that."""
+def command_words(name: str, run: RunLike) -> str:
+    """Return a command for a run, with the user's file where the command needs it."""
     needs = "resume_needs_recipe" if name == "resume" else "needs_recipe"
     recipe = run.manifest.get("recipe") or "FILE.py"
-    own = recipe.endswith(".py") and run.manifest.get(needs, True)
+    needs_file = recipe.endswith(".py") and run.manifest.get(needs, True)
     words = f"skillweave {name} {shlex.quote(str(shown_path(run.path)))}"
-    return words + (f" --recipe {shlex.quote(recipe)}" if own else "")
+    return words + (f" --recipe {shlex.quote(recipe)}" if needs_file else "")
 
 
-def resume_words(run: Told, *more: str) -> str:
-    """Return what continues a run: a command, or a line of Python, as the user works.
+def resume_words(run: RunLike, *more: str) -> str:
+    """Return the command or the line of Python that continues a run.
 
-    ``more``: further arguments, of Python.
+    ``more``: further arguments of the line of Python.
     """
     if from_command_line():
         return command_words("resume", run)
@@ -65,8 +65,8 @@ def resume_words(run: Told, *more: str) -> str:
     return _call(run, ", ".join([python_string(shown_path(run.path)), *seed, "resume=True", *more]))
 
 
-def start_words(run: Told) -> str:
-    """Return what begins a new run with the policies of this one."""
+def start_words(run: RunLike) -> str:
+    """Return the command or the line of Python that starts a new run from this one's policies."""
     if from_command_line():
         recipe = run.manifest.get("recipe") or "RECIPE"
         where = shlex.quote(str(shown_path(run.path)))
@@ -74,15 +74,15 @@ def start_words(run: Told) -> str:
     return _call(run, f"start_from={python_string(shown_path(run.path))}")
 
 
-def load_words(run: Told) -> str:
-    """Return what loads a finished run, or shows how it does."""
+def load_words(run: RunLike) -> str:
+    """Return the line of Python that loads a finished run, or the command that evaluates it."""
     if from_command_line():
         return command_words("evaluate", run)
     path = python_string(shown_path(run.path))
     return f"sw.load({path}, hierarchy)" if run.manifest.get("needs_recipe") else f"sw.load({path})"
 
 
-def _call(run: Told, arguments: str) -> str:
+def _call(run: RunLike, arguments: str) -> str:
     plain = run.manifest.get("kind") == "agent"
     caller = _CALLER.get() or ("agent" if plain else "hierarchy")
     flat = ", flat=True" if plain and caller == "hierarchy" else ""
@@ -90,14 +90,14 @@ def _call(run: Told, arguments: str) -> str:
 
 
 def python_string(text: object) -> str:
-    """Return a string of Python, in double quotes."""
+    """Return a Python string literal, in double quotes."""
     return json.dumps(str(text), ensure_ascii=False)
 
 
-def saved_words(run: Told) -> str:
-    """Return how far a run is saved that was stopped."""
-    if at := Checkpoints(run.path).told():
-        return f"saved at {at['steps']:,} steps of {at['stage']}"
+def saved_words(run: RunLike) -> str:
+    """Return the progress that a stopped run has saved, in words."""
+    if header := Checkpoints(run.path).latest_header():
+        return f"saved at {header['steps']:,} steps of {header['stage']}"
     stages = run.manifest["stages"]
     for stage in stages:
         if stage["status"] != "done" and (continued := stage.get("continued")):

@@ -1,4 +1,7 @@
-"""What a run keeps of policies that were ready when it began."""
+"""A run's copies of policies that were ready when it began.
+
+Stands alone because it joins run directories with foreign policies, which know nothing of runs.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,20 @@ from skillweave.types import Policy
 
 
 def keep_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
-    """Copy into the run what a skill's ready policy acts by, where it is to be copied."""
+    """Copy the content of a skill's ready policy into the run, if it has content to copy."""
     if isinstance(policy, Foreign) and (content := policy.content()) is not None:
         path = _copy_path(run, skill, policy)
-        if not path.exists():  # a run that goes on has it
+        if not path.exists():  # a resumed run has it
             run.check()
             make_directory(path.parent)
             write_bytes(path, content, make_directories=False)
 
 
 def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
-    """A skill's ready policy as it was when the run began.
+    """Return a skill's ready policy as it was when the run began.
 
     Raises:
-        RunError: the policy is another one, and the run holds no copy of its own.
+        RunError: the policy has changed, and the run holds no copy.
     """
     entry: dict[str, Any] = next((s for s in run.manifest["skills"] if s["name"] == skill), {})
 

@@ -1,28 +1,31 @@
-"""The run directory: what training writes and everything else reads (contract 9).
+"""The run directory, which training writes and everything else reads.
 
-run.json                     what is trained, with which settings, seeds and versions; stages
+run.json                     the declaration, settings, seeds, versions and stages
 metrics.jsonl                a line for every update
-lineage.jsonl                a line for every member of every generation, where populations evolve
-evaluation.json              its score: the latest evaluation (``training/evaluation_file.py``)
+lineage.jsonl                a line for every member of every generation, of populations
+evaluation.json              the latest evaluation (``training/evaluation_file.py``)
 evaluation-sampled.json      the latest evaluation that sampled actions on request
-checkpoint.safetensors       the stage under way, at its latest checkpoint (and the one before)
-policies/<stage>.safetensors finished stages
-states/<who>.safetensors      what learns on in a later stage, until that is done
-starts/<who>.safetensors      what learners begin with, from another run, until their stage is done
-final/<stage>.safetensors    what finished stages continue from for more steps
-policies/<skill>.*            copies of ready policies: .onnx; a torch module's weights
+checkpoint.safetensors       the latest checkpoint of the stage in training (and the one before)
+policies/<stage>.safetensors policies of finished stages
+states/<name>.safetensors    states of learners that continue in a later stage, until that is done
+starts/<name>.safetensors    initial policies from another run, until their learner's stage is done
+final/<stage>.safetensors    final states, from which finished stages can train for more steps
+policies/<skill>.*           copies of ready policies: .onnx; a torch module's weights
 .lock                        locked by the process that trains the run; its number and machine
 
-``manifest`` says what these hold.
+``manifest`` has the schemas of their contents.
 """
 
 from __future__ import annotations
 
 import os
+import re
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,10 +33,10 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import absolute
+from skillweave.messages import absolute, shown_path
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
-from skillweave.runs.command_words import resume_words, saved_words
+from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.files import (
     TEMPORARY,
     check_unchanged,
@@ -51,12 +54,11 @@ from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
 from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
 from skillweave.runs.population_schema import LineageLine
-from skillweave.runs.replacing import check_ours, check_replaceable, clear
 from skillweave.types import unprefixed
 
 S = TypeVar("S")
 First = Callable[["RunDirectory"], None]
-"""Writes what a new run needs from its beginning."""
+"""A function that writes the files of a new run before ``run.json``."""
 
 
 FINAL = "final"
@@ -65,9 +67,21 @@ LINES = ("metrics_bytes", "lineage_bytes")
 
 
 LONGEST_NAME = 255
-"""Bytes of a file's name, on nearly all file systems."""
+"""The most bytes of a file's name, on nearly all file systems."""
 MORE = 14
-"""Characters that a file's name has more while it is written."""
+"""Additional characters of a file's name while it is written."""
+
+FILES = ("run.json", "metrics.jsonl", "lineage.jsonl", LOCK, TEMPORARY)
+"""Files that training writes before the first checkpoint."""
+FOLDERS = {
+    "policies": (TEMPORARY,),
+    "starts": ("*.safetensors", TEMPORARY),
+    "tensorboard": ("events.out.tfevents.*",),
+}
+"""Folders of such files. ``policies`` holds copies of ready policies, too."""
+LEFT = ("wandb",)
+"""Folders of a run's trackers; they stay, because they belong to the tracker."""
+LOCK_TEXT = re.compile(rb"(\d+ [^\n]*\n)?")
 
 
 def _check_file_names(manifest: Mapping[str, Any]) -> None:
@@ -84,18 +98,18 @@ def _check_file_names(manifest: Mapping[str, Any]) -> None:
 
 
 def _policy_file(stage: str, name: str | None) -> str:
-    """Return the name of the file of a stage's policy, or of one who learns in it."""
-    own = stage if name in (None, stage) else f"{stage}.{name}"
-    return f"{file_name(own)}.safetensors"
+    """Return the file name of a stage's policy, or of one of its learners."""
+    path = stage if name in (None, stage) else f"{stage}.{name}"
+    return f"{file_name(path)}.safetensors"
 
 
 def file_name(path: str) -> str:
-    """The name of a file for who has this path: ``inner.skill`` for ``inner/skill``."""
+    """Return the file name of a path in the hierarchy: ``inner.skill`` for ``inner/skill``."""
     return path.replace("/", ".")
 
 
 class RunDirectory:
-    """One run on disk. ``manifest`` is the content of ``run.json``.
+    """A run on disk. ``manifest`` is the content of ``run.json``.
 
     Its ``path`` is absolute: a program may change its working directory while it trains.
     """
@@ -108,13 +122,13 @@ class RunDirectory:
         self._checkpoints = Checkpoints(path)
         self._lock: Lock | None = None
         self.reported_absent: set[str] = set()
-        """Logged keys of ``info`` of which users know already that they do not occur."""
+        """Logged keys of ``info`` whose absence was reported."""
         self.reported_slow = False
-        """Users know already that evaluations take longer than training."""
+        """True after users were informed that evaluations take longer than training."""
 
     @property
     def num_envs(self) -> int | None:
-        """Environments side by side in training, the most of all stages; None: no stages."""
+        """Return the largest number of training environments of all stages; None: no stages."""
         stages = self.manifest["stages"]
         return max((int(s["algorithm"]["num_envs"]) for s in stages), default=None)
 
@@ -130,7 +144,7 @@ class RunDirectory:
         """Write a new run, in place of one that has not learnt anything.
 
         Args:
-            first: writes what the run needs before ``run.json`` is there.
+            first: writes files of the run before ``run.json`` exists.
             hold: keep the run locked, to train it; ``close`` releases it.
 
         Raises:
@@ -149,8 +163,8 @@ class RunDirectory:
         before = cls.open(path) if os.path.lexists(path / "run.json") else None
         if before is not None:
             check_no_links(path)
-            check_replaceable(before)
-        check_ours(path, before)  # before the lock is written there
+            _check_replaceable(before)
+        _check_ours(path, before)  # before the lock is written there
         lock = Lock(path)
         try:
             if before is not None:
@@ -179,31 +193,32 @@ class RunDirectory:
         """Remove a run that has not learnt anything; it is locked."""
         if not lock.exclusive:
             raise RunError(
-                f"{path} holds a run that has not learnt anything yet, and this system cannot say "
-                "whether a process uses it. Delete it if none does, or choose another directory"
+                f"{path} holds a run that has not learnt anything yet, and this system has no "
+                "locks that show whether a process uses it. Delete it if none does, or choose "
+                "another directory"
             )
         run = cls.open(path)
-        check_replaceable(run)  # another process may have trained it until now
-        check_ours(path, run)
-        clear(path)
+        _check_replaceable(run)  # another process may have trained it until now
+        _check_ours(path, run)
+        _clear_run(path)
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
-        """An existing run, to read or to train.
+        """Return an existing run, to read or to train.
 
         Raises:
-            RunError: there is none, or it is damaged or newer than this Skillweave.
+            RunError: the directory holds no run, or it is damaged or newer than this Skillweave.
         """
         path = Path(path)
         if not os.path.lexists(path / "run.json"):
-            raise RunError(f"{path} holds no run: there is no {path / 'run.json'}")
+            raise RunError(f"{path} holds no run: {path / 'run.json'} does not exist")
         return cls(path, read_manifest(path))
 
     def begin(self, *, finished: bool = False) -> None:
-        """Take the run for training: lock it, and clear away what a killed process left.
+        """Lock the run for training, and clean up after a killed process.
 
         Args:
-            finished: also if it is finished, to train it for longer.
+            finished: also lock a finished run, to train it for longer.
 
         Raises:
             RunError: another process trains it, it cannot be written, or it holds links.
@@ -213,7 +228,7 @@ class RunDirectory:
         check_no_links(self.path)
         self._lock = Lock(self.path)
         try:
-            # Another process may have gone on with it.
+            # Another process may have continued it.
             self.manifest.update(read_manifest(self.path))
             self._clear()
         except BaseException:
@@ -221,7 +236,7 @@ class RunDirectory:
             raise
 
     def _clear(self) -> None:
-        """Remove half-written files, and checkpoints that nothing needs any more."""
+        """Remove half-written files, and checkpoints that are no longer needed."""
         folders = ("policies", "starts", FINAL)
         for directory in (self.path, *(self.path / name for name in folders)):
             for path in directory.glob(TEMPORARY):
@@ -236,12 +251,12 @@ class RunDirectory:
         write_json(self.path / "run.json", self.manifest, make_directories=False)
 
     def check(self) -> None:
-        """Raise where the directory was deleted under our hands."""
+        """Raise a RunError where the directory was deleted during the training."""
         if self._lock is not None:
             self._lock.check()
 
     def stage(self, name: str) -> dict[str, Any]:
-        """The manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
+        """Return the manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
         entries: list[dict[str, Any]] = self.manifest["stages"]
         for entry in entries:
             if entry["name"] == name:
@@ -251,20 +266,20 @@ class RunDirectory:
 
     @property
     def finished(self) -> bool:
-        """Whether every stage is done, and judged where it is to be."""
+        """Return whether every stage is done, and compared at its end where it must be."""
         done = all(p["status"] == "done" for p in self.manifest["stages"])
         return done and not self.unjudged
 
     @property
     def has_learnt(self) -> bool:
-        """Whether a new run in its place would lose something that was learnt."""
+        """Return whether a new run in its place would lose results of training."""
         stages = self.manifest["stages"]
         done = any(s["status"] == "done" or s.get("continued") for s in stages)
         return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
 
     @property
     def unjudged(self) -> bool:
-        """Whether nobody has found out yet which hierarchy is the best that was learnt."""
+        """Return whether the comparison that chooses the best hierarchy is still missing."""
         stages = self.manifest["stages"]
         return any("kept" not in s and to_be_judged(s) for s in stages)
 
@@ -275,7 +290,7 @@ class RunDirectory:
 
         Args:
             state: a dataclass of tensors; None: all is in ``extra``.
-            extra: what else resuming needs: environments, a replay buffer.
+            extra: further tensors for resuming: environments, a replay buffer.
         """
         self.check()
         self._checkpoints.save(*self._as_checkpoint(state, header, extra))
@@ -283,7 +298,7 @@ class RunDirectory:
     def save_final(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
     ) -> None:
-        """Write a stage's final state, which is no checkpoint; arguments as there."""
+        """Write a stage's final state; arguments as in ``save_checkpoint``."""
         self.check()
         path = self.final_path(header["stage"])
         make_directory(path.parent)
@@ -297,25 +312,25 @@ class RunDirectory:
         return tensors, self.place(header["stage"]) | header | self.line_bytes()
 
     def drop_checkpoints(self) -> None:
-        """Remove the checkpoints of a stage that is done, and said to be so in ``run.json``."""
+        """Remove the checkpoints of a stage that ``run.json`` marks as done."""
         self.check()
         self._checkpoints.drop()
 
     def keep_final(self, stage: str) -> None:
-        """Keep the latest checkpoint as what the stage continues from for more steps."""
+        """Keep the latest checkpoint as the final state, from which the stage can continue."""
         self.check()
         path = self.final_path(stage)
         make_directory(path.parent)
         self._checkpoints.keep(path)
 
     def final_path(self, stage: str) -> Path:
-        """Return where the final state of a stage lies."""
+        """Return the path of a stage's final state."""
         return self.path / FINAL / f"{file_name(stage)}.safetensors"
 
     def make_room(self) -> bool:
-        """Remove what a run can spare on a full disk; return whether there was something.
+        """Remove files that a run can spare on a full disk; return whether any existed.
 
-        That is the checkpoint before the latest, and the final states of finished stages.
+        These are the checkpoint before the latest, and the final states of finished stages.
         """
         self.check()
         spare = [p for p in self.path.glob(f"{FINAL}/*.safetensors") if p.is_file()]
@@ -326,33 +341,35 @@ class RunDirectory:
     def load_checkpoint(
         self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
     ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
-        """State, header and extra of a stage's latest good checkpoint; None: there is none yet.
+        """Return state, header and extra of a stage's latest good checkpoint; None: it has none.
 
-        Without a checkpoint it is the final state of a stage that continues, or whose budget is
+        Without a checkpoint, use the final state of a stage that continues, or whose budget is
         spent.
 
         Args:
-            kind: of the state, a dataclass of tensors; None: there is none.
-            like: a state of the shapes and types that it must have.
-            schema: of the header.
+            kind: the type of the state, a dataclass of tensors; None: no state.
+            like: a state with the required shapes and types.
+            schema: the schema of the header.
 
         Raises:
-            RunError: checkpoints of this stage exist, but none is good.
+            RunError: checkpoints of this stage exist, but all are damaged.
         """
-        found = self._checkpoints.load(stage, schema, self.must_be_ours)
-        if found is None and (final := self._final(stage, schema)) is not None:
+        checkpoint = self._checkpoints.load(stage, schema, self.must_be_ours)
+        if checkpoint is None and (final := self._final(stage, schema)) is not None:
             entry = self.stage(stage)
             if entry.get("continued") or final[1]["steps"] >= entry["budget"]:
-                found = final
-        if found is None:
+                checkpoint = final
+        if checkpoint is None:
             return None
-        tensors, header, path = found
+        tensors, header, path = checkpoint
         extra = unprefixed("extra", tensors)
         tensors = {k: v for k, v in tensors.items() if not k.startswith("extra.")}
         names = set() if kind is None else {f.name for f in fields(kind)}  # type: ignore[arg-type]
         if names != set(tensors):
-            what = "finish the run with the version that began it, or delete the file to begin anew"
-            raise RunError(f"{path} does not hold what this Skillweave resumes from: {what}")
+            raise RunError(
+                f"{path} has other fields than this version of Skillweave resumes from: finish the "
+                "run with the version that started it, or delete the file to train the stage again"
+            )
         if like is not None:
             return state_from(tensors, like, str(path)), header, extra
         return None if kind is None else kind(**tensors), header, extra
@@ -360,7 +377,7 @@ class RunDirectory:
     def _final(
         self, stage: str, schema: Any
     ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
-        """Tensors and header of a stage's final state, and its file; None: there is none."""
+        """Return tensors, header and file of a stage's final state; None: it has none."""
         path = self.final_path(stage)
         if not path.exists():
             return None
@@ -371,22 +388,22 @@ class RunDirectory:
         self.must_be_ours(header, path)
         entry = self.stage(stage)
         if header["steps"] == (entry.get("continued") or [None])[-1]:
-            # Since it was written, other stages have added lines, and evaluations were made.
+            # Since then, other stages have added lines and evaluations.
             header = {k: v for k, v in header.items() if k not in LINES}
             header["evaluation_steps"] = entry.get("evaluation_steps", header["evaluation_steps"])
         return tensors, header, path
 
     def final_tensors(self, stage: str) -> list[str]:
-        """Return the names of the tensors of a stage's final state; none if there is no such state.
+        """Return the names of the tensors of a stage's final state; empty: it has none.
 
         Raises:
-            RunError: the file is damaged, or belongs elsewhere.
+            RunError: the file is damaged, or belongs to another stage or run.
         """
-        found = self._final(stage, Checkpoint)
-        return [] if found is None else list(found[0])
+        final = self._final(stage, Checkpoint)
+        return [] if final is None else list(final[0])
 
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
-        """Write who learnt in a finished stage; ``save`` then binds the files to the run."""
+        """Write the policies of a finished stage; ``save`` then binds the files to the run."""
         self.check()
         entry, sums = self.stage(stage), {}
         for name, policy in policies.items():
@@ -401,7 +418,7 @@ class RunDirectory:
             entry["policies"] = sums
 
     def place(self, stage: str) -> dict[str, str]:
-        """What the header of a stage's file says of where it belongs."""
+        """Return the part of a file's header that names its stage and run."""
         run = self.manifest.get("id")  # runs of older versions have none
         return {"stage": stage} | ({} if run is None else {"run": run})
 
@@ -412,13 +429,13 @@ class RunDirectory:
             raise RunError(f"{path} belongs to another run")
 
     def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
-        """By name, who learnt in a finished stage; errors are those of ``load_policy``."""
+        """Return a finished stage's policies by name; raise the errors of ``load_policy``."""
         entry = self.stage(stage)
         names = [stage] if entry.get("policies") is None else entry["policies"]
         return {name: self.load_policy(stage, name) for name in names}
 
     def load_policy(self, stage: str, name: str | None = None) -> AgentPolicy:
-        """The policy of a finished stage, or of one who learnt in it.
+        """Return the policy of a finished stage, or of one of its learners.
 
         Raises:
             RunError: the stage is not finished, or its file is damaged.
@@ -441,7 +458,7 @@ class RunDirectory:
         return AgentPolicy.from_file(tensors, header, str(path))
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:
-        """Where the policy of a stage lies, or of one who learns in it."""
+        """Return the path of a stage's policy, or of one of its learners."""
         return self.path / "policies" / _policy_file(stage, name)
 
     def log(self, record: dict[str, Any]) -> None:
@@ -450,17 +467,17 @@ class RunDirectory:
         self._metrics.append([record])
 
     def line_bytes(self) -> dict[str, int]:
-        """How long ``metrics.jsonl`` and ``lineage.jsonl`` are, for ``rewind``."""
+        """Return the sizes of ``metrics.jsonl`` and ``lineage.jsonl``, for ``rewind``."""
         return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
 
     def rewind(self, at: Mapping[str, Any]) -> list[str]:
-        """Drop the lines after those that ``line_bytes`` told: training writes them again.
+        """Drop the lines after the sizes of ``line_bytes``: training writes them again.
 
         Args:
-            at: what ``line_bytes`` returned; a size that it lacks drops nothing.
+            at: sizes that ``line_bytes`` returned; a missing size drops nothing.
 
         Returns:
-            The files that lack lines, as they were removed or shortened; each is returned once.
+            The files that were removed or shortened and lack lines; each is returned once.
         """
         lacking = []
         for key, lines in zip(LINES, (self._metrics, self.lineage), strict=True):
@@ -477,13 +494,89 @@ class RunDirectory:
         return resume_words(self)
 
     def metrics(self) -> Iterator[dict[str, Any]]:
-        """The lines of ``metrics.jsonl``; a half-written last line is left out."""
+        """Yield the lines of ``metrics.jsonl`` except a half-written last line."""
         return self._metrics.read()
 
     def close(self) -> None:
-        """Close the files that lines are appended to, and let others train the run."""
+        """Close the files of lines, and release the lock."""
         self._metrics.close()
         self.lineage.close()
         if self._lock is not None:
             self._lock.release()
             self._lock = None
+
+
+# Directories that a new run may take: an empty one, or one whose run has not learnt anything
+
+
+def _check_replaceable(run: RunDirectory) -> None:
+    """Raise a RunError where a new run would replace results of training."""
+    if run.finished:
+        raise RunError(
+            f"{shown_path(run.path)} holds a finished run, which is never replaced. Load it: "
+            f"{load_words(run)}; or give more steps and continue it: {resume_words(run)}; or "
+            "choose another directory"
+        )
+    if run.has_learnt:
+        raise RunError(
+            f"{shown_path(run.path)} holds an unfinished run, {saved_words(run)}. Continue it: "
+            f"{resume_words(run)}; or choose another directory"
+        )
+
+
+def _check_ours(path: Path, run: RunDirectory | None = None) -> None:
+    """Raise a RunError where a directory holds files that training did not write.
+
+    Args:
+        run: the run in it; None: it holds no run.
+    """
+    skills = () if run is None else run.manifest.get("skills", ())
+    copies = tuple(f"{s['name'].replace('/', '.')}.*" for s in skills)
+    if not (path / "run.json").is_file():
+        lock = path / LOCK
+        ours = lock.is_file() and not lock.is_symlink() and lock.stat().st_size < 300
+        if any(path.iterdir()) and not (ours and LOCK_TEXT.fullmatch(lock.read_bytes())):
+            raise RunError(f"{path} exists and is not an empty directory; choose another")
+    for foreign in _foreign(path, copies):
+        raise RunError(
+            f"{path} holds {foreign.relative_to(path)}, which is no file of a run that has just "
+            "started, so nothing there is replaced; choose another directory"
+        )
+
+
+def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:
+    """Yield files that a new run does not write; ``copies`` are names of ready policies' files."""
+    for entry in path.iterdir():
+        mode = entry.lstat().st_mode
+        if stat.S_ISREG(mode):
+            if not _fits(entry, FILES):
+                yield entry
+        elif not stat.S_ISDIR(mode) or entry.name not in (*FOLDERS, *LEFT):
+            yield entry
+        elif entry.name in FOLDERS:
+            patterns = FOLDERS[entry.name] + (copies if entry.name == "policies" else ())
+            for inner in entry.rglob("*"):
+                mode = inner.lstat().st_mode
+                plain = stat.S_ISREG(mode) and _fits(inner, patterns)
+                if not plain and not stat.S_ISDIR(mode):
+                    yield inner
+
+
+def _clear_run(path: Path) -> None:
+    """Remove the files of a run that has not learnt anything, after ``_check_ours``.
+
+    Raises:
+        RunError: a file cannot be removed.
+    """
+    remove(path / "run.json")  # first: without it, the other files have no meaning
+    for entry in list(path.iterdir()):
+        if entry.name in FOLDERS:
+            for inner in sorted(entry.rglob("*"), reverse=True):
+                inner.rmdir() if inner.is_dir() else remove(inner)
+            entry.rmdir()
+        elif entry.name != LOCK and entry.name not in LEFT:
+            remove(entry)
+
+
+def _fits(path: Path, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatch(path.name, pattern) for pattern in patterns)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: temporary file, fsync, rename. No pickle (contract 7)."""
+"""Files that are complete or absent: temporary file, fsync, rename. No pickle."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from skillweave.errors import RunError
 from skillweave.reading import check_file, parse_json, read_file, shown
 
 SCHEMA = 1
-"""Version of everything written here; readers refuse newer ones."""
+"""Version of all files; readers refuse newer ones."""
 TEMPORARY = ".*.tmp"
-"""What files are named while they are written; only a killed process leaves some behind."""
+"""Names of files while they are written; only a killed process leaves some behind."""
 _BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 LARGEST_JSON = 16 * 2**20
-"""Bytes of a JSON file."""
+"""The most bytes of a JSON file."""
 
 
 def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> None:
-    """Replace ``path`` by ``data``, or leave it exactly as it was.
+    """Replace ``path`` by ``data``, or leave it unchanged.
 
     Raises:
-        RunError: the disk is full or cannot be written; what was there is intact.
+        RunError: the disk is full or cannot be written; the old file is intact.
     """
     temporary = ""
     try:
         if make_directories:
             path.parent.mkdir(parents=True, exist_ok=True)
         temporary = str(path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp")
-        # The system gives it the mode that the umask leaves.
+        # The umask applies to this mode.
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -57,10 +57,10 @@ def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> No
 
 
 def move(source: Path, target: Path) -> None:
-    """Give a file another name, in place of what has that name.
+    """Rename a file, in place of a file with that name.
 
     Raises:
-        RunError: the disk is full or cannot be written; both are as they were.
+        RunError: the disk is full or cannot be written; both files are unchanged.
     """
     try:
         os.replace(source, target)
@@ -70,7 +70,7 @@ def move(source: Path, target: Path) -> None:
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory in one that is there.
+    """Make a directory in an existing one.
 
     Raises:
         RunError: it cannot be made.
@@ -82,7 +82,7 @@ def make_directory(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Delete a file, if it is there.
+    """Delete a file, if it exists.
 
     Raises:
         RunError: it cannot be deleted.
@@ -96,16 +96,14 @@ def remove(path: Path) -> None:
 def _unwritten(path: Path, error: OSError) -> RunError:
     if isinstance(error, FileNotFoundError):
         return RunError(
-            f"could not write {path}: its directory is not there any more; was it deleted or moved?"
+            f"could not write {path}: its directory no longer exists; was it deleted or moved?"
         )
-    return RunError(
-        f"could not write {path}: {error.strerror or error}. What was saved before is intact"
-    )
+    return RunError(f"could not write {path}: {error.strerror or error}. Earlier files are intact")
 
 
 def _sync(directory: Path) -> None:
-    """See that a new name is on the disk, too, before anything older is deleted."""
-    with suppress(OSError):  # not every system can
+    """Write a new name to the disk, before older files are deleted."""
+    with suppress(OSError):  # not every system supports this
         handle = os.open(directory, os.O_RDONLY)
         try:
             os.fsync(handle)
@@ -114,21 +112,21 @@ def _sync(directory: Path) -> None:
 
 
 def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = True) -> None:
-    """Replace a JSON file; ``schema`` and a checksum of it all are added."""
+    """Replace a JSON file; add ``schema`` and a checksum of the content."""
     write_bytes(path, json_bytes(path, data), make_directories=make_directories)
 
 
 def json_bytes(path: Path, data: Mapping[str, Any]) -> bytes:
-    """What ``write_json`` writes."""
+    """Return the bytes that ``write_json`` writes."""
     plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **data})))
     text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
     return text.encode() + b"\n"
 
 
 def _whole(data: Any) -> Any:
-    """Return JSON whose texts are of whole characters.
+    """Return JSON whose texts have no surrogates.
 
-    In a locale that does not know all characters, Python has halves of some in the names of files.
+    In a locale without all characters, Python represents some in file names as surrogates.
     """
     if isinstance(data, str):
         return data if data.isascii() else _whole_text(data)
@@ -147,10 +145,10 @@ def _whole_text(text: str) -> str:
 def read_json(
     path: Path, check: Callable[[dict[str, Any]], object] | None = None
 ) -> dict[str, Any]:
-    """A JSON file written by ``write_json``, without its checksum.
+    """Return a JSON file written by ``write_json``, without its checksum.
 
     Args:
-        check: looks at the content before the checksum does, for an error that says more.
+        check: checks the content before the checksum, for a more specific error.
 
     Raises:
         RunError: missing, damaged, altered, no plain file, or of a newer schema.
@@ -161,8 +159,7 @@ def read_json(
     check_schema(data, path)
     if check is not None:
         check(data)
-    found = data.pop("sha256", None)
-    if found != _json_digest(data):
+    if data.pop("sha256", None) != _json_digest(data):
         raise RunError(
             f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
         )
@@ -175,12 +172,12 @@ def _json_digest(data: Mapping[str, Any]) -> str:
 
 def check_schema(data: Mapping[str, Any], where: Path | str) -> None:
     """Raise a RunError where ``data`` comes from a newer Skillweave."""
-    found = data.get("schema")
-    if type(found) is not int:
+    schema = data.get("schema")
+    if type(schema) is not int:
         raise RunError(f"{where} was not written by Skillweave: it has no schema number")
-    if found > SCHEMA:
+    if schema > SCHEMA:
         raise RunError(
-            f"{where} has schema {shown(found)}; this Skillweave reads up to {SCHEMA}. Upgrade "
+            f"{where} has schema {shown(schema)}; this Skillweave reads up to {SCHEMA}. Upgrade "
             "skillweave"
         )
 
@@ -192,11 +189,11 @@ def write_tensors(
     *,
     make_directories: bool = True,
 ) -> str:
-    """Replace a safetensors file; ``header`` is JSON, a checksum covers both and is returned."""
+    """Replace a safetensors file with a JSON ``header``; return the checksum of both."""
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
     whole = {"schema": SCHEMA, **header}
     whole["sha256"] = _digest(_json(path, whole, sort_keys=True), plain)
-    # One key only: safetensors writes several in random order, and equal runs make equal files.
+    # Only one key: safetensors writes several in random order, and equal runs need equal files.
     metadata = {"skillweave": _json(path, whole, sort_keys=True)}
     content = safetensors.torch.save(plain, metadata)
     write_bytes(path, content, make_directories=make_directories)
@@ -204,7 +201,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and header written by ``write_tensors``.
+    """Return tensors and header written by ``write_tensors``.
 
     Raises:
         RunError: missing, truncated, altered, no plain file, not Skillweave's, or of a
@@ -214,39 +211,39 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
-    """Like ``read_tensors``, and the checksum."""
-    header, tensors = _opened(path, with_tensors=True)
-    told = header.pop("sha256", None)
+    """Return tensors, header and checksum written by ``write_tensors``."""
+    header, tensors = _open(path, with_tensors=True)
+    recorded = header.pop("sha256", None)
     sha256 = _digest(json.dumps(header, sort_keys=True), tensors)
-    if told != sha256:
+    if recorded != sha256:
         raise RunError(f"{path} is damaged: its contents do not match its checksum")
-    # Copies: in the file tensors are aligned to 4 bytes only, and matrix products of such differ in
-    # the last bit, so that a resumed run would drift.
+    # Copies: in the file, tensors are aligned to 4 bytes only, and their matrix products differ in
+    # the last bit, so a resumed run would drift.
     return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
 def check_unchanged(path: Path, found: str, written: str) -> None:
-    """Raise a RunError where a file's checksum is not that of what the run wrote there."""
+    """Raise a RunError where a file's checksum differs from the one that the run recorded."""
     if found != written:
         raise RunError(
-            f"{path} is not the file that the run wrote there: another checksum. Put it back, or "
-            "train anew"
+            f"{path} is not the file that the run wrote there: its checksum differs. Restore the "
+            "file, or train again"
         )
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """The header alone, quickly: its checksum is not compared.
+    """Return the header alone, quickly: its checksum is not compared.
 
     Raises:
         RunError: as ``read_tensors``.
     """
-    return _opened(path, with_tensors=False)[0]
+    return _open(path, with_tensors=False)[0]
 
 
-def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     check_file(path)
     try:
-        # Before 0.5 its tensors are made on the default device, which is the user's.
+        # Before 0.5, safetensors creates tensors on the default device, which the user may change.
         with (
             torch.device("cpu"),
             safetensors.safe_open(str(path), framework="pt") as file,
@@ -267,9 +264,9 @@ def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, T
     return header, tensors
 
 
-def _json(path: Path, data: Mapping[str, Any], **how: Any) -> str:
+def _json(path: Path, data: Mapping[str, Any], **options: Any) -> str:
     try:
-        return json.dumps(data, allow_nan=False, **how)
+        return json.dumps(data, allow_nan=False, **options)
     except (TypeError, ValueError, RecursionError) as error:
         raise RunError(f"could not write {path}: {error}") from error
 
@@ -281,6 +278,6 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
         flat = tensors[name].reshape(-1)
         if len(flat) < 2:  # it may have the stride 0, which cannot be viewed as bytes
             flat = flat.clone(memory_format=torch.contiguous_format)
-        # As bytes, so that it may be of a type that NumPy does not know.
+        # As bytes, because NumPy lacks some types of PyTorch.
         digest.update(flat.view(torch.uint8).numpy().data)
     return digest.hexdigest()

@@ -1,4 +1,7 @@
-"""What goes wrong with the hub, as sentences for people."""
+"""Errors of the hub's library as sentences for users.
+
+Stands alone because it translates another library's exceptions, which ``hub`` only wraps.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from skillweave.messages import short, shortened
 
 
 def status_of(error: BaseException | None) -> Any:
-    """The number of the hub's answer; None: there was no answer."""
+    """Return the status code of the hub's answer; None: it did not answer."""
     while error is not None:
         if (response := getattr(error, "response", None)) is not None:
             return response.status_code
@@ -24,7 +27,7 @@ def status_of(error: BaseException | None) -> Any:
 def asking(
     api: Any, name: str, *, writes: bool = False, revision: str | None = None
 ) -> Iterator[None]:
-    """Errors of the hub's library as sentences for people."""
+    """Convert errors of the hub's library within the block to a RunError."""
     try:
         yield
     except SkillweaveError:
@@ -44,7 +47,7 @@ def _sentence(
     if isinstance(error, errors.RevisionNotFoundError):
         return f"{name} has no revision {short(revision)}; look at {endpoint}/{name}/commits/main"
     if status == 401 and writes:
-        return f"{endpoint} does not know you: {login} to a token that may write"
+        return f"{endpoint} does not recognise you: {login} to a token that may write"
     if status == 403 and writes:
         return (
             f"you may not write to {name}: its owner must be you or an organisation of yours, and "
@@ -58,9 +61,9 @@ def _sentence(
     what = shortened(f"{type(error).__name__}: {error}".replace("\n", " "), 300)
     if status is not None:
         return f"{endpoint} refused {name} with the answer {status}; try again later. {what}"
-    if isinstance(error, errors.HFValidationError) or type(error) is ValueError:  # it was not asked
+    if isinstance(error, errors.HFValidationError) or type(error) is ValueError:  # no request
         return f"{name} is refused: {what}"
-    after = "Nothing was pushed" if writes else f"There is no copy of {name} on this machine"
+    after = "Nothing was pushed" if writes else f"This machine has no copy of {name}"
     return (
         f"{endpoint} cannot be reached. {after}. Check the network, HF_ENDPOINT and "
         f"HF_HUB_OFFLINE, then try again. {what}"

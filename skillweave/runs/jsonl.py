@@ -1,4 +1,7 @@
-"""Files of JSON lines: a run appends to them, and a resumed run first shortens them."""
+"""Files of JSON lines: a run appends to them, and a resumed run first shortens them.
+
+Stands alone because it is one format of files; ``files`` has the others.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,8 @@ class JsonLines:
 
     Args:
         path: the file.
-        schema: what each line that is read must fit (see ``reading.fit``); None: any object.
-        next_step: returns what to type when a full disk has space again, for messages.
+        schema: the schema of each line (see ``reading.fit``); None: any object.
+        next_step: returns the command to type when a full disk has space again, for messages.
     """
 
     def __init__(
@@ -31,7 +34,7 @@ class JsonLines:
 
     @property
     def size(self) -> int:
-        """The size of the file in bytes."""
+        """Return the size of the file in bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
     def append(self, records: Iterable[Mapping[str, Any]]) -> None:
@@ -48,7 +51,7 @@ class JsonLines:
             self._file.write(text)
             self._file.flush()
         except OSError as error:
-            self.close()  # what could not be written must not be written later
+            self.close()  # a line that failed must not be written later
             raise RunError(
                 f"could not write {self.path}: {error.strerror}. The checkpoint is intact; free "
                 f"space{self._next()}"
@@ -58,7 +61,7 @@ class JsonLines:
         return "" if self._next_step is None else f", then: {self._next_step()}"
 
     def rewind(self, size: int | None) -> None:
-        """Remove all after ``size`` bytes: training will write it again; None: remove nothing.
+        """Truncate to ``size`` bytes, because training writes the rest again; None: do nothing.
 
         Raises:
             RunError: the disk cannot be written.
@@ -72,7 +75,7 @@ class JsonLines:
             raise RunError(f"could not write {self.path}: {error.strerror}") from error
 
     def read(self) -> Iterator[dict[str, Any]]:
-        """The records, without a last line that is incomplete.
+        """Yield the records, without a last line that is incomplete.
 
         Raises:
             RunError: a line is damaged, or the path is not a plain file.

@@ -1,4 +1,4 @@
-"""Which of several hierarchies a stage ended with."""
+"""The choice among several hierarchies at the end of a stage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLING: dict[str, tuple[bool, bool]] = {
     "selector_samples": (False, True),
     "both_sample": (True, True),
 }
-"""By candidate, whether skills sample and whether the selector does."""
+"""For each candidate: skills sample, the selector samples."""
 _WORDS = {
     "before": "before learning together",
     "greedy": "greedy",
@@ -27,7 +27,7 @@ _WORDS = {
 
 
 class Kept(TypedDict):
-    """Which hierarchy a stage ended with, and the mean returns of those that were compared."""
+    """The hierarchy that a stage ended with, and the mean returns of the compared ones."""
 
     before: NotRequired[float]
     greedy: NotRequired[float]
@@ -35,12 +35,12 @@ class Kept(TypedDict):
     selector_samples: NotRequired[float]
     both_sample: NotRequired[float]
     episodes: AtLeastOne
-    """Of each of them."""
+    """Episodes of each candidate."""
     kept: Candidate
 
 
 def kept_words(kept: Mapping[str, Any]) -> str:
-    """Return a sentence on the hierarchies that were compared, and on which was kept."""
+    """Return a sentence on the compared hierarchies and the kept one."""
     returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
     return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
 
@@ -55,5 +55,5 @@ def best_words(best: Mapping[str, Any]) -> str:
 
 
 def to_be_judged(entry: Mapping[str, Any]) -> bool:
-    """Whether a stage of a run is to end with the best of several hierarchies."""
+    """Return whether a stage of a run must end with the best of several hierarchies."""
     return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

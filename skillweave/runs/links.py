@@ -1,8 +1,8 @@
-"""Links inside a run: nothing is written there, since what they lead to is no part of the run.
+"""Checks for links inside a run, through which training would change files outside of it.
 
-A run may come from another person. Training appends to its files, shortens them, and deletes what a
-killed process has left; through a link all of that would happen to the user's other files. The
-directory of the run itself may be reached through a link.
+A run may come from another person. Training appends to its files, shortens and deletes some;
+through a link it would change the user's other files. The directory of the run itself may be
+reached through a link.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from skillweave.errors import RunError
 from skillweave.runs.files import write_bytes
 
 ABOVE = 2
-"""Folders above a file in which its run is looked for: ``<run>/policies/<file>``."""
+"""Folders above a file that may be its run: ``<run>/policies/<file>``."""
 TRACKERS = ("wandb",)
-"""Folders of trackers that make links there, to other files of the same folder."""
+"""Folders of trackers that make links to other files of the same folder."""
 
 
 def check_no_links(run: Path) -> None:
@@ -32,8 +32,8 @@ def check_no_links(run: Path) -> None:
             if not _stays_in_tracker(run, Path(entry.path)):
                 raise RunError(
                     f"{entry.path} is a link to {_target(entry.path)}, and nothing is written into "
-                    "a run with links, as that would change files outside of it. Put a copy in its "
-                    "place, or delete it"
+                    "a run with links, because that would change files outside of it. Put a copy "
+                    "in its place, or delete it"
                 )
         elif not entry.is_file() and not entry.is_dir():
             raise RunError(
@@ -52,9 +52,9 @@ def check_no_links_around(folder: Path) -> None:
 
 
 def own_copy(path: Path) -> None:
-    """Replace a file that has other names, too (hard links), by a copy of its own.
+    """Replace a file with further names (hard links) by a separate copy.
 
-    ``cp -al`` makes such copies of a run. A line that was appended to one would be in all.
+    ``cp -al`` makes such copies of a run. A line appended to one would appear in all.
     """
     with suppress(FileNotFoundError):
         if os.stat(path).st_nlink > 1:
@@ -62,15 +62,15 @@ def own_copy(path: Path) -> None:
 
 
 def _entries(folder: Path) -> Iterator[os.DirEntry[str]]:
-    """Yield everything below a folder; links are not followed."""
+    """Yield all entries below a folder; links are not followed."""
     waiting = [str(folder)]
     while waiting:
         try:
-            with os.scandir(waiting.pop()) as entries:
-                found = sorted(entries, key=lambda entry: entry.name)
+            with os.scandir(waiting.pop()) as scanned:
+                entries = sorted(scanned, key=lambda entry: entry.name)
         except OSError as error:
             raise RunError(f"could not read {error.filename}: {error.strerror}") from error
-        for entry in found:
+        for entry in entries:
             yield entry
             if entry.is_dir(follow_symlinks=False):
                 waiting.append(entry.path)

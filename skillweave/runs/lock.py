@@ -1,4 +1,4 @@
-"""One process at a time trains a run: a lock that the system releases when its process dies."""
+"""The lock of a run, so one process trains it at a time; the system releases it at process end."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from skillweave.errors import RunError
 
 try:
     import fcntl
-except ImportError:  # Windows: nothing keeps two processes apart there
+except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
 NAME = ".lock"
-"""The file in the run that is locked; it holds the number of the process and its machine."""
+"""The locked file in the run; it holds the number of the process and its machine."""
 _held: set[int] = set()
 
 
 class Lock:
-    """Held from ``__init__`` to ``release``."""
+    """A lock that is held from ``__init__`` to ``release``."""
 
     def __init__(self, directory: Path) -> None:
-        """Take it.
+        """Acquire the lock.
 
         Raises:
-            RunError: another process has it, or the directory cannot be written.
+            RunError: another process holds it, or the directory cannot be written.
         """
         self._directory, self._path = directory, directory / NAME
         self.exclusive = False
-        """The system keeps other processes away."""
+        """True if the system excludes other processes."""
         self._open()
         self._lock()
         if self.exclusive and os.fstat(self._handle).st_nlink > 1:
-            # The run was copied by hard links (cp -al): the copy gets a lock of its own.
+            # The run was copied by hard links (cp -al): the copy gets a separate lock.
             with suppress(FileNotFoundError):
                 os.unlink(self._path)
             self.release()
             self._open()
             self._lock()
         if self.exclusive:
-            with suppress(OSError):  # it is for messages alone
+            with suppress(OSError):  # the text is only for messages
                 os.ftruncate(self._handle, 0)
                 os.write(self._handle, f"{os.getpid()} {platform.node()}\n".encode())
 
     def _lock(self) -> None:
-        """Lock the file that is open, where the system can.
+        """Lock the open file, if the system supports it.
 
         Raises:
             RunError: another process has locked it.
@@ -67,7 +67,7 @@ class Lock:
         self.exclusive = True
 
     def _open(self) -> None:
-        """Open the file, which is made if it is not there."""
+        """Open the file, or create it."""
         flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
         try:
             self._handle = os.open(self._path, flags, 0o666)
@@ -76,7 +76,7 @@ class Lock:
         _held.add(self._handle)
 
     def _owner(self) -> str:
-        """Return which process holds it, as far as the file says."""
+        """Return the process that holds the lock, as far as the file names it."""
         number, _, machine = self._path.read_bytes()[:300].decode(errors="replace").partition(" ")
         if not number.isdecimal():
             return "another process"
@@ -86,30 +86,30 @@ class Lock:
         return f"process {number}{where}"
 
     def check(self) -> None:
-        """Raise a RunError where the run is not there any more."""
+        """Raise a RunError where the run no longer exists."""
         try:
-            there = os.path.samestat(os.stat(self._path), os.fstat(self._handle))
+            exists = os.path.samestat(os.stat(self._path), os.fstat(self._handle))
         except OSError:
-            there = False
-        if not there:
+            exists = False
+        if not exists:
             raise RunError(
-                f"{self._directory} was deleted or moved while it was being trained; training ends "
-                "here, for there is no run to write to"
+                f"{self._directory} was deleted or moved during its training; training ends, "
+                "because it has no run to write to"
             )
 
     def release(self) -> None:
-        """Let it go, if it is held."""
+        """Release the lock, if it is held."""
         if self._handle in _held:
             _held.discard(self._handle)
             os.close(self._handle)
 
 
-def _let_go() -> None:
-    """In a process forked from this one: a worker must not hold the lock when its parent dies."""
+def _release_in_child() -> None:
+    """Release all locks in a forked process: a worker must not hold one when its parent dies."""
     for handle in _held:
         os.close(handle)
     _held.clear()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_let_go)
+    os.register_at_fork(after_in_child=_release_in_child)

@@ -1,6 +1,6 @@
-"""What ``run.json`` and the headers of checkpoints hold: the schema that reading them goes by.
+"""The schemas of ``run.json`` and of the headers of checkpoints.
 
-To add a field, add a line; ``NotRequired`` where not every run has it.
+To add a field, add a line; ``NotRequired`` if not every run has it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _is_path(text: str) -> bool:
 
 
 MOST_NAMES = 16
-"""In a path."""
+"""The most names in a path."""
 NodePath = Annotated[
     str, Check("names of letters, digits, '_' and '-', with '/' between", _is_path)
 ]
@@ -37,20 +37,20 @@ NodePath = Annotated[
 
 
 class NestedEntry(TypedDict):
-    """A hierarchy: the run's, or a skill of it or of another one; its skills have entries, too."""
+    """The entry of a hierarchy, the run's or a skill's; its skills have entries, too."""
 
     call_steps: AtLeastOne | None
     call_lengths: NotRequired[list[AtLeastOne]]
     interrupt: NonNegative | None
-    """By how much a new decision must be worth more to interrupt a call."""
+    """The gain in value at which a new decision interrupts a call."""
     learn: Literal["apart", "together", "apart, then together"]
     greedy_skills: bool | None
-    """None: measured at the end of learning together, and written there (``kept``)."""
+    """None: measured at the end of learning together (``kept``)."""
     greedy_selector: bool | None
     selector: NotRequired[Source]
-    """Of a ready selector; absent where it is trained."""
+    """The source of a ready selector; absent if it is trained."""
     guide: NotRequired[Source]
-    """Of the ready selector that a trained one keeps to."""
+    """The source of the ready selector that guides a trained one."""
     guide_restrict: NotRequired[bool]
     guide_kl: NotRequired[Positive | None]
     reflexes: list[str]
@@ -61,7 +61,7 @@ class NestedEntry(TypedDict):
 
 
 class SkillEntry(TypedDict):
-    """A skill of the run, or of a hierarchy that is one."""
+    """The entry of a skill of the run, or of a hierarchy in it."""
 
     name: NodePath
     max_steps: AtLeastOne | None
@@ -69,11 +69,11 @@ class SkillEntry(TypedDict):
     ready: NotRequired[bool]
     policy: NotRequired[Source]
     hierarchy: NotRequired[NestedEntry]
-    """What it is made of."""
+    """Its parts, if the skill is a hierarchy."""
 
 
 class Winner(TypedDict):
-    """The member that a population's stage ended with."""
+    """The member that won a population's stage."""
 
     member: Count
     fitness: float
@@ -82,21 +82,21 @@ class Winner(TypedDict):
 
 
 class TargetEntry(TypedDict):
-    """Where a stage may end before its budget is spent."""
+    """The target at which a stage may end before its budget is spent."""
 
     of: Literal["return", "success"]
     at_least: float
 
 
 class Reached(TypedDict):
-    """That a stage has reached its target: when, and with which value."""
+    """The steps and the value with which a stage reached its target."""
 
     steps: Count
     value: float
 
 
 class Stopped(TypedDict):
-    """That a callback ended a stage."""
+    """The steps at which a callback ended a stage."""
 
     steps: Count
 
@@ -110,34 +110,34 @@ class Best(TypedDict):
 
 
 class BestSoFar(TypedDict):
-    """The best evaluation of a stage that goes on."""
+    """The best evaluation so far of a stage in training."""
 
     steps: Count
     metrics: dict[str, float]
 
 
 class Start(TypedDict):
-    """What one begins a stage with, from another run."""
+    """The policy of another run with which a learner begins a stage."""
 
     sha256: str
-    """Of its file there."""
+    """Checksum of its file in the other run."""
     steps: Count
-    """Environment steps that it learnt from there."""
+    """Environment steps of its training there."""
     run: str | None
-    """That run's ``id``."""
+    """The other run's ``id``."""
     copy: str
     """Checksum of this run's copy."""
 
 
 class StageEntry(TypedDict):
-    """A stage: who learns in it and who decides, for how many steps, and how far it is."""
+    """A stage: its learners, the policy that decides, its budget and its progress."""
 
     name: NodePath
     kind: Literal["agent", "skill", "selector", "together"]
     learns: Annotated[list[NodePath], Check("at least one name", bool)]
-    """Whose weights the stage changes: "agent", "selector" or a skill's name."""
+    """Names of the learners: "agent", "selector" or a skill's name."""
     decides: NodePath | None
-    """Who chooses among the skills; None: one acts all the time."""
+    """The policy that chooses among the skills; None: one policy acts all the time."""
     budget: AtLeastOne
     algorithm: dict[str, Any]
     status: Literal["waiting", "training", "done"]
@@ -156,29 +156,29 @@ class StageEntry(TypedDict):
     final: NotRequired[dict[str, float | None]]
     winner: NotRequired[Winner]
     succeeded: NotRequired[bool]
-    """Any call of the skill, while it trained or was evaluated, as far as that is known."""
+    """True if any call of the skill succeeded in training or evaluation; absent: unknown."""
     sha256: NotRequired[str]
-    """Of its policy's file."""
+    """Checksum of its policy's file."""
     policies: NotRequired[dict[NodePath, str]]
-    """The same where several learn: by name, checksums of their policies' files."""
+    """With several learners: checksums of their policies' files by name."""
     together: NotRequired[dict[str, Any]]
-    """How skills and selector learn together."""
+    """Settings of skills and selector learning together."""
     algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
-    """Of the skills that learn together with the selector."""
+    """Settings of the skills that learn together with the selector."""
     task_weights: NotRequired[dict[NodePath, NonNegative]]
-    """Of skills whose ``task_weight`` is not that of ``together``."""
+    """The weights of skills whose ``task_weight`` differs from the one of ``together``."""
     guide_kl: NotRequired[Positive]
-    """The KL within which the selector stays of its guide."""
+    """The largest KL of the selector to its guide."""
     compared: NotRequired[bool]
-    """What is learnt together is kept only if it is better than what was there before."""
+    """Keep the jointly learnt weights only if they are better than the earlier ones."""
     greedy_judged: NotRequired[bool]
     """At its end, evaluate whether skills and selector should act greedily or sample."""
     kept: NotRequired[Kept]
-    """What was found out at its end."""
+    """The result of the comparison at its end."""
     continued: NotRequired[list[Count]]
-    """Steps after which the stage had ended, and was then given more."""
+    """Steps after which the stage had ended, before its budget was raised."""
     starts: NotRequired[dict[NodePath, Start]]
-    """By name, who begins with what it has learnt in another run."""
+    """Initial policies from other runs, by learner."""
 
 
 class Manifest(TypedDict):
@@ -197,9 +197,9 @@ class Manifest(TypedDict):
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
     keep: NotRequired[Literal["last", "best"]]
-    """What stages end with."""
+    """The weights that stages end with."""
     log_info: NotRequired[list[str]]
-    """Keys of ``info`` that are logged."""
+    """Logged keys of ``info``."""
     resume_needs_recipe: bool
     recipe: NotRequired[str | None]
     track: NotRequired[list[str]]
@@ -221,7 +221,7 @@ MetricsLine = TypedDict(
         "return": NotRequired[float],
     },
 )
-"""A line of ``metrics.jsonl``: an update, with numbers of its algorithm's own."""
+"""A line of ``metrics.jsonl``: an update, with further numbers of its algorithm."""
 
 
 class Checkpoint(TypedDict):
@@ -237,7 +237,7 @@ class Checkpoint(TypedDict):
     lineage_bytes: NotRequired[Count]
     run: NotRequired[str]
     kept_best: NotRequired[BestSoFar]
-    """Where the best weights are kept."""
+    """The best evaluation so far, if the best weights are kept."""
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:
@@ -260,28 +260,28 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
     if "id" in data and "sha256" not in data:
-        raise RunError(f"{file} is damaged: no field 'sha256', the checksum of it all")
+        raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
 
 
 def read_manifest(run: Path) -> dict[str, Any]:
-    """The content of a run's ``run.json``, checked."""
+    """Return the checked content of a run's ``run.json``."""
     file = run / "run.json"
     return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
 def identity(manifest: Mapping[str, Any]) -> str:
-    """What distinguishes a new run from others, in 16 letters.
+    """Return 16 letters that identify a new run.
 
-    Runs that are bound to end with the same weights have the same.
+    Runs that must end with the same weights have the same.
     """
-    settled = {k: v for k, v in manifest.items() if k not in ("recipe", "track", "log_info")}
-    return hashlib.sha256(json.dumps(settled, sort_keys=True, default=str).encode()).hexdigest()[
+    settings = {k: v for k, v in manifest.items() if k not in ("recipe", "track", "log_info")}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[
         :16
     ]
 
 
 def versions() -> dict[str, str]:
-    """Of Skillweave, Python, what it stands on, and the machine."""
+    """Return the versions of Skillweave, Python and dependencies, and the platform."""
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("skillweave", "torch", "gymnasium", "numpy", "envpool"):
         try:

@@ -1,4 +1,7 @@
-"""Numbered directories: where a run is written if the user names no directory."""
+"""Numbered directories, for runs without a directory from the user.
+
+Stands alone because it only makes directories, and knows nothing of runs.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,9 @@ from pathlib import Path
 from skillweave.errors import RunError
 
 FOLDER = Path("runs")
-"""Where numbered directories are made, below the working directory."""
+"""The parent of numbered directories, below the working directory."""
 LONGEST = 60
-"""Characters of a name."""
+"""The most characters of a name."""
 
 
 def safe_name(text: str) -> str:
@@ -33,7 +36,7 @@ def make_numbered(name: str, below: Path) -> Path:
     try:
         folder.mkdir(exist_ok=True)
         taken = (pattern.fullmatch(path.name) for path in folder.iterdir())
-        number = max((int(found[1]) for found in taken if found), default=0) + 1
+        number = max((int(match[1]) for match in taken if match), default=0) + 1
         while True:
             path = folder / f"{name}-{number}"
             with suppress(FileExistsError):

@@ -1,4 +1,4 @@
-"""What populations write into a run: lines of ``lineage.jsonl``, headers of their checkpoints."""
+"""The schemas of populations: lines of ``lineage.jsonl``, headers of their checkpoints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class MemberEntry(TypedDict):
 
 
 class Origin(TypedDict):
-    """Where a member comes from."""
+    """The origin of a member: its parent and its mutation."""
 
     parent: Count | None
     mutation: str

@@ -1,4 +1,4 @@
-"""Runs by the paths that people name: a run's directory, or a directory of runs, as sweeps are."""
+"""Runs at paths of the user: a run's directory, or a directory of runs such as a sweep."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ def open_runs(paths: Sequence[Path]) -> list[RunDirectory]:
     Raises:
         RunError: a path holds no run, or a run is damaged.
     """
-    found = []
+    runs = []
     for path in paths:
         inside = [] if (path / "run.json").exists() else _runs_in(path)
-        # Where neither is there, opening says what a run is.
-        found += [RunDirectory.open(each) for each in inside or [path]]
-    if not found:
+        # Without a run, opening the path raises an error that explains runs.
+        runs += [RunDirectory.open(each) for each in inside or [path]]
+    if not runs:
         raise DeclarationError("no runs were given; name a run's directory, or a sweep's")
-    return found
+    return runs
 
 
 def _runs_in(path: Path) -> list[Path]:
-    """The runs directly below a directory: s2 before s10."""
+    """Return the runs directly below a directory: s2 before s10."""
     if not path.is_dir():
         return []
     runs = [each.parent for each in path.glob("*/run.json")]
@@ -35,6 +35,6 @@ def _runs_in(path: Path) -> list[Path]:
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts numbers in names by their size."""
+    """Return a key that sorts numbers in names by their size."""
     parts = re.split(r"(\d+)", name)
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]

@@ -1,4 +1,4 @@
-"""The whole state that a learner ended a stage with, for a later stage in which it learns on."""
+"""The full state of a learner at the end of a stage, for a later stage in which it continues."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ S = TypeVar("S")
 
 
 def learns_again(run: RunDirectory, stage: str, name: str) -> bool:
-    """Whether ``name`` learns in a stage after this one, too."""
+    """Return whether ``name`` also learns in a later stage."""
     stages = run.manifest["stages"]
     at = [entry["name"] for entry in stages].index(stage)
     return any(name in entry["learns"] for entry in stages[at + 1 :])
 
 
 def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
-    """Write the state, a dataclass of tensors on the CPU, that ``name`` ends a stage with."""
+    """Write the final state of ``name`` in a stage, a dataclass of tensors on the CPU."""
     run.check()
     path = state_path(run, name)
     make_directory(path.parent)
@@ -31,13 +31,12 @@ def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
 
 
 def load_state(run: RunDirectory, name: str, like: S) -> S | None:
-    """The state that ``name`` ended its latest stage with; None: none was written.
+    """Return the final state of ``name`` in its latest stage; None: it cannot continue from one.
 
-    A population writes none. Where what was learnt in that stage was
-    not kept, its state is none of who goes on.
+    A population writes none, and a stage whose result was not kept has none to continue from.
 
     Raises:
-        RunError: the file is damaged, or belongs elsewhere.
+        RunError: the file is damaged, or belongs to another learner or run.
     """
     path = state_path(run, name)
     if not path.exists():
@@ -52,14 +51,14 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
 
 
 def drop_states(run: RunDirectory, stage: str) -> None:
-    """Remove the states of those who have learnt in this stage and learn no more after it."""
+    """Remove the states of learners of this stage that do not learn in a later one."""
     for name in run.stage(stage)["learns"]:
         if not learns_again(run, stage, name):
             remove(state_path(run, name))
-    with suppress(OSError):  # it holds others still, or never was there
+    with suppress(OSError):  # it still holds others, or never existed
         (run.path / "states").rmdir()
 
 
 def state_path(run: RunDirectory, name: str) -> Path:
-    """Return where the state lies that ``name`` ended its latest stage with."""
+    """Return the path of the final state of ``name`` in its latest stage."""
     return run.path / "states" / f"{file_name(name)}.safetensors"

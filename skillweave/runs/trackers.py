@@ -1,4 +1,4 @@
-"""Sends metrics and films to TensorBoard, Weights & Biases or MLflow, besides ``metrics.jsonl``."""
+"""Trackers that send metrics and films to TensorBoard, Weights & Biases or MLflow."""
 
 from __future__ import annotations
 
@@ -17,51 +17,51 @@ from skillweave.runs.mlflow_tracker import MLflow
 
 
 class Tracker(Protocol):
-    """A listener of training that sends what it is told to somewhere else."""
+    """A listener of training that sends its events to another program."""
 
     def stage(self, name: str, budget: int) -> None:
-        """A stage begins, or goes on."""
+        """Report that a stage begins or continues."""
         ...
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """An update was made."""
+        """Report an update."""
         ...
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """A stage is over."""
+        """Report the end of a stage."""
         ...
 
     def message(self, text: str) -> None:
-        """Something that people should know."""
+        """Report a message for users."""
         ...
 
     def film(self, path: Path, steps: int) -> None:
-        """A film was made, a GIF or an MP4, after so many steps of training."""
+        """Report a film, a GIF or an MP4, after ``steps`` of training."""
         ...
 
     def close(self) -> None:
-        """Nothing more will be told."""
+        """Release the tracker after the last event."""
         ...
 
 
 class TensorBoard:
-    """Scalars by environment step, under ``<run>/tensorboard``, in a folder for each stage.
+    """A tracker of scalars by environment step, in ``<run>/tensorboard/<stage>``.
 
-    A folder each, because every stage counts its steps from 0, and what a resumed run replaces is
-    purged by the number of the step.
+    Each stage has a folder, because it counts its steps from 0, and a resumed run purges later
+    entries by the number of the step.
     """
 
     def __init__(self, run: RunDirectory) -> None:
-        import torch.utils.tensorboard  # noqa: F401  # fails here, not after hours
+        import torch.utils.tensorboard  # noqa: F401  # raises now, not after hours
 
         self._path = run.path / "tensorboard"
         self._writers: dict[str, Any] = {}
 
     def stage(self, name: str, budget: int) -> None:
-        """Nothing to say."""
+        """Do nothing."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Write every metric; a resumed stage's first one takes the place of all from there on."""
+        """Write every metric; a resumed stage's first step replaces all entries from there on."""
         if name not in self._writers:
             from torch.utils.tensorboard import SummaryWriter
 
@@ -70,15 +70,15 @@ class TensorBoard:
             self._writers[name].add_scalar(f"{name}/{key}", value, steps)
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Flush."""
+        """Flush the stage's file."""
         if name in self._writers:
             self._writers[name].flush()
 
     def message(self, text: str) -> None:
-        """Messages are not tracked."""
+        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
-        """Write a GIF as it is; of an MP4 TensorBoard shows nothing."""
+        """Write a GIF unchanged; skip an MP4, which TensorBoard cannot show."""
         if path.suffix != ".gif":
             return
         from tensorboard.compat.proto.summary_pb2 import Summary
@@ -98,9 +98,9 @@ class TensorBoard:
 
 
 class WandB:
-    """One Weights & Biases run; offline if there is no login. It never asks for one.
+    """A tracker of one Weights & Biases run; offline without a login, for which it never asks.
 
-    A resumed run goes on in it: its id follows from the run's path, and from when it was begun.
+    A resumed run continues it: its id follows from the run's path and time of creation.
     """
 
     def __init__(self, run: RunDirectory) -> None:
@@ -118,7 +118,7 @@ class WandB:
         )
 
     def stage(self, name: str, budget: int) -> None:
-        """Metrics of this stage are drawn over its own steps."""
+        """Plot metrics of this stage over its own steps."""
         self._run.define_metric(f"{name}/*", step_metric=f"{name}/steps")
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
@@ -126,13 +126,13 @@ class WandB:
         self._run.log({f"{name}/{k}": v for k, v in (metrics | {"steps": steps}).items()})
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Weights & Biases needs nothing here."""
+        """Do nothing."""
 
     def message(self, text: str) -> None:
-        """Messages are not tracked."""
+        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
-        """Log the film; Weights & Biases keeps a copy."""
+        """Log the film, of which Weights & Biases stores a copy."""
         import wandb
 
         self._run.log({f"film/{path.stem}": wandb.Video(str(path)), "film/steps": steps})
@@ -143,13 +143,13 @@ class WandB:
 
 
 def identifier(run: RunDirectory) -> str:
-    """The same for a run and for what resumes it, and for no other."""
-    told = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
-    return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
+    """Return 16 letters that identify a run, also when it is resumed."""
+    parts = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 def make_mlflow(run: RunDirectory) -> Tracker:
-    """A run of MLflow's."""
+    """Return a tracker that sends to MLflow."""
     return MLflow(run, identifier(run))
 
 
@@ -159,15 +159,15 @@ MAKE: dict[str, Callable[[RunDirectory], Tracker]] = {
     "mlflow": make_mlflow,
 }
 TRACKERS = tuple(MAKE)
-"""Their names, and those of their modules and extras."""
+"""Names of the trackers, of their modules and of their extras."""
 
 
 def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Tracker, ...]:
-    """The trackers with these names; if ``run`` is None, only check that they can be made.
+    """Return the trackers with these names; if ``run`` is None, only check that they can be made.
 
     Raises:
-        DeclarationError: there is no such tracker.
-        RunError: it does not answer.
+        DeclarationError: a tracker of this name does not exist.
+        RunError: a tracker does not answer.
         MissingExtra: its package is not installed.
     """
     for name in names:
@@ -180,9 +180,9 @@ def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Track
 
 @contextmanager
 def trackers_of(run: RunDirectory) -> Iterator[tuple[Tracker, ...]]:
-    """The trackers that a run was trained with, to tell what was found out since.
+    """Yield the trackers of a run's training, to send later results.
 
-    None where they are not installed: the run was trained on another machine.
+    None if they are not installed: the run was trained on another machine.
     """
     with ExitStack() as stack:
         try:
@@ -202,12 +202,12 @@ def track_film(run: RunDirectory, path: Path) -> None:
 
 
 def steps_of(run: RunDirectory) -> int:
-    """Environment steps of all stages."""
+    """Return the environment steps of all stages."""
     return sum(stage.get("steps", 0) for stage in run.manifest["stages"])
 
 
 def wandb_mode() -> Any:
-    """The value of WANDB_MODE if it is set; else online if there is a login, else offline."""
+    """Return WANDB_MODE if it is set; else "online" with a login, "offline" without."""
     login = bool(os.environ.get("WANDB_API_KEY")) or _has_netrc()
     return os.environ.get("WANDB_MODE") or ("online" if login else "offline")
 

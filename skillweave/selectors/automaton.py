@@ -1,4 +1,4 @@
-"""An automaton as a selector: states with skills, and transitions by what happens in steps.
+"""An automaton as a selector: states with skills, and transitions by events in steps.
 
 Its states and events are those of a reward machine (Toro Icarte, Klassen, Valenzano & McIlraith
 2018, "Using Reward Machines for High-Level Task Specification"), without the rewards.
@@ -23,7 +23,7 @@ from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, Step
 
 Event = Callable[[Step], Any] | str
-"""What makes a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
+"""The event of a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
 Choices = str | Sequence[str] | set[str] | frozenset[str]
 """The skills of a state."""
 ENDS = ("success", "failure")
@@ -31,7 +31,7 @@ ENDS = ("success", "failure")
 
 @checked_names
 class Automaton(ReadySelector):
-    """States, each with the skills that are called in it, and transitions between them.
+    """An automaton: states, each with the skills that are called in it, and transitions.
 
     ```python
     import skillweave as sw
@@ -47,22 +47,22 @@ class Automaton(ReadySelector):
     )
     ```
 
-    After every step, also within a call, the transitions of each environment's state are looked
-    at in the order in which they are written; the first whose event has happened is taken, and no
-    other in this step. The event "success" is that the call ended with this step and succeeded,
-    "failure" that it ended without. A transition ends no call: the skills of the new state are
+    After every step, also within a call, the transitions of each environment's state are checked
+    in the order of declaration; the first whose event has happened is taken, and no other in this
+    step. The event "success" means that the call ended in this step and succeeded, "failure" that
+    it ended without success. A transition does not end a call: the skills of the new state are
     called when the running call is over. Every episode starts in ``start``.
 
-    Of several skills one that may start is called: if greedy, the first (of a list in its order,
-    of a set in the hierarchy's), else one at random, all equally likely.
+    Among several skills that may start, greedy selection calls the first (in the order of a list;
+    in the hierarchy's order of a set), else one uniformly at random.
 
     Args:
-        states: by name, a skill's name, or several.
-        transitions: by (from, to), the event.
-        start: the first state; None: the one that is written first.
+        states: a skill's name, or several, by the state's name.
+        transitions: the event by (from, to).
+        start: the first state; None: the first in ``states``.
 
     Raises:
-        DeclarationError: a state has no skill, or a transition names a state that is not there.
+        DeclarationError: a state has no skill, or a transition names an unknown state.
         SkillError: when it acts: no skill of the state may start.
     """
 
@@ -94,28 +94,28 @@ class Automaton(ReadySelector):
         self.ranks = np.zeros((len(states), 0))
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the ``skills`` of these names."""
-        found = super().among(skills)
-        # The larger, the earlier: 0 where the skill is none of the state's.
-        found.ranks = np.zeros((len(self.states), len(skills)), np.int64)
+        """Return a copy that chooses among the ``skills`` of these names."""
+        selector = super().among(skills)
+        # Larger ranks come first; 0: the skill is not in the state.
+        selector.ranks = np.zeros((len(self.states), len(skills)), np.int64)
         for i, (state, names) in enumerate(self.states.items()):
-            numbers = [found._number(n, f"automaton: state {short(state)}") for n in names]
+            numbers = [selector._number(n, f"automaton: state {short(state)}") for n in names]
             numbers = sorted(numbers) if isinstance(names, frozenset) else numbers
             for place, number in enumerate(numbers):
-                found.ranks[i, number] = len(numbers) - place
-        return found
+                selector.ranks[i, number] = len(numbers) - place
+        return selector
 
     @property
     def ranges(self) -> dict[str, range]:
-        """Its states."""
+        """Return the range of state numbers."""
         return {"state": range(len(self.state_names))}
 
     def start(self, n: int) -> Memory:
-        """Memory of ``n`` environments in the first state."""
+        """Return the memory of ``n`` environments in the first state."""
         return {"state": np.full(n, self.state_names.index(self.start_state))}
 
     def allowed(self, memory: Memory) -> Array:
-        """(n, S) bool: by the ``memory`` the skills of the state that each environment is in."""
+        """Return the skills of each environment's state, (n, S) bool."""
         allowed: Array = self.ranks[memory["state"]] > 0
         return allowed
 
@@ -128,7 +128,7 @@ class Automaton(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """A skill of each environment's state, (n,)."""
+        """Return a skill of each environment's state, (n,)."""
         allowed = self._startable(memory, obs, mask)
         score = self.ranks[memory["state"]]
         if not deterministic:
@@ -136,32 +136,32 @@ class Automaton(ReadySelector):
         return np.where(allowed, score, -1).argmax(axis=1), memory
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """All skills of the state that may start, by ``mask`` (n, S), are equally likely, (n, S).
+        """Return equal probabilities of all skills of the state that may start, (n, S).
 
-        ``memory`` is of n environments; ``obs`` is not looked at.
+        ``mask`` is (n, S) bool, ``memory`` of n environments; ``obs`` is only for messages.
         """
         allowed = self._startable(memory, obs, mask)
-        found: Array = allowed / allowed.sum(axis=1, keepdims=True, dtype=np.float32)
-        return found, memory
+        share: Array = allowed / allowed.sum(axis=1, keepdims=True, dtype=np.float32)
+        return share, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """The ``memory`` after a ``step``: take the transitions whose events have happened.
+        """Take the transitions whose events have happened in a ``step``; return the new memory.
 
-        ``last`` says how the last calls ended.
+        ``last`` has the ends of the last calls.
         """
         before, after = memory["state"], memory["state"].copy()
         waiting = np.ones(len(before), bool)  # no transition was taken yet
         for origin, target, event in self.arrows:
-            here = waiting & (before == origin)
-            if not here.any():
+            taken = waiting & (before == origin)
+            if not taken.any():
                 continue
-            here &= self._happened(event, step, last)
-            after[here] = target
-            waiting &= ~here
+            taken &= self._happened(event, step, last)
+            after[taken] = target
+            waiting &= ~taken
         return {"state": after}
 
     def source(self) -> dict[str, Any]:
-        """The checksum of its states and transitions; of functions the names alone are in it."""
+        """Return the checksum of its states and transitions, with only the names of functions."""
         arrows = [
             [*pair, event if isinstance(event, str) else [function_name(event)]]
             for pair, event in self.transitions.items()
@@ -174,7 +174,7 @@ class Automaton(ReadySelector):
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
     def _startable(self, memory: Memory, obs: Array, mask: Array | None) -> Array:
-        """The skills of the state that may start, (n, S) bool: at least one."""
+        """Return the skills of the state that may start, (n, S) bool, at least one per row."""
         allowed = self.allowed(memory)
         if mask is not None:
             allowed = allowed & mask
@@ -183,7 +183,7 @@ class Automaton(ReadySelector):
         return allowed
 
     def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
-        """Whether an event has happened in this step, (n,) bool."""
+        """Return whether an event has happened in this step, (n,) bool."""
         if isinstance(event, str):
             wanted = last.succeeded if event == "success" else ~last.succeeded
             happened: Array = (last.why != CallEnd.RUNNING) & wanted
@@ -192,7 +192,7 @@ class Automaton(ReadySelector):
         return answer(event, step, n, bool, self._who, name, step.elapsed)
 
     def _ends_of(self, pair: Any, event: Any) -> tuple[int, int]:
-        """The states that a transition is between, after a check of both and of its event."""
+        """Check a transition and its event; return the numbers of its two states."""
         if not isinstance(pair, tuple) or len(pair) != 2:
             raise DeclarationError(
                 f"an Automaton's transition is from {short(pair)}; write ('from', 'to'): event"
@@ -209,8 +209,8 @@ class Automaton(ReadySelector):
     def _number_of_state(self, name: Any, where: str) -> int:
         if name not in self.state_names:
             raise DeclarationError(
-                f"automaton: {where} names the state {short(name)}, which is not there; there are: "
-                f"{listed(self.state_names)}"
+                f"automaton: {where} names the state {short(name)}, which does not exist; the "
+                f"states are: {listed(self.state_names)}"
             )
         return self.state_names.index(name)
 
@@ -219,7 +219,7 @@ class Automaton(ReadySelector):
         raise SkillError(
             f"{self._who}: in state {short(state)} none of its skills ("
             f"{listed(tuple(self.states[state]))}) may start in observation {shown_obs(obs[row])}: "
-            "initiation() is False there. Give the state another skill too, or let one start there"
+            "initiation() is False there. Add a skill to the state, or let one start there"
         )
 
 
@@ -230,7 +230,7 @@ def _name(state: Any) -> str:
 
 
 def _skills(state: str, skills: Any) -> tuple[str, ...] | frozenset[str]:
-    """The names of a state's skills: in order, or as a set."""
+    """Return the names of a state's skills: in order, or as a set."""
     if isinstance(skills, str):
         return (skills,)
     where = f"automaton: state {short(state)}"

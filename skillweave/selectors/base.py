@@ -1,4 +1,4 @@
-"""What every ready selector is, and what it is told of the last call."""
+"""The base of ready selectors, which choose skills without training."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from skillweave.types import Array, Memory, Step
 
 
 class ReadySelector(Foreign):
-    """A selector that is not trained: a policy over skills that also sees how calls end.
+    """A selector that is not trained: a policy over skills that also observes the ends of calls.
 
-    It is asked only where a call is over. It keeps to the skills' initiation sets itself, as its
-    mask tells them. All that it remembers is in its memory, with a row for each environment.
+    It is called only where a call is over. It respects the skills' initiation sets, which are its
+    mask. Its whole state is its memory, with a row for each environment.
     """
 
     def __init__(self, name: str) -> None:
@@ -27,38 +27,38 @@ class ReadySelector(Foreign):
 
     @property
     def ranges(self) -> dict[str, range]:
-        """What numbers in its memory may be, of those that choose among something, by name."""
+        """Return the valid range of each index in its memory, by name."""
         return {}
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the skills of these names, in the hierarchy's order.
+        """Return a copy that chooses among the skills of these names, in the hierarchy's order.
 
         Raises:
-            DeclarationError: it names a skill that is none of them.
+            DeclarationError: it names another skill.
         """
-        found = copy.copy(self)
-        found.skills = skills
-        return found
+        selector = copy.copy(self)
+        selector.skills = skills
+        return selector
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """How likely it is to choose each skill where a call is over, (n, S) float32.
+        """Return the probability of each skill where a call is over, (n, S) float32.
 
         Returns:
-            that, and the memory after it was asked.
+            The probabilities, and the memory after the choice.
         """
         skill, after = self.act(memory, obs, mask)
         return np.eye(len(self.skills), dtype=np.float32)[skill], after
 
     def allowed(self, memory: Memory) -> Array | None:
-        """(n, S) bool, the skills that it may choose next; None: that depends on what it sees."""
+        """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
         return None
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """The memory after a step of n environments; called after every step.
+        """Return the memory after a step of n environments; called after every step.
 
         Args:
-            step: as the environments answered; its ``elapsed`` counts as for any policy.
-            last: ``why`` is 0 (``CallEnd.RUNNING``) where the call goes on.
+            step: the environments' transition; ``elapsed`` counts as for any policy.
+            last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
         """
         return memory
 
@@ -68,27 +68,27 @@ class ReadySelector(Foreign):
         """Return the place of a skill in the hierarchy's list.
 
         Raises:
-            DeclarationError: there is no skill of this name; the message begins with ``where``. It
-                is of another ``kind`` where that is given.
+            DeclarationError: no skill has this name; the message begins with ``where``. ``kind`` is
+                the type of the error.
         """
         if not isinstance(skill, str) or skill not in self.skills:
             raise kind(
-                f"{where} names {short(skill)}, which is no skill of the hierarchy; there are: "
-                f"{listed(self.skills)}"
+                f"{where} names {short(skill)}, which is no skill of the hierarchy; its skills "
+                f"are: {listed(self.skills)}"
             )
         return self.skills.index(skill)
 
 
 def listed(names: tuple[str, ...]) -> str:
-    """Names as one part of a sentence."""
+    """Join names to a part of a sentence."""
     return shortened(", ".join(names), 300)
 
 
 def shown_obs(obs: Array) -> str:
-    """One observation in a message."""
+    """Format an observation for a message."""
     return shortened(np.array2string(obs, precision=3, threshold=20), 300)
 
 
 def function_name(function: Any) -> str:
-    """What a function of the user is called in messages and checksums."""
+    """Return a user function's name for messages and checksums."""
     return str(getattr(function, "__name__", type(function).__name__))

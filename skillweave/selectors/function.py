@@ -22,11 +22,11 @@ from skillweave.types import Array, Memory, Step, read_only
 class FunctionSelector(ReadySelector):
     """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
 
-    If it needs a second argument, it is given the ``LastCall``.
+    If it needs a second argument, that is the ``LastCall``.
 
     Raises:
-        SkillError: when it acts: the function failed, or chose what is no skill, or a skill
-            that may not start.
+        SkillError: when it acts: the function failed, or chose an unknown skill, or a skill that
+            may not start.
     """
 
     kind = "function"
@@ -37,7 +37,7 @@ class FunctionSelector(ReadySelector):
         self.asks_last = required_arguments(function) > 1
 
     def start(self, n: int) -> Memory:
-        """How the last call ended, for functions that are told; else nothing."""
+        """Return the initial last call, for functions that use it; else an empty memory."""
         if not self.asks_last:
             return {}
         return {
@@ -55,7 +55,7 @@ class FunctionSelector(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """What the function chooses, (n,), checked."""
+        """Return the function's choices, (n,), checked."""
         function = self.function
         if self.asks_last:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
@@ -75,15 +75,17 @@ class FunctionSelector(ReadySelector):
         return chosen, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Keep how the last call ended."""
+        """Store the end of the last call."""
         if not self.asks_last:
             return memory
         return {
-            "skill": last.skill.copy(), "why": last.why.copy(), "succeeded": last.succeeded.copy()
-        }  # fmt: skip
+            "skill": last.skill.copy(),
+            "why": last.why.copy(),
+            "succeeded": last.succeeded.copy(),
+        }
 
     def source(self) -> dict[str, Any]:
-        """The function's name."""
+        """Return the function's name."""
         return {"kind": self.kind, "name": qualified(self.function)}
 
     def _check_starts(self, chosen: Array, obs: Array, mask: Array | None) -> None:

@@ -1,4 +1,4 @@
-"""What a user may write after ``selector =`` beside an algorithm's settings."""
+"""Values of the attribute ``selector`` of a hierarchy, converted to ready selectors."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ ReadyValue = Callable[..., Any] | Automaton | tree.Composite
 
 
 def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
-    """The selector that ``value`` means among skills of these names; None: it is none.
+    """Convert ``value`` to a selector among skills of these names; None: it is not one.
 
     Raises:
-        DeclarationError: it names a skill that is not among them.
+        DeclarationError: it names another skill.
     """
-    found: ReadySelector
+    selector: ReadySelector
     if isinstance(value, Automaton):
-        found = value
+        selector = value
     elif isinstance(value, tree.Composite):
-        found = TreeSelector(value)
+        selector = TreeSelector(value)
     elif callable(value) and not isinstance(value, type):
-        found = FunctionSelector(value)
+        selector = FunctionSelector(value)
     else:
         return None
-    return found.among(skills)
+    return selector.among(skills)

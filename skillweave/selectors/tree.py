@@ -17,12 +17,11 @@ selector = tree.Sequence(
 
 Text is a skill's name; a function of observations (n, *obs_shape) to (n,) bool is a condition.
 
-The tree is asked only where a call is over. A skill's leaf is RUNNING while its call is under way,
-SUCCESS where the call succeeded (by the skill's ``success``; where it has none, by its own end),
-and FAILURE where it ended otherwise: at a limit (``max_steps``, ``call_steps``) without success.
-A skill that may not start is FAILURE at once. When the whole tree has come to SUCCESS or FAILURE,
-it begins anew from its root. The field's terms: Colledanchise & Ögren 2018, "Behavior Trees in
-Robotics and AI".
+The tree is evaluated only where a call is over. A skill's leaf is RUNNING during its call, SUCCESS
+if the call succeeded (by the skill's ``success``; without it, by its ``termination``), and FAILURE
+if it ended otherwise: at a limit (``max_steps``, ``call_steps``) without success. A skill that may
+not start is FAILURE at once. When the whole tree is SUCCESS or FAILURE, it starts again from its
+root. Terms as in Colledanchise & Ögren 2018, "Behavior Trees in Robotics and AI".
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from skillweave.types import Array
 
 
 class Status(IntEnum):
-    """What a node of a tree answers."""
+    """The status of a node of a tree."""
 
     RUNNING = 0
     SUCCESS = 1
@@ -51,11 +50,11 @@ class Condition:
     """A function of observations (n, *obs_shape) to (n,) bool: SUCCESS where it holds.
 
     Args:
-        function: asked where a call is over.
+        function: evaluated where a call is over.
         name: used in messages; default: the function's name.
 
     Raises:
-        DeclarationError: it is no function of observations.
+        DeclarationError: it is not a function of observations.
     """
 
     def __init__(self, function: Callable[[Array], Any], name: str = "") -> None:
@@ -72,19 +71,21 @@ class Composite:
 
     Args:
         children: skills' names, conditions (or bare functions), sequences and fallbacks.
-        memory: go on with the child that is under way; else begin with the first child whenever
-            the tree is asked, so conditions before it are looked at again, and skills before it
-            are called again.
+        memory: continue with the running child; else begin with the first child at each evaluation,
+            so conditions before it are evaluated again, and skills before it are called again.
 
     Raises:
-        DeclarationError: there are no children, or one is none of these.
+        DeclarationError: it has no children, or a child of a wrong type.
     """
 
     goes_on_after: ClassVar[Status]
-    """The children's status after which the next child's turn comes."""
+    """The status of a child after which the next child is evaluated."""
 
-    def __init__(self, *children: str | Callable[[Array], Any] | Condition | Composite,
-                 memory: bool = True) -> None:  # fmt: skip
+    def __init__(
+        self,
+        *children: str | Callable[[Array], Any] | Condition | Composite,
+        memory: bool = True,
+    ) -> None:
         where = f"tree: {type(self).__name__}"
         if not children:
             raise DeclarationError(f"{where} has no children: give skills' names or conditions")
@@ -95,13 +96,13 @@ class Composite:
 
 
 class Sequence(Composite):
-    """Its children one after another, as long as they succeed.
+    """A node that runs its children one after another, as long as they succeed.
 
     FAILURE as soon as one fails, SUCCESS when all have succeeded. ``children`` and ``memory`` are
     as in ``Composite``.
 
     Raises:
-        DeclarationError: there are no children, or one is none of a name, a condition, a sequence
+        DeclarationError: it has no children, or a child that is not a name, a condition, a sequence
             or a fallback.
     """
 
@@ -109,13 +110,13 @@ class Sequence(Composite):
 
 
 class Fallback(Composite):
-    """Its children one after another, until one succeeds; also called a selector.
+    """A node that runs its children one after another until one succeeds; also called a selector.
 
     SUCCESS as soon as one succeeds, FAILURE when all have failed. ``children`` and ``memory`` are
     as in ``Composite``.
 
     Raises:
-        DeclarationError: there are no children, or one is none of a name, a condition, a sequence
+        DeclarationError: it has no children, or a child that is not a name, a condition, a sequence
             or a fallback.
     """
 

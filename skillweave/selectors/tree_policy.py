@@ -1,4 +1,7 @@
-"""A behaviour tree as a policy over skills: all environments walk through it together."""
+"""A behaviour tree as a policy over skills, evaluated for all environments at once.
+
+Stands alone because ``tree`` is the declaration, which users import.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +25,12 @@ from skillweave.types import Array, Memory, Step
 class TreeSelector(ReadySelector):
     """A behaviour tree as a policy over skills.
 
-    Memory rows: ``leaf`` (the leaf whose call was the last, −1: none), ``succeeded`` (bool, whether
-    that call did), ``child`` (n, C) (of each sequence and fallback, the child under way).
+    Memory rows: ``leaf`` (the leaf of the last call, −1: none), ``succeeded`` (bool, that call
+    succeeded), ``child`` (n, C) (the running child of each sequence and fallback).
 
     Raises:
         DeclarationError: the tree has no skill.
-        SkillError: when it acts: it comes to its end without a skill.
+        SkillError: when it acts: the tree ends without a skill.
     """
 
     kind = "tree"
@@ -43,19 +46,21 @@ class TreeSelector(ReadySelector):
             )
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """A copy that chooses among the skills of these names."""
-        found = super().among(skills)
-        found._plan = _Plan()
-        found._top = found._plan.add(self.root, lambda name: found._number(name, "tree: a leaf"))
-        return found
+        """Return a copy that chooses among the skills of these names."""
+        selector = super().among(skills)
+        selector._plan = _Plan()
+        selector._top = selector._plan.add(
+            self.root, lambda name: selector._number(name, "tree: a leaf")
+        )
+        return selector
 
     @property
     def ranges(self) -> dict[str, range]:
-        """Its leaves, and −1 for none."""
+        """Return the range of its leaves, with −1 for none."""
         return {"leaf": range(-1, len(self._plan.skills))}
 
     def start(self, n: int) -> Memory:
-        """Nothing is under way."""
+        """Return a memory without a running call."""
         return {
             "leaf": np.full(n, -1),
             "succeeded": np.zeros(n, bool),
@@ -71,19 +76,19 @@ class TreeSelector(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The skill of the leaf that each environment's tree comes to, (n,)."""
+        """Return the skill of the leaf that each environment's tree runs, (n,)."""
         n = len(obs)
         mask = np.ones((n, len(self.skills)), bool) if mask is None else mask
         tick = _Tick(obs, mask, memory, self._who)
         status = self._top.tick(tick, np.arange(n))
         again = np.flatnonzero(status != Status.RUNNING)
-        if len(again):  # the whole tree is over: it begins anew
+        if len(again):  # the whole tree is over: it starts again
             tick.begin(again)
             status[again] = self._top.tick(tick, again)
         if (status != Status.RUNNING).any():
             row = int(np.flatnonzero(status != Status.RUNNING)[0])
             raise SkillError(
-                f"{self._who} came to its end ({Status(int(status[row])).name}) in observation "
+                f"{self._who} ended ({Status(int(status[row])).name}) in observation "
                 f"{shown_obs(obs[row])} without a skill that may start there: add a Fallback whose "
                 "last child is a skill that may start everywhere"
             )
@@ -91,10 +96,10 @@ class TreeSelector(ReadySelector):
         return tick.skill, after
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Keep whether the call under way has succeeded.
+        """Store whether the running call has succeeded.
 
-        Where another skill was called than the leaf's, as one may who is only guided, the leaf was
-        not under way: it is asked for again.
+        If a policy that the tree only guides called another skill than the leaf's, the leaf did not
+        run: it is evaluated again.
         """
         over = last.why != CallEnd.RUNNING
         called = np.array(self._plan.skills)[memory["leaf"]] == last.skill
@@ -103,40 +108,40 @@ class TreeSelector(ReadySelector):
         return memory | {"leaf": leaf, "succeeded": succeeded}
 
     def try_out(self) -> None:
-        """Ask every condition once about two made-up observations."""
-        tick = _Tick(made_up(self.observation_space, 2), np.ones((2, 1), bool), self.start(2),
-                     self._who)  # fmt: skip
-        for node in self._plan.asked:
+        """Evaluate every condition once on two example observations."""
+        obs = made_up(self.observation_space, 2)
+        tick = _Tick(obs, np.ones((2, 1), bool), self.start(2), self._who)
+        for node in self._plan.conditions:
             node.tick(tick, np.arange(2))
 
     def source(self) -> dict[str, Any]:
-        """The checksum of its nodes; of functions the names alone are in it."""
-        whole = json.dumps(_told(self.root))
+        """Return the checksum of its nodes, with only the names of functions."""
+        whole = json.dumps(_as_json(self.root))
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
 
-def _told(node: Node) -> Any:
-    """A node as JSON."""
+def _as_json(node: Node) -> Any:
+    """Return a node as JSON."""
     if isinstance(node, str):
         return node
     if isinstance(node, Condition):
         return {"condition": node.name}
-    return {type(node).__name__: [_told(c) for c in node.children], "memory": node.memory}
+    return {type(node).__name__: [_as_json(c) for c in node.children], "memory": node.memory}
 
 
 class _Tick:
-    """One walk of n environments through the tree, at a decision."""
+    """One evaluation of the tree for n environments, at a decision."""
 
     def __init__(self, obs: Array, mask: Array, memory: Memory, who: str) -> None:
         self.obs, self.mask, self.who = obs, mask, who
         self.leaf, self.succeeded = memory["leaf"].copy(), memory["succeeded"]
         self.before = memory["child"].copy()
-        # Zeros: what the walk does not come to is no longer under way.
+        # Zeros: nodes that this evaluation does not reach are no longer running.
         self.after = np.zeros_like(self.before)
         self.skill = np.zeros(len(obs), np.int64)
 
     def begin(self, rows: Array) -> None:
-        """Environments ``rows`` begin at the root: nothing is under way."""
+        """Restart environments ``rows`` at the root, without a running call."""
         self.leaf[rows] = -1
         self.before[rows] = self.after[rows] = 0
 
@@ -147,7 +152,7 @@ class _Leaf:
     skill: int
 
     def tick(self, tick: _Tick, rows: Array) -> Array:
-        """How its call ended, where it was the last; else its call begins."""
+        """Return the end of its call, if that was the last one; else start its call."""
         over = tick.leaf[rows] == self.number
         status = np.where(tick.succeeded[rows], Status.SUCCESS, Status.FAILURE)
         fresh = ~over
@@ -159,11 +164,11 @@ class _Leaf:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Check:
     condition: Condition
 
     def tick(self, tick: _Tick, rows: Array) -> Array:
-        """What the condition says of the observations."""
+        """Return the condition's status for the observations."""
         function, name = self.condition.function, self.condition.name
         holds = answer(function, tick.obs[rows], len(rows), bool, tick.who, name)
         return np.where(holds, Status.SUCCESS, Status.FAILURE)
@@ -174,18 +179,18 @@ class _Several:
     number: int
     memory: bool
     goes_on_after: Status
-    children: tuple[_Several | _Asked | _Leaf, ...]
+    children: tuple[_Several | _Check | _Leaf, ...]
 
     def tick(self, tick: _Tick, rows: Array) -> Array:
-        """The children in turn, until one of them decides."""
+        """Evaluate the children in turn, until one of them decides."""
         status = np.full(len(rows), self.goes_on_after)
         first = tick.before[rows, self.number] if self.memory else np.zeros(len(rows), np.int64)
         for i, child in enumerate(self.children):
-            here = np.flatnonzero((status == self.goes_on_after) & (first <= i))
-            if len(here):
-                status[here] = child.tick(tick, rows[here])
-                under_way = here[status[here] == Status.RUNNING]
-                tick.after[rows[under_way], self.number] = i
+            reached = np.flatnonzero((status == self.goes_on_after) & (first <= i))
+            if len(reached):
+                status[reached] = child.tick(tick, rows[reached])
+                running = reached[status[reached] == Status.RUNNING]
+                tick.after[rows[running], self.number] = i
         return status
 
 
@@ -195,13 +200,13 @@ class _Plan:
 
     skills: list[int] = field(default_factory=list)  # of each leaf
     composites: int = 0
-    asked: list[_Asked] = field(default_factory=list)
+    conditions: list[_Check] = field(default_factory=list)
 
     def add(self, node: Node, number_of: Callable[[str], int]) -> Any:
-        """A node with all below it."""
+        """Return a node with all below it."""
         if isinstance(node, Condition):
-            self.asked.append(_Asked(node))
-            return self.asked[-1]
+            self.conditions.append(_Check(node))
+            return self.conditions[-1]
         if isinstance(node, str):
             self.skills.append(number_of(node))
             return _Leaf(len(self.skills) - 1, self.skills[-1])

@@ -1,4 +1,4 @@
-"""Skills and reflexes: what a user declares."""
+"""Skills and reflexes, which users declare."""
 
 from skillweave.skills.answers import checked
 from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, path_of

@@ -1,4 +1,4 @@
-"""What the user's functions say of steps and observations, checked."""
+"""Checked results of the user's functions of steps and observations."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def answer(
     elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
-    """What a function of the user's returns, ``checked``.
+    """Call a function of the user and return its ``checked`` result.
 
     Raises:
-        SkillError: the function failed, or returned something else than was asked for.
+        SkillError: the function failed, or returned a result of a wrong shape or type.
     """
     if isinstance(about, np.ndarray):
         about = read_only(about)
@@ -50,14 +50,14 @@ def checked(
     elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
-    """``value`` as an array (n,) of ``dtype``.
+    """Convert ``value`` to an array (n,) of ``dtype``.
 
     Args:
-        elapsed: at which steps, (n,) or (), for messages.
-        ids: in which environments, (n,), for messages; None: in all n.
+        elapsed: steps of the rows, (n,) or (), for messages.
+        ids: environments of the rows, (n,), for messages; None: all n.
 
     Raises:
-        SkillError: it has another shape or kind, or is a NaN or an infinity; the message
+        SkillError: the value has another shape or type, or a NaN or an infinity; the message
             names the skill, the method and the step.
     """
     if value is None:
@@ -97,24 +97,24 @@ def checked(
 
 
 def _number(row: int, ids: Array | None) -> int:
-    """The environment that a row is of."""
+    """Return the environment of a row."""
     return row if ids is None else int(ids[row])
 
 
 def _flags(array: Array, what: str, when: str, ids: Array | None) -> Array:
-    """Numbers that are all 0 or 1, as bool."""
+    """Convert numbers that are all 0 or 1 to bool."""
     if array.dtype.kind not in "fiu":
-        raise SkillError(f"{what} returned {_kind(array)}{when}, but yes or no (bool) is asked")
+        raise SkillError(f"{what} returned {_kind(array)}{when}, but yes or no (bool) is needed")
     wrong = np.flatnonzero((array != 0) & (array != 1))
     if len(wrong):
         row = int(wrong[0])
         raise SkillError(
             f"{what} returned {array[row]}{when} for environment {_number(row, ids)}, but yes or "
-            "no (bool) is asked: compare with something"
+            "no (bool) is needed: return a comparison"
         )
     return array.astype(bool)
 
 
 def _kind(array: Array) -> str:
-    first = array.reshape(-1)[:1].tolist()  # as Python's own values, which read better
+    first = array.reshape(-1)[:1].tolist()  # Python's numbers, which are easier to read
     return f"{array.dtype} ({short(first[0])})" if first else str(array.dtype)

@@ -1,4 +1,4 @@
-"""What a user declares: skills and reflexes."""
+"""The classes that a user declares: skills and reflexes."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from skillweave.types import Array, Step
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_\-]{0,63}")
 DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
-"""What a skill may be named: its name names files, too."""
+"""Valid names of skills, which are also names of files."""
 
 
 _OF_TRAINING = ("steps", "task_weight", "target_return", "target_success")
 
 
 class Skill:
-    """An option: where it may start, what it maximises, when it stops.
+    """An option: an initiation set, a reward to maximise, and a termination condition.
 
     Sutton, Precup & Singh 1999, "Between MDPs and semi-MDPs".
 
@@ -44,22 +44,22 @@ class Skill:
 
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.
-        max_steps: the skill stops after so many steps; None: only by ``termination``.
-        call_steps: its calls last at most so long, wherever it is trained; None: the hierarchy's.
+        max_steps: the most steps until the skill stops; None: it stops only by ``termination``.
+        call_steps: the most steps of a call, wherever it is trained; None: the hierarchy's.
         steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
         task_weight: weight of the task's advantage beside its own reward where skills learn
-            together; None: ``Together.task_weight`` (1). 0: it follows its own reward alone, as a
-            skill should that other hierarchies will use.
-        algorithm: settings of the algorithm that trains it (its network is among them);
-            None: the hierarchy's.
-        target_return: its training ends early at this mean return of the periodic evaluation (the
-            hierarchy's ``eval_every``); None: it takes all its steps.
+            together; None: ``Together.task_weight`` (1). 0: only its own reward counts, as it
+            should in a skill for other hierarchies.
+        algorithm: settings of the algorithm that trains it, its network included; None: the
+            hierarchy's.
+        target_return: mean return of the periodic evaluation (the hierarchy's ``eval_every``) at
+            which its training ends early; None: it uses all its steps.
         target_success: the same for the share of successful episodes, from 0 to 1.
-        policy: what acts without being trained: a function of observations (n, *obs_shape), which
-            needs no ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
+        policy: acts without training: a function of observations (n, *obs_shape), which needs no
+            ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
             ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
-            environment tells an action mask, networks that return logits keep to it; what others
-            return goes to the environment as it is.
+            environment has an action mask, networks that return logits respect it; actions of
+            others go to the environment unchanged.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 
@@ -88,11 +88,11 @@ class Skill:
             cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower().strip("_")
 
     def __repr__(self) -> str:
-        own = [*own_methods(self), *(f"{k}={short(v, 60)}" for k, v in _own_fields(self))]
-        return f"<Skill {self.name!r}: {', '.join(own) or 'all defaults'}>"
+        parts = [*own_methods(self), *(f"{k}={short(v, 60)}" for k, v in _own_fields(self))]
+        return f"<Skill {self.name!r}: {', '.join(parts) or 'all defaults'}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of what it declares, for notebooks."""
+        """Return a table of the declaration, for notebooks."""
         rows = [
             ("skill", path_of(self)),
             ("about", about(self)),
@@ -102,30 +102,30 @@ class Skill:
         return joined([facts((k, v) for k, v in rows if v)])
 
     def reward(self, step: Step) -> Array:
-        """What it maximises in a ``step``, (N,). The default is the environment's own reward."""
+        """Return the reward of a ``step``, (N,). Default: the environment's reward."""
         return step.reward
 
     def initiation(self, obs: Array) -> Array:
-        """Where it may start: ``obs`` (N, *obs_shape) to (N,) bool. The default is everywhere."""
+        """Return where it may start: ``obs`` (N, *obs_shape) to (N,) bool. Default: everywhere."""
         return np.ones(len(obs), bool)
 
     def termination(self, step: Step) -> Array:
-        """Where it stops, after a ``step``: (N,) bool; its value ends there. Default: nowhere."""
+        """Return where it stops after a ``step``, (N,) bool; its value ends. Default: nowhere."""
         return np.zeros(len(step.reward), bool)
 
     def success(self, step: Step) -> Array:
-        """What counts as having succeeded, (N,) bool, by the last ``step`` before it stops.
+        """Return where it has succeeded, (N,) bool, by the last ``step`` before it stops.
 
-        Default: none in evaluations; to automata and trees, that ``termination`` stopped it.
+        Default: nowhere in evaluations; for automata and trees, where ``termination`` stopped it.
         """
         return np.zeros(len(step.reward), bool)
 
     def defines(self, method: str) -> bool:
-        """Whether the subclass gives its own version of ``method``."""
+        """Return whether the subclass overrides ``method``."""
         return getattr(type(self), method) is not getattr(Skill, method)
 
     def validate(self) -> None:
-        """Raise a DeclarationError that names what is wrong with the declaration."""
+        """Raise a DeclarationError that names an error in the declaration."""
         where = f"skill {short(self.name)} ({type(self).__name__})"
         if not isinstance(self.name, str):
             raise DeclarationError(f"{where}: the name must be text")
@@ -143,10 +143,10 @@ class Skill:
         kinds = annotations_of(Skill)
         for field in ("max_steps", "call_steps", *_OF_TRAINING):
             value = getattr(self, field)
-            found = fitted(kinds[field], value, f"{where}: {field}")
-            if found is not value and (self.policy is None or field not in _OF_TRAINING):
+            converted = fitted(kinds[field], value, f"{where}: {field}")
+            if converted is not value and (self.policy is None or field not in _OF_TRAINING):
                 with suppress(AttributeError):  # of a property
-                    setattr(self, field, found)
+                    setattr(self, field, converted)
         if self.color is not None and not _is_color(self.color):
             raise DeclarationError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
@@ -155,7 +155,7 @@ class Skill:
         known = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
         for name, meant in misspelt(self, Skill, known):
             warnings.warn(
-                f"{where} has {name!r}, which Skillweave does not know: is {meant!r} meant?",
+                f"{where} has {name!r}, which is no attribute of a skill: is {meant!r} meant?",
                 stacklevel=2,
             )
         for method in self.methods:
@@ -166,7 +166,7 @@ class Skill:
 
 
 def _is_color(value: object) -> bool:
-    """Whether a value is red, green and blue, each from 0 to 255."""
+    """Return whether a value is red, green and blue, each from 0 to 255."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if not isinstance(value, tuple | list) or len(value) != 3:
@@ -175,18 +175,18 @@ def _is_color(value: object) -> bool:
 
 
 def about(skill: Skill) -> str:
-    """Return the first line of the docstring of a skill's class; "" where it has none."""
+    """Return the first line of the docstring of a skill's class; "" if it has none."""
     lines = (type(skill).__dict__.get("__doc__") or "").strip().splitlines()
     return lines[0] if lines else ""
 
 
 def own_methods(skill: Skill) -> list[str]:
-    """Return the methods of which a skill has its own version."""
+    """Return the methods that a skill overrides."""
     return [method for method in skill.methods if skill.defines(method)]
 
 
 def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
-    """Yield the settings of a skill that differ from the defaults, but for its name."""
+    """Yield the settings of a skill that differ from the defaults, except its name."""
     for field in Skill.__annotations__:
         value = getattr(skill, field)
         if field not in ("name", "methods", "_path") and value is not getattr(Skill, field):
@@ -194,12 +194,12 @@ def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
 
 
 def path_of(skill: Skill) -> str:
-    """What messages call a skill: its name, after those of the hierarchies that it is in."""
+    """Return a skill's name in messages, after the names of the hierarchies that it is in."""
     return skill._path or skill.name
 
 
 class RecordedSkill(Skill):
-    """A skill of a run that was loaded without its code: its reward and success are not known."""
+    """A skill of a run that was loaded without its code, so without reward and success."""
 
 
 @checked_names
@@ -213,7 +213,7 @@ class Reflex:
         name: used in messages and captions; default: the condition's name.
 
     Raises:
-        DeclarationError: the condition is no function, or the name no text.
+        DeclarationError: the condition is not a function, or the name not a text.
     """
 
     def __init__(
@@ -229,15 +229,15 @@ class Reflex:
         self.name = name or getattr(condition, "__name__", "reflex")
 
     def check(self, space: Space[Any]) -> None:
-        """Raise a DeclarationError where a fixed action is none of ``space``."""
+        """Raise a DeclarationError where a fixed action is not in ``space``."""
         if not callable(self.action):
             self._actions(np.empty((1, 0)), space)
 
     def apply(self, obs: Array, action: Array, space: Space[Any]) -> tuple[Array, Array]:
-        """Each ``action`` (N, ...) in ``space`` with this reflex; (N,) bool: where ``obs`` asks it.
+        """Return actions (N, ...) of ``space`` with this reflex; (N,) bool: where it acted.
 
         Raises:
-            SkillError: what it answers is not what was asked for; the message names it.
+            SkillError: its condition or action has a wrong result; the message names it.
         """
         holds = self.holds(obs)
         if holds.any():
@@ -249,40 +249,40 @@ class Reflex:
         """Evaluate its condition: ``obs`` (N, *obs_shape) to (N,) bool.
 
         Raises:
-            SkillError: the condition returned something else; the message names it.
+            SkillError: the condition returned a wrong result; the message names it.
         """
-        return answer(self.condition, obs, len(obs), bool, self._who, "condition")
+        return answer(self.condition, obs, len(obs), bool, self._label, "condition")
 
     def fixed(self, space: Space[Any]) -> Array:
-        """Its action, where that is no function, as one of ``space``; (...)."""
-        who, shape = f"{self._who}: action", space.shape or ()
-        one = as_array(self.action, who, DeclarationError)
+        """Return a fixed action as an element of ``space``, (...)."""
+        label, shape = f"{self._label}: action", space.shape or ()
+        value = as_array(self.action, label, DeclarationError)
         # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
-        value = np.full(shape, one) if one.shape == () else one
-        found: Array = checked_actions(value[None], 1, space, who, DeclarationError)[0]
-        return found
+        row = np.full(shape, value) if value.shape == () else value
+        action: Array = checked_actions(row[None], 1, space, label, DeclarationError)[0]
+        return action
 
     @property
-    def _who(self) -> str:
+    def _label(self) -> str:
         return f"reflex {self.name!r}"
 
     def _actions(self, obs: Array, space: Space[Any]) -> Array:
-        """Its actions for observations (n, ...)."""
-        n, who = len(obs), f"{self._who}: action"
+        """Return its actions for observations (n, ...)."""
+        n, label = len(obs), f"{self._label}: action()"
         if not callable(self.action):
             return np.repeat(self.fixed(space)[None], n, axis=0)
-        answered = called(self.action, obs, f"{who}()")
-        actions = checked_actions(answered, n, space, f"{who}()", SkillError)
-        probe(self.action, obs, n, f"{who}()", space.shape or ())
+        result = called(self.action, obs, label)
+        actions = checked_actions(result, n, space, label, SkillError)
+        probe(self.action, obs, n, label, space.shape or ())
         return actions
 
 
 def apply_reflexes(
     reflexes: tuple[Reflex, ...], obs: Array, action: Array, space: Space[Any]
 ) -> tuple[Array, Array]:
-    """The actions with every reflex in force, and (n,) bool: where one of them acted.
+    """Apply all reflexes to actions; return them, and (n,) bool: where a reflex acted.
 
-    Where several hold, the last one counts.
+    If several conditions hold, the last reflex acts.
     """
     overridden = np.zeros(len(obs), bool)
     for reflex in reflexes:
@@ -299,10 +299,10 @@ def asked(
     elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
-    """What a method of a skill says about a step or observations: (n,) float32 or bool.
+    """Call a method of a skill with a step or observations; return (n,) float32 or bool.
 
     Raises:
-        SkillError: as of ``answer``.
+        SkillError: see ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
     who = f"skill {path_of(skill)!r}"

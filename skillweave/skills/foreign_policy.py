@@ -1,4 +1,4 @@
-"""Policies made elsewhere: how they are fitted to an environment and recorded in a run."""
+"""Policies made elsewhere: their fit to an environment and their record in a run."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from skillweave.types import Array, Memory, Memoryless, Policy
 
 
 class Foreign(Memoryless):
-    """A policy made elsewhere; its spaces may stay open until ``bind`` gives it an environment's.
+    """A policy made elsewhere; its spaces may be unknown until ``bind``.
 
     A run records its ``source``. If it has ``content``, the run keeps a copy, and the copy acts
-    when the run is loaded. Without content, it must still have the same checksum then.
+    when the run is loaded. Without content, its checksum must not have changed then.
     """
 
     kind: str
@@ -35,10 +35,7 @@ class Foreign(Memoryless):
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy on ``observation_space`` and ``action_space``, where it has none of its own.
-
-        Messages begin with ``who``.
-        """
+        """Return a copy with these spaces where its own are unknown; ``who`` begins messages."""
         bound = copy.copy(self)
         bound._who = f"{who}: {self.name}"
         if self._open[0]:
@@ -56,7 +53,7 @@ class Foreign(Memoryless):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Actions for a batch of observations."""
+        """Return actions for a batch of observations."""
         raise NotImplementedError
 
     def must_be_bound(self) -> None:
@@ -65,24 +62,24 @@ class Foreign(Memoryless):
             raise PolicyError(f"{self._who} has no spaces yet: bind() it to an environment's")
 
     def source(self) -> dict[str, Any]:
-        """Where it comes from, as JSON for ``run.json``: at least its kind."""
+        """Return its source as JSON for ``run.json``: at least its kind."""
         content = self.content()
         sha256 = {} if content is None else {"sha256": checksum(content)}
         return {"kind": self.kind, "name": self.name, **sha256}
 
     def content(self) -> bytes | None:
-        """The bytes that a run keeps a copy of; None: the run only names it."""
+        """Return the bytes that a run copies; None: the run only names the policy."""
         return None
 
     def restored(self, content: bytes) -> Self:
-        """This policy with the ``content`` from a run."""
+        """Return this policy with the ``content`` from a run."""
         raise NotImplementedError
 
     def try_out(self) -> None:
-        """Act once on two made-up observations, so that errors are found before training.
+        """Act once on two example observations, to find errors before training.
 
         Raises:
-            PolicyError: it failed; the message names who, and the space.
+            PolicyError: it failed; the message names the policy and the space.
         """
         try:
             self.act(self.start(2), made_up(self.observation_space, 2))
@@ -98,7 +95,7 @@ class Foreign(Memoryless):
 def fitted(
     policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
 ) -> Policy:
-    """The policy, ready to act on the spaces of the environment named ``env``.
+    """Return the policy, ready to act on the spaces of the environment named ``env``.
 
     Raises:
         PolicyError: it does not fit; the message names ``who`` and both spaces.
@@ -121,24 +118,24 @@ def fitted(
 
 
 class Source(TypedDict):
-    """Where a ready policy comes from, as JSON."""
+    """The source of a ready policy, as JSON."""
 
     kind: str
     name: NotRequired[str]
     file: NotRequired[str]
     sha256: NotRequired[str]
-    """Of what it acts by, where there is a way to tell."""
+    """Checksum of its content, if it can be computed."""
 
 
 def source_of(policy: Policy) -> dict[str, Any]:
-    """Where a ready policy comes from, as JSON; see ``Source``.
+    """Return the source of a ready policy as JSON; see ``Source``.
 
-    A policy may have a method ``source`` that says so, with a checksum of all that it acts by;
-    of others the class is named.
+    A policy may have a method ``source`` that returns it, with a checksum; for others it is the
+    name of the class.
     """
-    own = getattr(policy, "source", None)
-    found: dict[str, Any] = own() if callable(own) else {}
-    return {"kind": "policy", "name": qualified(type(policy))} | found
+    method = getattr(policy, "source", None)
+    source: dict[str, Any] = method() if callable(method) else {}
+    return {"kind": "policy", "name": qualified(type(policy))} | source
 
 
 def as_recorded(
@@ -147,13 +144,13 @@ def as_recorded(
     read: Callable[[], bytes | None],
     where: str,
 ) -> Policy:
-    """The policy as it was when ``recorded`` was its source; ``read`` gets the copy kept then.
+    """Return the policy at the time when ``recorded`` was its source; ``read`` reads the copy.
 
     Raises:
-        RunError: it is of another kind, or another file that was only named; or the copy is
-            damaged, or fits no longer.
+        RunError: the policy has another kind, or another checksum without a copy; or the copy is
+            damaged, or does not fit.
     """
-    if recorded is None:  # written before sources were
+    if recorded is None:  # an old run, without sources
         return policy
     now = source_of(policy)
     if now["kind"] != recorded["kind"]:
@@ -166,7 +163,7 @@ def as_recorded(
     if content is None or not isinstance(policy, Foreign):
         raise RunError(
             f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
-            "another checksum. Put back what it was trained with, or train anew"
+            "another checksum. Restore the policy that it was trained with, or train again"
         )
     if checksum(content) != recorded.get("sha256"):
         raise RunError(f"{where}: the copy of its policy is damaged: another checksum")
@@ -174,12 +171,12 @@ def as_recorded(
 
 
 def checksum(content: bytes) -> str:
-    """SHA-256, as hexadecimal digits."""
+    """Compute the SHA-256 as hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 
 
 def qualified(thing: Any) -> str:
-    """``module.qualname`` of a function or a class, or of an object's class."""
+    """Return ``module.qualname`` of a function or a class, or of an object's class."""
     if not hasattr(thing, "__qualname__"):
         thing = type(thing)
     return f"{thing.__module__}.{thing.__qualname__}"
@@ -191,7 +188,7 @@ def _described(source: dict[str, Any]) -> str:
 
 
 def made_up(space: Space[Any], n: int) -> Array:
-    """n members of a space as one batch."""
+    """Draw n elements of a space as one batch."""
     from skillweave.spaces import pack
 
     batch = batch_space(space, n)
@@ -200,7 +197,7 @@ def made_up(space: Space[Any], n: int) -> Array:
 
 
 def _tamed(space: Space[Any], sample: Any) -> Any:
-    """Without huge numbers: a space's bounds may be the largest floats there are."""
+    """Clip huge numbers: a space's bounds may be the largest floats."""
     if isinstance(space, Dict):
         return {name: _tamed(part, sample[name]) for name, part in space.spaces.items()}
     if isinstance(space, Tuple):

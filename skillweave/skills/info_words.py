@@ -1,4 +1,4 @@
-"""Words on a batched info, for errors of code that reads infos."""
+"""Parts of messages on a batched info, for errors in code that reads infos."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(key for key in texts if not (key.startswith("_") and key[1:] in info))
 
 
-def keys_told(info: Mapping[str, Any]) -> str:
-    """Words on a key that no environment gives."""
+def missing_key(info: Mapping[str, Any]) -> str:
+    """Return a clause on a key that no environment sets."""
     return (
-        f"no environment gave this key of info in this step (they gave {keys_of(info)}): let the "
-        "environment give it in each step"
+        f"no environment set this key of info in this step (the keys are: {keys_of(info)}): let "
+        "the environment set it in each step"
     )
 
 
 def keys_of(info: Mapping[str, Any]) -> str:
-    """The keys of a batched info, in words."""
+    """Return the keys of a batched info, in words."""
     return ", ".join(short(key) for key in info_keys(info)) or "nothing"
 
 
 def odd_key(function: Any, info: Mapping[str, Any], ids: Array | None = None) -> str:
-    """Words on a key, read by a function, under which not all environments give a number.
+    """Return a clause on a key that a function reads and that is not a number everywhere.
 
     Args:
-        function: the user's; a key is taken to be read if it is among its constants.
+        function: the user's function; it reads a key if the key is among its constants.
         ids: (n,) the environments; None: all n.
 
     Returns:
-        An empty string where there is no such key.
+        An empty string if all its keys are numbers.
     """
     code = getattr(getattr(function, "__func__", function), "__code__", None)
     for key in getattr(code, "co_consts", ()):
@@ -54,12 +54,12 @@ def odd_key(function: Any, info: Mapping[str, Any], ids: Array | None = None) ->
             continue
         rows = [number.index(True)] if any(number) else []
         rows.append(number.index(False))
-        told = (
+        values = (
             f"{short(column[row])} of environment {row if ids is None else int(ids[row])}"
             for row in rows
         )
         return (
-            f"info[{key!r}] is {', but '.join(told)}: let the environment give a number there in "
+            f"info[{key!r}] is {', but '.join(values)}: let the environment set a number there in "
             "each step"
         )
     return ""

@@ -24,7 +24,7 @@ NUMBERS = {
     "tensor(int32)": np.int32,
     "tensor(uint8)": np.uint8,
 }
-"""ONNX's names of the numbers that an input may take."""
+"""Supported types of an input, by ONNX's names."""
 
 
 class OnnxPolicy(Foreign):
@@ -70,7 +70,7 @@ class OnnxPolicy(Foreign):
         self._input = self._session.get_inputs()[0]
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy for these spaces.
+        """Return a copy for these spaces.
 
         Raises:
             PolicyError: its input has another shape; the message names both.
@@ -97,7 +97,7 @@ class OnnxPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The model's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        """Return the model's actions; logits are sampled with ``rng`` if not ``deterministic``."""
         self.must_be_bound()
         rows = np.ascontiguousarray(obs, NUMBERS[self._input.type])
         if self._input.shape[0] == 1 and len(rows) != 1:
@@ -105,28 +105,33 @@ class OnnxPolicy(Foreign):
         else:
             output = self._run(rows)
         action = decoded(
-            output, len(obs), self.action_space, self._who,
-            mask=mask, deterministic=deterministic, rng=rng,
-        )  # fmt: skip
+            output,
+            len(obs),
+            self.action_space,
+            self._who,
+            mask=mask,
+            deterministic=deterministic,
+            rng=rng,
+        )
         return action, memory
 
     def _run(self, rows: Array) -> Array:
         return np.asarray(self._session.run([self.output], {self._input.name: rows})[0])
 
     def source(self) -> dict[str, Any]:
-        """The file, and the checksum of the copy that the run keeps."""
+        """Return the file, and the checksum of the copy that the run keeps."""
         return {"kind": self.kind, "file": str(self.file), "sha256": checksum(self.data)}
 
     def content(self) -> bytes:
-        """The whole model."""
+        """Return the whole model."""
         return self.data
 
     def restored(self, content: bytes) -> Self:
-        """A policy with the same spaces and this model."""
+        """Return a policy with the same spaces and this model."""
         spaces = self.observation_space, self.action_space
-        found = type(self)(content, self.file, self.output, *spaces)
-        found._who = self._who
-        return found
+        policy = type(self)(content, self.file, self.output, *spaces)
+        policy._who = self._who
+        return policy
 
 
 @checked_names
@@ -137,23 +142,23 @@ def from_onnx(
     observation_space: Any = None,
     action_space: Any = None,
 ) -> OnnxPolicy:
-    """An ONNX file as a skill's policy; the run keeps a copy of it.
+    """Return an ONNX file as a skill's policy; the run keeps a copy of it.
 
     It takes a batch of observations, of any size or of one. Whole numbers that it returns are
     actions; other numbers are logits for Discrete and MultiDiscrete, actions for Box.
 
     Args:
-        path: the file; weights that lie in a second file beside it are taken too.
-        output: which of its outputs; None: the first.
-        observation_space: None: that of the environment it meets.
-        action_space: None: that of the environment it meets.
+        path: the file; weights in a second file beside it are read, too.
+        output: the name of the output to use; None: the first.
+        observation_space: None: the environment's.
+        action_space: None: the environment's.
 
     Returns:
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        RunError: there is no such file.
-        PolicyError: it is no model of one batch of observations.
+        RunError: the file does not exist.
+        PolicyError: it is not a model of one batch of observations.
         MissingExtra: the extra 'onnx' is not installed.
     """
     try:
@@ -172,21 +177,24 @@ def from_onnx(
             raise PolicyError(f"{path}: its weights {tensor.name[:60]!r} hold NaN")
     return OnnxPolicy(
         model.SerializeToString(deterministic=True),
-        Path(path), output, observation_space, action_space,
-    )  # fmt: skip
+        Path(path),
+        output,
+        observation_space,
+        action_space,
+    )
 
 
 def _numbers(tensor: Any, path: str | Path) -> Array:
-    """A weight as an array; of what is no real number, nothing."""
+    """Return a weight as an array; empty if it does not hold real numbers."""
     from onnx import numpy_helper
 
     try:
-        found = numpy_helper.to_array(tensor)
+        array = numpy_helper.to_array(tensor)
     except Exception as error:
         raise PolicyError(
             f"{path}: its weights {tensor.name[:60]!r} are damaged: {str(error)[:300]}"
         ) from error
-    return found if np.issubdtype(found.dtype, np.floating) else np.zeros(0)
+    return array if np.issubdtype(array.dtype, np.floating) else np.zeros(0)
 
 
 def _session(data: bytes, file: Path) -> Any:
@@ -200,5 +208,5 @@ def _session(data: bytes, file: Path) -> Any:
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's own errors have no common class
-        told = shortened(str(error))
-        raise PolicyError(f"{file} cannot be run by onnxruntime: {told}") from error
+        reason = shortened(str(error))
+        raise PolicyError(f"{file} cannot be run by onnxruntime: {reason}") from error

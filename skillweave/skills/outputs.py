@@ -1,4 +1,4 @@
-"""Checks what functions and policies of the user return, and reads logits as actions."""
+"""Checks of results of the user's functions and policies, and decoding of logits to actions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import short, told
-from skillweave.skills.info_words import keys_told, odd_key
+from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.tracebacks import is_users
 from skillweave.types import Array, Step
 
@@ -30,13 +30,13 @@ def called(
     Args:
         function: takes one argument.
         argument: a step, or observations.
-        who: names the function in messages.
+        who: the function's name in messages.
         elapsed: the step of the episode, if known.
-        ids: the environments that the rows stand for.
-        kind: of the error: a PolicyError where the function is a policy.
+        ids: the environments of the rows.
+        kind: the type of the error: PolicyError if the function is a policy.
 
     Raises:
-        SkillError: it raised; the message names ``who``, the line, and the step if known.
+        SkillError: the function raised; the message names ``who``, the line, and the step if known.
     """
     try:
         return function(argument)
@@ -50,12 +50,12 @@ def called(
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
-    """What to write instead, for the mistakes that are made most; else nothing."""
+    """Return advice for common mistakes; else an empty string."""
     text, step = str(error), isinstance(argument, Step)
     name = getattr(error, "name", None) if isinstance(error, AttributeError) else None
     key = error.args[0] if isinstance(error, KeyError) and error.args else None
     if step and isinstance(key, str) and key not in argument.info:
-        return f"; {keys_told(argument.info)}"
+        return f"; {missing_key(argument.info)}"
     if (
         step
         and isinstance(error, TypeError | ValueError)
@@ -63,26 +63,26 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
     ):
         return f"; {odd}"
     if "read-only" in text:
-        return "; what it is given cannot be changed: change a copy"
+        return "; its argument is read-only: change a copy"
     if "truth value of an array" in text:
-        return "; combine arrays by & and |, with each side in parentheses, and use np.where for if"
+        return "; combine arrays by & and |, with each side in parentheses; use np.where for if"
     if "positional argument" in text and "given" in text and _not_entered(error):
         what = "(self, step)" if step else "(self, obs)"
-        return f"; a method of a skill takes {what}, another function the last of these alone"
+        return f"; a method of a skill takes {what}, another function only the last of these"
     if step and ("not subscriptable" in text or name in dir(np.ndarray)):
-        return "; it is given a Step: write step.next_obs[:, 0]"
+        return "; its argument is a Step: write step.next_obs[:, 0]"
     if step and name is not None and getattr(error, "obj", None) is argument:
         known = [f.name for f in fields(Step)]
         return meant(name, known, "a Step has").replace(": is", "; is")
     if isinstance(argument, np.ndarray) and name in Step.__slots__:
-        return "; it is given observations, not a Step: write obs[:, 0]"
+        return "; its argument is observations, not a Step: write obs[:, 0]"
     if isinstance(error, IndexError) and step:
         return f"; step.next_obs has the shape {argument.next_obs.shape}"
     return ""
 
 
 def _not_entered(error: BaseException) -> bool:
-    """Whether a function was called wrongly, and none of its lines ran."""
+    """Return whether a function was called with wrong arguments, so none of its lines ran."""
     frames = error.__traceback__
     return frames is not None and frames.tb_next is None
 
@@ -90,7 +90,7 @@ def _not_entered(error: BaseException) -> bool:
 def blame(error: BaseException, who: str) -> NoReturn:
     """Raise a PolicyError that names ``who`` where the user's code raised ``error``.
 
-    Otherwise raise ``error`` itself: its traceback shows what is wrong in this library.
+    Otherwise raise ``error`` itself: its traceback shows a bug of this library.
     """
     if isinstance(error, SkillweaveError) or not is_users(error):
         raise error
@@ -98,7 +98,7 @@ def blame(error: BaseException, who: str) -> NoReturn:
 
 
 def at_step(elapsed: Any) -> str:
-    """The step, for messages; an empty string if ``elapsed`` is None."""
+    """Return the step, for messages; an empty string if ``elapsed`` is None."""
     return "" if elapsed is None else f" at step {np.max(elapsed)}"
 
 
@@ -106,8 +106,8 @@ def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> 
     """Return ``value`` as an array.
 
     Raises:
-        SkillError: it cannot be converted; the message names ``who``. It is of another ``kind``
-            where that is given.
+        SkillError: it cannot be converted; the message names ``who``. ``kind`` is the type of the
+            error.
     """
     try:
         return np.asarray(value)
@@ -118,11 +118,11 @@ def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> 
 def checked_actions(
     value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError] = PolicyError
 ) -> Array:
-    """``value`` as actions (n, *shape) of ``space``; those of a Box are clipped to its bounds.
+    """Convert ``value`` to actions (n, *shape) of ``space``, clipped to the bounds of a Box.
 
     Raises:
-        PolicyError: the shape or the type of number is wrong, or there is no such action; the
-            message names ``who`` and the space. It is of another ``kind`` where that is given.
+        PolicyError: the shape or the type of number is wrong, or an action does not exist; the
+            message names ``who`` and the space. ``kind`` is the type of the error.
     """
     action, shape = as_array(value, who, kind), (n, *(space.shape or ()))
     if action.shape != shape:
@@ -155,7 +155,7 @@ def decoded(
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
 ) -> Array:
-    """A network's output as actions.
+    """Convert a network's output to actions.
 
     Integers are actions, and for a Box all numbers are. Other numbers are logits: (n, A) for
     Discrete(A), concatenated (n, ΣA) for MultiDiscrete, one per bit for MultiBinary. If
@@ -205,7 +205,7 @@ def _width(space: Space[Any]) -> int:
 
 
 def _bounds(space: Space[Any]) -> tuple[Any, Any] | None:
-    """The first action and the one after the last; None for a Box."""
+    """Return the first action and the one after the last; None for a Box."""
     if isinstance(space, Discrete):
         return space.start, space.start + space.n
     if isinstance(space, MultiDiscrete):

@@ -1,10 +1,9 @@
-"""A test of each user's function with other numbers of environments, the first time it is called.
+"""A test of each user's function with other numbers of environments, at its first call.
 
-A function that forgets the axis of the environments may return the right shape by chance:
-``step.next_obs[0]`` has four numbers for four environments of CartPole. So the rows of its first
-call are put together to 3 environments, and to more than there are, and it is called with these.
-Only what really occurred is in them. Random streams of Python, NumPy and torch, and of the object
-that a method belongs to, are afterwards as they were.
+A function that ignores the axis of the environments may return the right shape by chance:
+``step.next_obs[0]`` has four numbers for four environments of CartPole. So the function is also
+called with rows of its first call, repeated or cut to 3 and to more environments. Afterwards, the
+random streams of Python, NumPy, torch and the method's object are restored.
 """
 
 from __future__ import annotations
@@ -27,15 +26,21 @@ from skillweave.messages import told
 from skillweave.types import Array, Step, read_only
 
 MOST = 256
-"""Up to so many environments, a function is also called with more than there are."""
+"""The most environments at which a function is also called with more of them."""
 AXIS = (
     "the first axis of every array is that of the environments: step.next_obs[:, 0], obs[:, 0], "
     "axis=1"
 )
-"""What messages say to do."""
+"""Advice in messages."""
 CHANGING = (
-    dict, list, set, np.ndarray, random.Random, np.random.Generator, np.random.RandomState,
-)  # fmt: skip
+    dict,
+    list,
+    set,
+    np.ndarray,
+    random.Random,
+    np.random.Generator,
+    np.random.RandomState,
+)
 """Kinds of attributes that a method may change in place."""
 
 
@@ -46,7 +51,7 @@ class _Seen:
         self._names: dict[int, tuple[weakref.ref[Any], set[str]]] = {}
 
     def first_time(self, owner: Any, name: str) -> bool:
-        """Whether this is the first call with these arguments."""
+        """Return whether this is the first call with these arguments."""
         key = id(owner)
         if (entry := self._names.get(key)) is not None:
             if name in entry[1]:
@@ -72,18 +77,18 @@ def probe(
     shape: tuple[int, ...] = (),
     kind: type[SkillweaveError] = SkillError,
 ) -> None:
-    """Call a function, if it is its first time, for other numbers of environments than n.
+    """Call a function for other numbers of environments than n, at its first call.
 
     Args:
         function: the user's, which has just returned the right shape for n environments.
         given: its argument, or arguments: a step, or arrays whose first axis has n rows.
         n: environments.
-        who: what messages call the function.
-        shape: of its answer for one environment.
-        kind: of the error: a PolicyError where the function is a policy.
+        who: the function's name in messages.
+        shape: the shape of its result for one environment.
+        kind: the type of the error: PolicyError if the function is a policy.
 
     Raises:
-        SkillError: its answer does not have a row for each environment; the message names it.
+        SkillError: its result does not have a row for each environment; the message names it.
     """
     owner = getattr(function, "__self__", function)
     if not n or not _seen.first_time(owner, getattr(function, "__name__", "")):
@@ -104,16 +109,16 @@ def probe(
                     f"{who} answers for {n} environments, but for {m} it raised {told(error)}: "
                     f"{AXIS}"
                 ) from error
-            found, wanted = np.shape(answer), (m, *shape)
-            if found != wanted and certain:
+            actual, wanted = np.shape(answer), (m, *shape)
+            if actual != wanted and certain:
                 raise kind(
-                    f"{who} returned shape {found} for {m} environments, but {wanted} was "
+                    f"{who} returned shape {actual} for {m} environments, but {wanted} was "
                     f"expected; for {n} its shape was right by chance: {AXIS}"
                 )
 
 
 def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
-    """Numbers of environments that differ from n and from the sizes of all other axes."""
+    """Return numbers of environments that differ from n and from the sizes of all other axes."""
     free = (m for m in itertools.count(3) if m != n and m not in taken)
     first = next(free)
     if n > MOST:
@@ -122,7 +127,7 @@ def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
 
 
 def _values(given: Any) -> Iterator[Any]:
-    """All values in an argument: of a step its arrays and what is in its info."""
+    """Yield all values in an argument: of a step its arrays and the values of its info."""
     if is_dataclass(given):
         for field in fields(given):
             yield from _values(getattr(given, field.name))
@@ -134,7 +139,7 @@ def _values(given: Any) -> Iterator[Any]:
 
 
 def _sizes(given: Any, n: int) -> Iterator[int]:
-    """The sizes of all axes of an argument but the first."""
+    """Yield the sizes of all axes of an argument but the first."""
     for array in _values(given):
         if isinstance(array, np.ndarray):
             yield from array.shape[1:]
@@ -148,7 +153,7 @@ def _sizes_of_fields(dtype: np.dtype[Any]) -> Iterator[int]:
 
 
 def _has_rows(given: Any, n: int) -> bool:
-    """Whether an argument holds nothing whose rows cannot be taken, as a list in an info."""
+    """Return whether rows can be selected in all values of an argument, so no list in an info."""
     plain = bool | int | float | str | None | np.generic
     return all(
         isinstance(value, plain) or (isinstance(value, np.ndarray) and value.shape[:1] == (n,))
@@ -157,7 +162,7 @@ def _has_rows(given: Any, n: int) -> bool:
 
 
 def _taken(given: Any, rows: Array, n: int) -> Any:
-    """The rows of an argument; what has no rows stays as it is."""
+    """Return the rows of an argument; values without rows do not change."""
     if is_dataclass(given):
         parts = {f.name: _taken(getattr(given, f.name), rows, n) for f in fields(given)}
         kind: Any = type(given)
@@ -170,7 +175,7 @@ def _taken(given: Any, rows: Array, n: int) -> Any:
 
 
 def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a copy of its object, so that a counter or a generator stays as it was."""
+    """Return the method of a copy of its object, so counters and generators do not change."""
     if not isinstance(function, types.MethodType):
         return function
     try:
@@ -185,7 +190,7 @@ def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def _randomness_kept() -> Iterator[None]:
-    """Put the global random streams back afterwards."""
+    """Restore the global random streams after the block."""
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
     torch = sys.modules.get("torch")
     state = None if torch is None else torch.get_rng_state()

@@ -1,4 +1,4 @@
-"""What a user may write after ``policy =``."""
+"""Values of the attribute ``policy`` of a skill, converted to policies."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from skillweave.types import Policy
 
 
 def ready_policy(skill: Skill) -> Policy | None:
-    """A skill's ready policy, functions and modules made into policies; None: it is trained.
+    """Return a skill's ready policy, converted from a function or module; None: it is trained.
 
     Raises:
-        DeclarationError: the attribute ``policy`` is nothing that can act.
+        DeclarationError: the attribute ``policy`` cannot act.
     """
     value: Any = skill.policy
     if value is None:
@@ -30,11 +30,11 @@ def ready_policy(skill: Skill) -> Policy | None:
     if hasattr(value, "act") and hasattr(value, "start"):
         policy: Policy = value
         return policy
-    torch = sys.modules.get("torch")  # whoever has a module has imported it
+    torch = sys.modules.get("torch")  # imported if the user has a module
     if torch is not None and isinstance(value, torch.nn.Module):
         return from_torch(value)
-    # A function in a class body becomes a method when it is looked up. It is meant as one if it
-    # needs two arguments (``def policy(self, obs)``), and as a function of obs if it needs one.
+    # A function in a class body becomes a method when it is looked up. It is a method if it needs
+    # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
     bound = isinstance(value, MethodType) and value.__self__ is skill
     if bound and required_arguments(value.__func__) < 2:
         value = value.__func__
@@ -47,7 +47,7 @@ def ready_policy(skill: Skill) -> Policy | None:
 
 
 def required_arguments(function: Any) -> int:
-    """How many arguments a function cannot do without; 1 where Python cannot tell."""
+    """Return the number of required arguments of a function; 1 if Python has no signature."""
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     try:
         parameters = inspect.signature(function).parameters.values()

@@ -1,4 +1,7 @@
-"""Stable-Baselines3 models as policies."""
+"""Stable-Baselines3 models as policies.
+
+Stands alone because it is one kind of foreign policy, as ``onnx_file`` and ``torch_module`` are.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
 class SB3Policy(Foreign):
     """The policy of a Stable-Baselines3 model; it acts on the model's own spaces.
 
-    Sampling is that of the policy's distribution; DQN's exploration belongs to its training.
+    Samples are from the policy's distribution; DQN's exploration belongs to its training.
     """
 
     kind = "sb3"
@@ -39,7 +42,7 @@ class SB3Policy(Foreign):
         self.policy, self.file, self.sha256 = model.policy, file, sha256
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy; images may have their channels last, where the model turned them."""
+        """Return a copy; images may have their channels last if the model transposes them."""
         bound = super().bind(observation_space, action_space, who)
         bound.policy = copy.deepcopy(self.policy)
         mine, theirs = self.observation_space, observation_space
@@ -62,7 +65,7 @@ class SB3Policy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The model's actions, by its own ``predict``."""
+        """Return the model's actions, by its own ``predict``."""
         import torch
 
         from skillweave.spaces import unpack
@@ -71,7 +74,7 @@ class SB3Policy(Foreign):
         if deterministic:
             action = self.policy.predict(parts, deterministic=True)[0]
         else:
-            # It samples from torch's global generator, which others may be using.
+            # It samples from torch's global generator, which other code may use.
             rng = rng or np.random.default_rng()
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(int(rng.integers(2**62)))
@@ -79,41 +82,41 @@ class SB3Policy(Foreign):
         return checked_actions(action, len(obs), self.action_space, self._who), memory
 
     def source(self) -> dict[str, Any]:
-        """The zip with its checksum; of a model in memory, that of its weights."""
+        """Return the zip's path and checksum; for a model in memory, its weights' checksum."""
         where = {"file": str(self.file), "sha256": self.sha256} if self.file else {}
         return super().source() | {"name": self.algorithm} | where
 
     def content(self) -> bytes | None:
-        """The weights of a model in memory; a zip is only named: it can run code."""
+        """Return the weights of a model in memory; None for a zip, which can run code."""
         return None if self.file else weights_of(self.policy, self._who)
 
     def restored(self, content: bytes) -> Self:
-        """A copy with these weights."""
-        found = copy.copy(self)
-        found.policy = with_weights(self.policy, content, self._who)
-        return found
+        """Return a copy with these weights."""
+        policy = copy.copy(self)
+        policy.policy = with_weights(self.policy, content, self._who)
+        return policy
 
 
 @checked_names
 def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = False) -> SB3Policy:
-    """A Stable-Baselines3 model as a skill's policy.
+    """Return a Stable-Baselines3 model as a skill's policy.
 
-    A zip is named in the run with its checksum, not copied; of a model in memory the weights are
-    copied. Observations that ``VecNormalize`` had scaled must be scaled by the environment: the zip
-    does not hold those statistics.
+    The run records a zip's path and checksum, without a copy; it copies the weights of a model in
+    memory. If ``VecNormalize`` scaled observations, the environment must scale them: the zip does
+    not hold those statistics.
 
     Args:
         model: a zip that Stable-Baselines3 saved, or a model in memory.
         algorithm: of a zip: "ppo", "a2c", "dqn", "sac", "td3", "ddpg", or the class that saved it.
-        trust: opening the zip may run any code that its author put in; say True if you trust them.
+        trust: True if you trust the author: opening the zip may run any code in it.
 
     Returns:
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
         PolicyError: the zip is not trusted, or holds no such model.
-        RunError: the zip is not there.
-        DeclarationError: ``model`` or ``algorithm`` is something else.
+        RunError: the zip does not exist.
+        DeclarationError: ``model`` or ``algorithm`` has a wrong type.
     """
     if not isinstance(model, str | Path):
         if not (hasattr(model, "policy") and hasattr(model, "observation_space")):
@@ -125,7 +128,7 @@ def from_sb3(model: Any, algorithm: str | type | None = None, *, trust: bool = F
     if trust is not True:
         raise PolicyError(
             f"{file} was not opened: a Stable-Baselines3 zip holds pickles, which can run any code "
-            "on your machine. If you trust whoever made it: "
+            "on your machine. If you trust its author: "
             f"from_sb3({str(file)!r}, {algorithm!r}, trust=True)"
         )
     kind = _algorithm(algorithm, file)
@@ -152,7 +155,7 @@ def _algorithm(algorithm: str | type | None, file: Path) -> Any:
     if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
         return getattr(stable_baselines3, algorithm.upper())
     raise DeclarationError(
-        f"{file}: algorithm is {algorithm!r}; say which one saved it, as its class or one of "
+        f"{file}: algorithm is {algorithm!r}; it must be the class that saved the file, or one of "
         f"{', '.join(ALGORITHMS)}"
     )
 

@@ -1,4 +1,4 @@
-"""Policies that are not learnt: plain functions."""
+"""Plain functions as policies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ScriptedPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The function's actions, checked where the action space is known."""
+        """Return the function's actions, checked if the action space is known."""
         action = called(self.function, read_only(obs), self._who, kind=PolicyError)
         if self.action_space is None:
             return as_array(action, self._who, PolicyError), memory
@@ -50,7 +50,7 @@ class ScriptedPolicy(Foreign):
         return actions, memory
 
     def source(self) -> dict[str, Any]:
-        """The function's name."""
+        """Return the function's name."""
         return {"kind": self.kind, "name": qualified(self.function)}
 
 
@@ -58,7 +58,7 @@ class ScriptedPolicy(Foreign):
 def from_function(
     function: Callable[[Array], Any], *, observation_space: Any = None, action_space: Any = None
 ) -> ScriptedPolicy:
-    """A Python function as a skill's policy; a skill takes the bare function too.
+    """Return a Python function as a skill's policy; a skill takes the bare function too.
 
     ```python
     import skillweave as sw
@@ -68,16 +68,16 @@ def from_function(
     ```
 
     Args:
-        function: observations (n, *obs_shape) to actions (n, *action_shape), of whole numbers where
-            the actions are; keep no state in it, it is called for any environments in any order.
-        observation_space: None: that of the environment it meets.
-        action_space: None: that of the environment it meets.
+        function: maps observations (n, *obs_shape) to actions (n, *action_shape), whole numbers for
+            discrete spaces. Keep no state in it: it is called for any environments in any order.
+        observation_space: None: the environment's.
+        action_space: None: the environment's.
 
     Returns:
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        DeclarationError: it is no function of observations.
+        DeclarationError: it is not a function of observations.
     """
     if not callable(function):
         raise DeclarationError(

@@ -1,4 +1,7 @@
-"""Attributes of a user's skill that look like misspelt ones: what its declaration warns about."""
+"""Attributes of a user's skill that look misspelt, for the warnings of its declaration.
+
+Stands alone because of its two tables of names from other libraries.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 SIMILAR = 0.9
-"""The least similarity of a name to the attribute that it may be meant for; ``difflib``'s ratio."""
+"""The least similarity of a name to the attribute that it resembles, as ``difflib``'s ratio."""
 
 METHODS = {
     "available": "initiation",
@@ -37,7 +40,7 @@ METHODS = {
     "act": "policy",
     "predict": "policy",
 }
-"""Names that others give to a skill's methods, with the names that they have here."""
+"""Names of a skill's methods in other libraries, with the names of this library."""
 
 VALUES = {
     "max_episode_steps": "max_steps",
@@ -47,13 +50,13 @@ VALUES = {
     "training_steps": "steps",
     "colour": "color",
 }
-"""The same of attributes that are no methods."""
+"""The same for attributes that are not methods."""
 
 
 def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Names in a skill that are probably meant for attributes, with these attributes.
+    """Yield names in a skill that are probably misspelt attributes, with these attributes.
 
-    What the skill's own methods use is no mistake, and neither is what begins with "_".
+    Names that the skill's methods use are no mistake, and neither are names that begin with "_".
 
     Args:
         skill: an instance of a subclass of ``base``.
@@ -62,9 +65,9 @@ def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str
     """
     known = list(known)
     kinds = type(skill).__mro__[: type(skill).__mro__.index(base)]
-    own = {k: v for kind in reversed(kinds) for k, v in vars(kind).items()} | vars(skill)
-    used = set().union(*(_used(v) for v in own.values()))
-    for name, value in own.items():
+    declared = {k: v for kind in reversed(kinds) for k, v in vars(kind).items()} | vars(skill)
+    used = set().union(*(_used(v) for v in declared.values()))
+    for name, value in declared.items():
         if name.startswith("_") or name in dir(base):
             continue
         near = difflib.get_close_matches(name, known, n=1, cutoff=SIMILAR)
@@ -76,7 +79,7 @@ def misspelt(skill: Any, base: type, known: Iterable[str]) -> Iterator[tuple[str
 
 
 def _used(value: Any) -> set[str]:
-    """The names that a function, a property or a wrapped method reads."""
+    """Return the names that a function, a property or a wrapped method reads."""
     function: Callable[..., Any] | None = getattr(value, "fget", None)
     function = function or getattr(value, "__func__", None) or value
     code = getattr(function, "__code__", None)

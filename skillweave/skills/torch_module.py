@@ -32,7 +32,7 @@ class TorchPolicy(Foreign):
         self.module = module
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """A copy in evaluation mode: what the user does to the module later is no part of it."""
+        """Return a copy in evaluation mode, independent of later changes of the module."""
         bound = super().bind(observation_space, action_space, who)
         bound.module = copy.deepcopy(self.module).eval()
         return bound
@@ -46,7 +46,7 @@ class TorchPolicy(Foreign):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """The module's actions; logits are sampled with ``rng`` where not ``deterministic``."""
+        """Return the module's actions; logits are sampled with ``rng`` if not ``deterministic``."""
         import torch
 
         from skillweave.spaces import unpack
@@ -63,49 +63,54 @@ class TorchPolicy(Foreign):
             )
         output = output.float() if output.is_floating_point() else output
         action = decoded(
-            output.cpu().numpy(), len(obs), self.action_space, self._who,
-            mask=mask, deterministic=deterministic, rng=rng,
-        )  # fmt: skip
+            output.cpu().numpy(),
+            len(obs),
+            self.action_space,
+            self._who,
+            mask=mask,
+            deterministic=deterministic,
+            rng=rng,
+        )
         return action, memory
 
     def source(self) -> dict[str, Any]:
-        """The module's class, and the checksum of its weights."""
+        """Return the module's class, and the checksum of its weights."""
         name = qualified(type(self.module))
         return {"kind": self.kind, "name": name, "sha256": checksum(self.content())}
 
     def content(self) -> bytes:
-        """Its weights."""
+        """Return its weights."""
         return weights_of(self.module, self._who)
 
     def restored(self, content: bytes) -> Self:
-        """A copy with these weights."""
-        found = copy.copy(self)
-        found.module = with_weights(self.module, content, self._who)
-        return found
+        """Return a copy with these weights."""
+        policy = copy.copy(self)
+        policy.module = with_weights(self.module, content, self._who)
+        return policy
 
 
 @checked_names
 def from_torch(
     module: nn.Module, *, observation_space: Any = None, action_space: Any = None
 ) -> TorchPolicy:
-    """A PyTorch module as a skill's policy; a skill takes the bare module too.
+    """Return a PyTorch module as a skill's policy; a skill takes the bare module too.
 
-    ``forward`` gets observations (n, *obs_shape) of the type of its weights (without any, float32),
-    images unscaled, of a Dict or Tuple a dict or tuple of such. It returns logits for Discrete
-    (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box (clipped to
-    its bounds); whole numbers are actions everywhere. Its weights are copied into the run; loading
-    the run puts them into the recipe's module, whatever that was initialised with.
+    ``forward`` receives observations (n, *obs_shape) of the type of its weights (float32 without
+    weights), images unscaled, for a Dict or Tuple a dict or tuple of such. It returns logits for
+    Discrete (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box
+    (clipped to its bounds); whole numbers are always actions. Its weights are copied into the run;
+    loading the run replaces the weights of the recipe's module by them.
 
     Args:
-        module: acts in evaluation mode, as a copy of what it is when training starts.
-        observation_space: None: that of the environment it meets.
-        action_space: None: that of the environment it meets.
+        module: acts in evaluation mode, as a copy made when training starts.
+        observation_space: None: the environment's.
+        action_space: None: the environment's.
 
     Returns:
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        DeclarationError: it is no module made of its class.
+        DeclarationError: it is not an instance of a module.
     """
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
@@ -123,7 +128,7 @@ def _tensors(obs: Any, device: Any, dtype: Any) -> Any:
 
 
 def weights_of(module: nn.Module, who: str) -> bytes:
-    """The state of a module as a safetensors file.
+    """Return the state of a module as a safetensors file.
 
     Raises:
         PolicyError: it has state that is not a tensor.
@@ -135,26 +140,26 @@ def weights_of(module: nn.Module, who: str) -> bytes:
     for name, value in state.items():
         if not isinstance(value, Tensor):
             raise PolicyError(f"{who}: its state {name!r} is a {type(value).__name__}, no tensor")
-    # Clones: modules may share tensors, which the format does not know.
+    # Clones: modules may share tensors, which the format does not support.
     return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
 
 
 def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
-    """A copy of a module with the weights of ``weights_of``.
+    """Return a copy of a module with the weights of ``weights_of``.
 
     Raises:
-        RunError: they have other names or shapes.
+        RunError: the weights have other names or shapes.
     """
     import safetensors
     import safetensors.torch
     import torch
 
-    found = copy.deepcopy(module)
+    loaded = copy.deepcopy(module)
     try:
-        with torch.device("cpu"):  # the default device is the user's
+        with torch.device("cpu"):  # the user may have changed the default device
             weights = safetensors.torch.load(content)
-        found.load_state_dict(weights)
+        loaded.load_state_dict(weights)
     except (RuntimeError, safetensors.SafetensorError) as error:
-        told = shortened(str(error))
-        raise RunError(f"{who}: the weights in the run do not fit it: {told}") from error
-    return found
+        reason = shortened(str(error))
+        raise RunError(f"{who}: the weights in the run do not fit it: {reason}") from error
+    return loaded

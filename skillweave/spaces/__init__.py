@@ -1,7 +1,7 @@
 """Gymnasium spaces to tensors and back.
 
-``pack`` makes one array of a batch of observations, ``ObsCodec`` turns it into what networks
-eat; ``ActionCodec`` turns what a policy head emits into what the environment takes.
+``pack`` makes one array of a batch of observations, ``ObsCodec`` converts it to the inputs of
+networks; ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
 from skillweave.spaces.action_codec import ActionCodec, action_codec

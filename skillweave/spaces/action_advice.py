@@ -1,4 +1,7 @@
-"""Sentences on action spaces that are not supported: wrappers that make supported ones of them."""
+"""Errors of unsupported action spaces, with wrappers that make supported ones of them.
+
+Stands alone because it writes code for users, not actions.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ def unsupported_action(space: gym.Space[Any]) -> EnvError:
 
 
 def _way(space: gym.Space[Any]) -> str:
-    """Return advice about a space: the lines of a wrapper where they can be written."""
+    """Return advice about a space: the lines of a wrapper, if one can be generated."""
     leaves = list(_leaves(space))
     if not leaves or not all(_is_plain(leaf) for leaf in leaves):
         return _wrapped("Let a function make its actions", "function", "gymnasium.spaces.Box(...)")
@@ -82,7 +85,7 @@ def _is_real(leaf: gym.Space[Any]) -> bool:
 
 
 def _choices(leaf: gym.Space[Any]) -> list[tuple[int, int]]:
-    """Of each choice in a space without parts, how many values it has and which is the first."""
+    """Return the number of values and the first value of each choice in a space without parts."""
     if isinstance(leaf, gym.spaces.Discrete):
         return [(int(leaf.n), int(leaf.start))]
     if isinstance(leaf, gym.spaces.MultiDiscrete):
@@ -96,23 +99,23 @@ def _choices(leaf: gym.Space[Any]) -> list[tuple[int, int]]:
 
 
 def _expression(space: gym.Space[Any], at: int, one_hot: bool) -> tuple[str, int]:
-    """Python that makes an action of ``space`` of the numbers of ``action`` from ``at`` on.
+    """Return Python code that builds an action of ``space`` from numbers of ``action`` at ``at``.
 
     Args:
-        one_hot: the numbers are those of Gymnasium's ``flatten_space``, else a choice each.
+        one_hot: the numbers are in the format of ``flatten_space``; else one per choice.
 
     Returns:
         The expression, and where the next numbers begin.
     """
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        found = []
+        members = []
         for name, part in (parts(space) or {}).items():
             one, at = _expression(part, at, one_hot)
-            found.append(f"{name!r}: {one}" if isinstance(space, gym.spaces.Dict) else one)
-        inside = ", ".join(found)
+            members.append(f"{name!r}: {one}" if isinstance(space, gym.spaces.Dict) else one)
+        inside = ", ".join(members)
         if isinstance(space, gym.spaces.Dict):
             return f"{{{inside}}}", at
-        return f"({inside},)" if len(found) == 1 else f"({inside})", at
+        return f"({inside},)" if len(members) == 1 else f"({inside})", at
     number = isinstance(space, gym.spaces.Discrete)
     if one_hot and isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
         chosen = []
@@ -135,6 +138,6 @@ def _expression(space: gym.Space[Any], at: int, one_hot: bool) -> tuple[str, int
 
 
 def _shaped(some: str, space: gym.Space[Any], size: int) -> str:
-    """The expression of ``size`` numbers with the shape and type of a space's actions."""
+    """Return the expression of ``size`` numbers with the shape and type of a space's actions."""
     shape = "" if space.shape == (size,) else f".reshape({space.shape})"
     return f"{some}{shape}.astype({str(space.dtype)!r})"

@@ -1,4 +1,4 @@
-"""Converts actions from a policy's units to the environment's, and back."""
+"""Conversion of actions between a policy's units and the environment's."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from skillweave.types import Array
 
 @dataclass(frozen=True)
 class ActionCodec:
-    """Converts actions of one space.
+    """A converter of actions of one space.
 
-    In policy units, discrete actions count from 0: (n,) int64, or (n, K) if ``multi``. Those of a
+    In policy units, discrete actions count from 0: (n,) int64, or (n, K) if ``multi``. Actions of a
     Box are (n, A) float32, where each dimension with two bounds spans [−1, 1].
     """
 
@@ -33,34 +33,34 @@ class ActionCodec:
 
     @property
     def discrete(self) -> bool:
-        """Whether actions are discrete."""
+        """Return whether actions are discrete."""
         return bool(self.parts)
 
     @property
     def multi(self) -> bool:
-        """Whether an action has several discrete parts."""
+        """Return whether an action has several discrete parts."""
         return isinstance(self.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
 
     @cached_property
     def size(self) -> int:
-        """The width of the policy's head."""
+        """Return the number of logits or of means."""
         return sum(self.parts) or int(np.prod(self.space.shape or ()))
 
     def to_env(self, action: Array) -> Array:
-        """Policy units to the environment's, (n, *shape)."""
+        """Convert policy units to the environment's, (n, *shape)."""
         if self.parts:
             action = action if self.low is None else np.asarray(action + self.low)
             return self._shaped(action) if self.multi else action
         assert self.low is not None
         low, span, bounded = self.span
-        # A diverged network gives NaN; it acts by 0 until training reports it.
+        # A diverged network returns NaN; it acts with 0 until training reports it.
         action = np.nan_to_num(action)
         scaled = action.astype(np.result_type(action, low))
         scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
         return self._shaped(scaled.astype(self.space.dtype).clip(self.low, self.high))
 
     def from_env(self, action: Array) -> Array:
-        """The inverse of ``to_env``; actions outside a Box are clipped."""
+        """Convert the environment's actions to policy units, clipped to the bounds of a Box."""
         if self.parts:
             units = np.asarray(action, np.int64)
             units = units.reshape(len(units), -1) if self.multi else units
@@ -73,7 +73,7 @@ class ActionCodec:
         return units.astype(np.float32)
 
     def check(self, action: Tensor) -> None:
-        """Raise a ValueError where actions in policy units (…) are none of this space."""
+        """Raise a ValueError where actions in policy units (…) are not in this space."""
         if self.discrete:
             most = torch.tensor(self.parts if self.multi else self.parts[0], device="cpu")
             if not bool(((action >= 0) & (action < most.to(action.device))).all()):
@@ -85,7 +85,7 @@ class ActionCodec:
 
     @cached_property
     def span(self) -> tuple[Array, Array, Array]:
-        """Lower bound, width, and whether the width is finite, of a Box; (A,) each."""
+        """Return a Box's lower bound, width, and whether the width is finite; (A,) each."""
         assert self.low is not None
         assert self.high is not None
         with np.errstate(over="ignore"):  # bounds at the limits of the dtype overflow: unbounded
@@ -94,10 +94,10 @@ class ActionCodec:
 
 
 def action_codec(space: gym.Space[Any]) -> ActionCodec:
-    """The codec of an action space.
+    """Return the codec of an action space.
 
     Raises:
-        EnvError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message names supported ones.
     """
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
     if not isinstance(space, kinds):
@@ -117,7 +117,7 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
 
 
 def _width(space: gym.Space[Any]) -> int:
-    """The number of outputs of a policy's head for a space."""
+    """Return the number of outputs of a policy's head for a space."""
     if isinstance(space, gym.spaces.Discrete):
         return int(space.n)
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -126,6 +126,6 @@ def _width(space: gym.Space[Any]) -> int:
 
 
 def _first(start: Any) -> Array | None:
-    """The first values as an offset; None if all are 0."""
+    """Return the first values as an offset; None if all are 0."""
     first = np.asarray(start, np.int64)
     return (first.reshape(-1) if first.ndim else first) if first.any() else None

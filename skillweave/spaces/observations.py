@@ -1,4 +1,4 @@
-"""Observations as what networks eat: a vector of floats, and images."""
+"""Observations as inputs of networks: a vector of floats, and images."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
 _WIDEST = 2.0**24
-"""The widest range of pixels: bounds further apart are those of a data type, and say nothing."""
-_PICTURE = 36  # sides of what is a picture, and no board
+"""The widest range of pixels: wider bounds are only those of a data type."""
+_PICTURE = 36  # the least side of a picture, as opposed to a board
 
 
 def to_tensor(array: Array) -> Tensor:
-    """A batch of observations as a tensor, without a copy where PyTorch can have the array itself.
+    """Convert a batch of observations to a tensor, without a copy if PyTorch can share the array.
 
     A structured array (*lead,) becomes its bytes, uint8 (*lead, itemsize).
     """
@@ -37,20 +37,20 @@ def to_tensor(array: Array) -> Tensor:
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """How a Box is laid out as an image: a stack of frames, channels first or last."""
+    """The layout of a Box as an image: a stack of frames, channels first or last."""
 
     stack: tuple[int, ...]  # (S, a, b, c)
     channels_last: bool
-    sure: bool = field(compare=False)  # whether the shape says where the channels are
+    sure: bool = field(compare=False)  # True if the shape determines the axis of the channels
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(C, H, W); the frames of a stack follow each other in C."""
+        """Return (C, H, W); the frames of a stack follow each other in C."""
         s, a, b, c = self.stack
         return (s * c, a, b) if self.channels_last else (s * a, b, c)
 
     def read(self, x: Tensor, lead: torch.Size) -> Tensor:
-        """Images (*lead, *space.shape) as (*lead, C, H, W)."""
+        """Rearrange images (*lead, *space.shape) to (*lead, C, H, W)."""
         frames = x.reshape(*lead, *self.stack)
         if self.channels_last:
             frames = frames.movedim(-1, -3)
@@ -58,11 +58,11 @@ class ImageLayout:
 
 
 def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
-    """The layout of a space that is an image, else None.
+    """Return the layout of a space that is an image, else None.
 
-    Images are Boxes of 3 axes, or of 4 (a stack of frames), with bounds, and matrices of bytes.
-    Where the shape does not say which axis of a frame holds the channels, the layout is not
-    ``sure``, and takes the shorter one of the outer axes.
+    Images are Boxes of 3 axes, or of 4 (a stack of frames), with bounds, and matrices of bytes. If
+    the shape does not determine the axis of the channels, the layout is not ``sure``, and uses the
+    shorter one of the outer axes.
     """
     if not isinstance(space, gym.spaces.Box):
         return None
@@ -78,7 +78,7 @@ def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
 
 
 def _has_bounds(space: gym.spaces.Box) -> bool:
-    """Return whether the bounds of a Box are of its numbers, not of their data type."""
+    """Return whether the bounds of a Box are narrower than those of its data type."""
     if not space.is_bounded():
         return False
     span = space.high.astype(np.float64) - space.low.astype(np.float64)
@@ -86,10 +86,10 @@ def _has_bounds(space: gym.spaces.Box) -> bool:
 
 
 def _channels_last(a: int, b: int, c: int) -> bool | None:
-    """Return whether images (a, b, c) have their channels last; None: their shape does not say it.
+    """Return whether images (a, b, c) have their channels last; None: the shape is ambiguous.
 
-    Of two equal axes and another one, the other one is the channels'. Of three different ones it is
-    the shorter outer one if there are few channels, or if the image is too large for a board.
+    With two equal axes, the third one holds the channels. With three different ones it is the
+    shorter outer one, if it has few channels, or if the image is too large for a board.
     """
     if a == b != c:
         return True
@@ -111,20 +111,20 @@ def _aspect(a: int, b: int) -> float:
 
 @dataclass(frozen=True)
 class _Leaf:
-    """A part of an observation that has no parts itself."""
+    """An innermost part of an observation."""
 
     shape: tuple[int, ...]
-    place: slice | None  # which bytes of an observation; None: it is the whole observation
+    place: slice | None  # its bytes in an observation; None: it is the whole observation
     dtype: torch.dtype
     real: bool  # a Box, not choices
-    choices: tuple[int, ...] = ()  # of each entry, where it is to be one-hot
+    choices: tuple[int, ...] = ()  # of each entry, if it becomes one-hot
     start: tuple[int, ...] = ()  # first choice of each entry
     image: ImageLayout | None = None
     bounds: tuple[Array, Array] | None = field(default=None, compare=False)  # of an image
     name: str = ""  # of the part: ``board``, ``pair.0``; "": it is the whole observation
 
     def laid_out(self, planes: Literal["first", "last"]) -> _Leaf:
-        """The same leaf, an image, with its channels where ``planes`` says."""
+        """Return the leaf, an image, with its channels in the axis that ``planes`` names."""
         assert self.image is not None
         return replace(self, image=replace(self.image, channels_last=planes == "last", sure=True))
 
@@ -153,15 +153,15 @@ class ObsCodec:
     space: gym.Space[Any]
     size: int
     images: tuple[tuple[int, int, int], ...]  # (C, H, W) of each
-    scaled: bool  # whether the vector has real numbers, which are worth normalising
-    item: tuple[int, ...]  # trailing shape of what ``to_tensor`` makes
+    scaled: bool  # True if the vector has real numbers, which can be normalised
+    item: tuple[int, ...]  # trailing shape of the tensors of ``to_tensor``
     leaves: tuple[_Leaf, ...]
     scales: tuple[PixelScale, ...] = field(compare=False)  # of each image
     unclear: tuple[str, ...] = ()
-    """The images of which neither their shapes nor a setting say where the channels are."""
+    """The images whose axis of channels neither the shape nor a setting determines."""
 
     def split(self, obs: Tensor | Sequence[Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Raw observations to a vector and images.
+        """Split raw observations into a vector and images.
 
         Args:
             obs: (*lead, *item); or of each leaf, in order, (*lead, *its shape).
@@ -187,13 +187,13 @@ class ObsCodec:
 
     @property
     def may_be_wrong(self) -> bool:
-        """Whether ``check`` could find something: all bytes of an image are right, say."""
+        """Return whether ``check`` can fail: any bytes of an image are valid, for example."""
         return any(leaf.choices or leaf.dtype.is_floating_point for leaf in self.leaves)
 
     def check(self, obs: Tensor) -> None:
-        """Raise a ValueError where raw observations (*lead, *item) cannot be of this space.
+        """Raise a ValueError where raw observations (*lead, *item) are not in this space.
 
-        They hold a number that is not finite, or a choice that does not exist.
+        They have a number that is not finite, or a choice that does not exist.
         """
         for leaf in self.leaves:
             x = leaf.read(obs)
@@ -209,19 +209,19 @@ class ObsCodec:
                     raise ValueError("an observation holds a choice that does not exist")
 
     def highest(self, i: int) -> Tensor:
-        """The highest number that each pixel of image ``i`` may have, (C, H, W), in its dtype."""
+        """Return the highest number of each pixel of image ``i``, (C, H, W), in its dtype."""
         leaf = [leaf for leaf in self.leaves if leaf.image is not None][i]
         assert leaf.image is not None
         assert leaf.bounds is not None
         return leaf.image.read(torch.from_numpy(leaf.bounds[1]), torch.Size())
 
     def pixels(self, image: Tensor, i: int) -> Tensor:
-        """Image ``i`` as a network takes it: float32, scaled to [0, 1] by its bounds."""
+        """Convert image ``i`` for a network: float32, scaled to [0, 1] by its bounds."""
         return self.scales[i](image)
 
 
 class PixelScale:
-    """Pixels scaled to [0, 1] by the bounds of their space, which may differ between pixels.
+    """A scale of pixels to [0, 1] by the bounds of their space, which may differ between pixels.
 
     Args:
         low: the lowest number of each pixel, (C, H, W).
@@ -238,10 +238,10 @@ class PixelScale:
                 torch.from_numpy(np.asarray(x, np.float32)) for x in (low, span)
             )
         }
-        """By device, the lowest number and the span of each pixel."""
+        """The lowest number and the span of each pixel, by device."""
 
     def __call__(self, image: Tensor) -> Tensor:
-        """Pixels (…, C, H, W) of any type as float32."""
+        """Scale pixels (…, C, H, W) of any type to float32."""
         x = image.float()
         if not self._same:
             low, span = self._on(image.device)
@@ -258,14 +258,14 @@ class PixelScale:
 
 
 def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = None) -> ObsCodec:
-    """The codec of an observation space.
+    """Return the codec of an observation space.
 
     Args:
-        planes: which axis holds the channels of the images whose shape does not say it; where each
-            shape says it, of all images. None: the shapes alone count.
+        planes: the axis of the channels in images whose shape is ambiguous; if no shape is, in all
+            images. None: only the shapes count.
 
     Raises:
-        EnvError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message names supported ones.
     """
     dtype = obs_dtype(space)
     leaves = tuple(_leaves(space, dtype, None))
@@ -294,7 +294,7 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
 
 
 def _scale(leaf: _Leaf) -> PixelScale:
-    """The scale of a leaf that is an image."""
+    """Return the scale of a leaf that is an image."""
     assert leaf.image is not None
     assert leaf.bounds is not None
     values = (np.asarray(x, np.float64) for x in leaf.bounds)
@@ -314,7 +314,7 @@ def _described(leaf: _Leaf) -> str:
 def _leaves(
     space: gym.Space[Any], dtype: np.dtype[Any], offset: int | None, names: tuple[str, ...] = ()
 ) -> Iterator[_Leaf]:
-    """The leaves of a space whose observations of ``dtype`` lie ``offset`` bytes into the whole."""
+    """Yield the leaves of a space whose observations start ``offset`` bytes into the whole."""
     if dtype.fields is not None:
         for name, part in (parts(space) or {}).items():
             field, at = dtype.fields[name][:2]
@@ -339,7 +339,7 @@ def _leaves(
 
 
 def _choices(space: gym.Space[Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """How many choices each entry has, and which is the first; empty for numbers."""
+    """Return the number of choices and the first choice of each entry; empty for numbers."""
     if isinstance(space, gym.spaces.Discrete):
         return (int(space.n),), (int(space.start),)
     if isinstance(space, gym.spaces.MultiDiscrete):

@@ -1,4 +1,4 @@
-"""A batch of observations as one numpy array, whatever the space.
+"""A batch of observations as one NumPy array, for any space.
 
 Dict and Tuple become structured arrays, so that ``obs[rows]``, ``obs[rows] = x`` and
 ``obs.copy()`` mean the same for every space, and ``obs["position"]`` is a part.
@@ -20,13 +20,13 @@ OBSERVATIONS = "Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of
 
 
 LARGEST = 1_000_000
-"""Numbers in an observation or an action, as a network takes it; pixels may be 16 times as many."""
+"""The most numbers in an observation or an action of a network; pixels may be 16 times as many."""
 
 
 def check_size(space: gym.Space[Any], what: str, numbers: int, largest: int = LARGEST) -> None:
-    """Raise an EnvError where a network would need absurdly many numbers for a space.
+    """Raise an EnvError where a network would need too many numbers for a space.
 
-    The first layer alone has a weight for each number and each unit, and the optimiser keeps two
+    The first layer alone has a weight for each number and each unit, and the optimiser stores two
     more numbers for each weight.
     """
     if numbers > largest:
@@ -34,43 +34,43 @@ def check_size(space: gym.Space[Any], what: str, numbers: int, largest: int = LA
         raise EnvError(
             f"{what} space {short(space)} is {numbers:,} numbers to a network, choices one-hot; at "
             f"most {largest:,} are supported: 64 units that take them all in would need "
-            f"{gigabytes:,.1f} GB. Wrap the environment so that it says the same in fewer numbers"
+            f"{gigabytes:,.1f} GB. Wrap the environment so that it has fewer numbers"
         )
 
 
 def parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
-    """The named parts of a Dict or Tuple, in order; None for any other space.
+    """Return the named parts of a Dict or Tuple, in order; None for any other space.
 
     Raises:
-        EnvError: there are none, or their names are not text.
+        EnvError: it has no parts, or their names are not text.
     """
     if isinstance(space, gym.spaces.Dict):
-        found = dict(space.spaces)
+        named = dict(space.spaces)
     elif isinstance(space, gym.spaces.Tuple):
-        found = {str(i): part for i, part in enumerate(space.spaces)}
+        named = {str(i): part for i, part in enumerate(space.spaces)}
     else:
         return None
-    if not found or not all(isinstance(name, str) and name for name in found):
+    if not named or not all(isinstance(name, str) and name for name in named):
         raise EnvError(f"space {space} needs at least one part, each with text as its name")
-    return found
+    return named
 
 
 def obs_shape(space: gym.Space[Any]) -> tuple[int, ...]:
-    """The shape of one observation in a batch; () for Dict and Tuple."""
+    """Return the shape of one observation in a batch; () for Dict and Tuple."""
     return tuple(space.shape or ())
 
 
 def obs_dtype(space: gym.Space[Any]) -> np.dtype[Any]:
-    """The dtype of observations; a structured one for Dict and Tuple.
+    """Return the dtype of observations; a structured one for Dict and Tuple.
 
     Raises:
-        EnvError: the space is not supported; the message says which are, and what to do.
+        EnvError: the space is not supported; the message names supported ones, and what to do.
     """
     return _dtype(space, space, ())
 
 
 def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> np.dtype[Any]:
-    """The dtype of the part of ``whole`` that has these names."""
+    """Return the dtype of the part of ``whole`` with these names."""
     inner = parts(space)
     if inner is None:
         kinds = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
@@ -99,7 +99,7 @@ def _dtype(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...])
 
 
 def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str, ...]) -> str:
-    """A sentence on a space that is not supported, the part of ``whole`` with these names."""
+    """Return the error message of an unsupported part of ``whole`` with these names."""
     shown = " ".join(short(space).split())
     what = f"observation space {shown}"
     if place:
@@ -130,24 +130,24 @@ def _is_supported(space: gym.Space[Any]) -> bool:
 
 
 def pack(space: gym.Space[Any], batched: Any) -> Array:
-    """A batch as Gymnasium has it (dicts and tuples of arrays) as one array (*lead, *obs_shape).
+    """Pack a batch of Gymnasium (dicts and tuples of arrays) into one array (*lead, *obs_shape).
 
-    What is an array already is returned as it is.
+    An array is returned unchanged.
     """
     if parts(space) is None or isinstance(batched, np.ndarray):
         return np.asarray(batched)
-    # Zeros: the bytes between parts are written to files, which should be the same each time.
+    # Zeros, because the bytes between parts are written to files, which must be reproducible.
     packed = np.zeros(_lead(space, batched), obs_dtype(space))
     _fill(space, packed, batched)
     return packed
 
 
 def put_observation(space: gym.Space[Any], out: Array, row: int, obs: Any) -> None:
-    """Write one observation, as an environment gives it, into a row of a batch (n, *obs_shape).
+    """Write an observation of an environment into a row of a batch (n, *obs_shape).
 
     Raises:
         ValueError: it has another shape.
-        KeyError, TypeError, IndexError: a part is not there.
+        KeyError, TypeError, IndexError: a part is missing.
     """
     if isinstance(space, gym.spaces.Dict):
         for key, part in space.spaces.items():
@@ -164,7 +164,7 @@ def put_observation(space: gym.Space[Any], out: Array, row: int, obs: Any) -> No
 
 
 def unpack(space: gym.Space[Any], array: Array) -> Any:
-    """The inverse of ``pack``: dicts and tuples of views; a plain array is returned as it is."""
+    """Unpack an array of ``pack`` to dicts and tuples of views; return a plain array unchanged."""
     inner = parts(space)
     if inner is None:
         return array
@@ -173,7 +173,7 @@ def unpack(space: gym.Space[Any], array: Array) -> Any:
 
 
 def _values(space: gym.Space[Any], batched: Any) -> Iterable[Any]:
-    """The parts of a batch in the order of the space's, which a dict need not have."""
+    """Return the parts of a batch in the order of the space, which a dict may not have."""
     if isinstance(space, gym.spaces.Dict):
         return [batched[name] for name in space.spaces]
     return tuple(batched)

@@ -1,4 +1,7 @@
-"""Spaces as JSON, and whether two are the same to a policy."""
+"""Spaces as JSON, and the comparison of spaces for policies.
+
+Stands alone because it is a format of files, with its schema.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +19,11 @@ from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts
 from skillweave.types import Array
 
 _MOST = 10**8
-"""Numbers of one space: a damaged shape must not take all memory."""
+"""The most numbers of one space: a damaged shape must not take all memory."""
 
 
 def _is_whole(data: Any) -> bool:
-    """Whether it is a whole number, or lists of such."""
+    """Return whether data is a whole number, or lists of such."""
     if isinstance(data, list):
         return all(_is_whole(x) for x in data)
     return type(data) is int and abs(data) < LARGEST
@@ -67,16 +70,20 @@ class _MultiBinary(TypedDict):
 
 
 _SCHEMAS: dict[str, Any] = {
-    "Dict": _Dict, "Tuple": _Tuple, "Box": _Box, "Discrete": _Discrete,
-    "MultiDiscrete": _MultiDiscrete, "MultiBinary": _MultiBinary,
-}  # fmt: skip
+    "Dict": _Dict,
+    "Tuple": _Tuple,
+    "Box": _Box,
+    "Discrete": _Discrete,
+    "MultiDiscrete": _MultiDiscrete,
+    "MultiBinary": _MultiBinary,
+}
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    """A supported space as plain JSON; infinities become strings, equal bounds one number.
+    """Convert a supported space to plain JSON; infinities become strings, equal bounds a number.
 
     Raises:
-        EnvError: the space is not supported; the message says which are.
+        EnvError: the space is not supported; the message names supported ones.
     """
     match space:
         case gym.spaces.Dict():
@@ -93,8 +100,8 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
                 "high": _bounds_to_json(space.high),
             }
         case gym.spaces.Discrete():
-            found = {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
-            return found | _dtype_to_json(space)
+            discrete = {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+            return discrete | _dtype_to_json(space)
         case gym.spaces.MultiDiscrete():
             nvec, start = space.nvec.tolist(), np.asarray(space.start).tolist()
             return {"type": "MultiDiscrete", "nvec": nvec, "start": start} | _dtype_to_json(space)
@@ -105,7 +112,7 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
 
 
 def space_from_json(data: Any) -> gym.Space[Any]:
-    """The inverse of ``space_to_json``.
+    """Create a space from the JSON of ``space_to_json``.
 
     Raises:
         RunError: the JSON does not describe a supported space.
@@ -119,7 +126,7 @@ def space_from_json(data: Any) -> gym.Space[Any]:
     fit(_SCHEMAS[kind], data, "", "space")
     try:
         return _made(data)
-    # Gymnasium's own checks of values are assertions, partly.
+    # Some of Gymnasium's checks of values are assertions.
     except (TypeError, ValueError, ArithmeticError, AssertionError, AttributeError) as error:
         raise RunError(f"not a space: {shown(data)} ({str(error)[:300]})") from error
 
@@ -148,7 +155,7 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
 
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
-    """Whether a policy made for one space can act in the other: same kind, shape and choices."""
+    """Return whether a policy for one space can act in the other: equal kind, shape and choices."""
     if type(a) is not type(b) or a.shape != b.shape:
         return False
     inner, other = parts(a), parts(b)
@@ -159,7 +166,7 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
             and obs_dtype(a) == obs_dtype(b)  # a policy reads the parts out of bytes
         )
     if isinstance(a, gym.spaces.Discrete | gym.spaces.MultiDiscrete):
-        plain = {"dtype": None}  # choices are the same whatever the type that holds them
+        plain = {"dtype": None}  # the type of choices does not matter
         return space_to_json(a) | plain == space_to_json(b) | plain
     layout = image_layout(a)
     if layout is None or layout != image_layout(b):
@@ -169,7 +176,7 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
 
 
 def _dtype_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    """The type of a space of choices, where it is not the usual one."""
+    """Return the type of a space of choices, if it is not the default."""
     return {} if space.dtype == np.int64 else {"dtype": str(space.dtype)}
 
 

@@ -38,8 +38,7 @@ from skillweave.algorithms.config import (
     SelfImitationPPO,
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.algorithms.ppo import PPOAlgorithm
-from skillweave.algorithms.ppo_samples import next_values
+from skillweave.algorithms.ppo import PPOAlgorithm, next_values
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, RNN, Network

@@ -32,7 +32,7 @@ NAN, INF = float("nan"), float("inf")
 TOGETHER: list[tuple[type, str, object, str]] = [
     *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN, SAC)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
-    *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO has memory")
+    *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO supports recurrent networks")
       for kind in (DQN, TD3, SAC)),
     *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, SAC, PPO)),
     *((kind, "critic", Network(planes="last"), "without planes: Network.planes of network counts "
@@ -73,7 +73,7 @@ def test_settings_survive_json(config):
         ({"momentum": 1}, "SAC has no field momentum"),
         ({"network": {"cnn": {"depth": 3}}}, r"SAC\.network\.cnn has no field depth"),
         ({"network": {"rnn": {"kind": "elman"}}}, r"rnn\.kind is 'elman'; .* lstm, gru"),
-        ({"network": {"rnn": {"kind": "gru"}}}, r"SAC\.network is .*only PPO has memory"),
+        ({"network": {"rnn": {"kind": "gru"}}}, r"SAC\.network .*only PPO supports recurrent"),
     ],
 )
 def test_unknown_settings_in_json_are_named(change, says):

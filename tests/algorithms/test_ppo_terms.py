@@ -10,8 +10,9 @@ from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from toys import Toy, learn
 
 from skillweave import PPO, Network, SkillweaveError
+from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo_samples import Terms, epsilon_now, samples_of
+from skillweave.algorithms.ppo import Terms, samples_of
 from skillweave.experience import Reference, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon

@@ -11,7 +11,7 @@ import torch
 
 from skillweave import PPO, RNN, Network
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo_samples import Terms, samples_of
+from skillweave.algorithms.ppo import Terms, samples_of
 from skillweave.experience import Reference, Rollout
 from skillweave.seeding import Seeds
 

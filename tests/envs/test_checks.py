@@ -50,7 +50,7 @@ def third_step(env):
 
 
 WRONG = {
-    "four values": (GOOD[:4], "step.. returned 4 values; Gymnasium asks for five"),
+    "four values": (GOOD[:4], "step.. returned 4 values; Gymnasium needs five"),
     "nothing": (None, "step.. returned a NoneType"),
     "a complex reward": (but(reward=1 + 2j), r"reward is \(1\+2j\); it must be a number"),
     "a text as reward": (but(reward="1.5"), "reward is '1.5'"),
@@ -154,7 +154,7 @@ def test_an_error_of_an_environment_is_told_with_its_line_and_is_its_cause():
 @pytest.mark.parametrize(
     ("reset", "says"),
     [
-        (lambda *_, **__: GOOD[0], "reset.. returned a ndarray; Gymnasium asks for obs, info"),
+        (lambda *_, **__: GOOD[0], "reset.. returned a ndarray; Gymnasium needs obs, info"),
         (lambda *_, **__: (np.zeros(1), {}), r"observation is array\(\[0.\]\), which is not"),
         (lambda *_, **__: (np.full(2, np.nan, np.float32), {}), "2 of 2 numbers that are not"),
         (lambda *_, **__: (GOOD[0], None), "info is None"),
@@ -171,7 +171,7 @@ def test_the_first_observation_is_looked_at_too(reset, says):
     [
         (lambda: None, "made None, which is no environment"),
         (lambda: 1 / 0, "could not be made: ZeroDivisionError"),
-        (scripted(GOOD, action_space=3), "action_space is 3; it must be a space"),
+        (scripted(GOOD, action_space=3), "action_space is 3; it must be a Gymnasium space"),
         (type("Bare", (gym.Env,), {}), "observation_space is None"),
         (lambda shared=Scripted(): shared, "the same environment each time"),  # noqa: B008
     ],
@@ -184,7 +184,7 @@ def test_what_makes_no_environment_is_told(made, says):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"env": Scripted()}, "env is .*made many times"),
+        ({"env": Scripted()}, "env is .*many environments are made"),
     ],
 )
 def test_a_wrong_specification_names_the_field(given, says):

@@ -421,7 +421,7 @@ WRONG: dict[str, Any] = {
     "another in evaluation": (
         _module(lambda self, x: x if self.training else 2 * x), "other features in evaluation mode",
     ),
-    "a random constant": (_module(lambda self, x: x * self.mixing, _random), "mixing is another"),
+    "a random constant": (_module(lambda self, x: x * self.mixing, _random), "mixing differs"),
 }  # fmt: skip
 
 

@@ -48,11 +48,11 @@ def test_every_module_of_ops_with_shapes_is_checked() -> None:
 
 
 def test_others_use_what_is_checked() -> None:
-    from skillweave.algorithms import ppo_samples
+    from skillweave.algorithms import ppo
 
-    assert ppo_samples.gae is returns.gae
+    assert ppo.gae is returns.gae
     with pytest.raises(jaxtyping.TypeCheckError):
-        ppo_samples.gae(**of_gae(value=torch.ones(P, T, 1)))
+        ppo.gae(**of_gae(value=torch.ones(P, T, 1)))
 
 
 @pytest.mark.slow

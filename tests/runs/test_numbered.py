@@ -192,7 +192,7 @@ def test_a_living_process_keeps_its_run_and_is_named() -> None:
 def test_a_system_without_locks_replaces_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     dead_run(Path("run"))
     monkeypatch.setattr("skillweave.runs.lock.fcntl", None)
-    with pytest.raises(SkillweaveError, match="cannot say whether a process uses it"):
+    with pytest.raises(SkillweaveError, match="has no locks that show whether a process uses it"):
         declare().train("run", quiet=True)
 
 

@@ -201,7 +201,7 @@ def test_who_may_not_write_is_told_what_to_do(
         with pytest.raises(SkillweaveError, match=f"you may not write to {name}"):
             run.push(name)
     monkeypatch.setenv("HF_TOKEN", "")
-    with pytest.raises(SkillweaveError, match=r"does not know you: log in \(hf auth login\)"):
+    with pytest.raises(SkillweaveError, match=r"does not recognise you: log in \(hf auth login\)"):
         run.push(NAME)
 
 

@@ -26,8 +26,8 @@ from skillweave import (
     train_agent,
 )
 from skillweave.cli import main
+from skillweave.envs.engine import SyncEnvs
 from skillweave.envs.infos import info_numbers
-from skillweave.envs.sync import SyncEnvs
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
