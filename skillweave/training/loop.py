@@ -15,13 +15,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.collecting.group import Collectors
+from skillweave.collecting.source import Source
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.seeding import Seeds
@@ -114,11 +114,12 @@ OnCheckpoint = Callable[[Saved], None]
 
 def train(
     learner: Learner,
-    collectors: Collectors,
+    collectors: Source,
     episodes: Episodes,
     seeds: Seeds,
     budget: int,
     *,
+    counts: Literal["steps", "updates"] = "steps",
     resume_from: Progress | None = None,
     schedule_steps: int | None = None,
     skip_diverged: bool = False,
@@ -126,12 +127,14 @@ def train(
     on_tick: OnTick | None = None,
     on_checkpoint: OnCheckpoint | None = None,
 ) -> Progress:
-    """Train until ``budget`` environment steps are spent; states of the learner change.
+    """Train until the ``budget`` is spent; states of the learner change.
 
     Args:
         collectors: fresh or already started.
         episodes: the latest episodes, for the metrics; new ones are added.
-        schedule_steps: steps at which schedules end; None: the budget.
+        budget: environment steps, or updates.
+        counts: unit of the budget; a source that makes no steps needs updates.
+        schedule_steps: the part of the budget at which schedules end; None: all of it.
         skip_diverged: continue where a member diverges.
         checkpoint_every: environment steps between checkpoints. They are also written by time
             (``CHECKPOINT_SECONDS``), and on an interrupt.
@@ -146,7 +149,7 @@ def train(
         KeyboardInterrupt: after an interrupt, when a checkpoint is written.
     """
     loop = _Loop(learner, collectors, episodes, seeds, resume_from or Progress(), on_tick)
-    loop.schedule_steps = schedule_steps or budget
+    loop.schedule_steps, loop.counts = schedule_steps or budget, counts
     loop.skip_diverged = skip_diverged
     loop.checkpoint_every = checkpoint_every
     loop.on_checkpoint = on_checkpoint
@@ -154,7 +157,7 @@ def train(
         try:
             collectors.start(seeds / "start")
             loop.request()
-            while loop.at.steps < budget:
+            while loop.spent < budget:
                 loop.round(budget)
             loop.report()
         finally:
@@ -166,6 +169,7 @@ class _Loop:
     """One stage's training."""
 
     schedule_steps: int
+    counts: Literal["steps", "updates"]
     skip_diverged: bool
     checkpoint_every: int
     on_checkpoint: OnCheckpoint | None
@@ -173,7 +177,7 @@ class _Loop:
     def __init__(
         self,
         learner: Learner,
-        collectors: Collectors,
+        collectors: Source,
         episodes: Episodes,
         seeds: Seeds,
         at: Progress,
@@ -196,10 +200,10 @@ class _Loop:
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._request)
         self.report()
-        before, update = at.steps, at.update
+        before, steps, update = self.spent, at.steps, at.update
         at.steps += collected.steps
         at.update += 1
-        over = at.steps >= budget
+        over = self.spent >= budget
         self.episodes.extend(collected.episodes, collected.info_keys, collected.longest)
         if len(collected.begun_anew):
             learner.cut(collected.begun_anew)
@@ -207,22 +211,22 @@ class _Loop:
         if learner.overlap and not over:
             self.request()  # before the parameters change
         every = learner.report_every
-        self._start_update(update, not every or over or crossed(every, before, at.steps))
+        self._start_update(update, not every or over or crossed(every, before, self.spent))
         if not learner.overlap:
             self.report()
             if not over:
                 self.request()
         if not over:
-            self._save_if_due(before)
+            self._save_if_due(steps)
 
     def request(self) -> None:
         """Prepare the next request with the present parameters."""
         at = self.at
-        self._request = self.learner.request(at.update, at.steps, self._progress(at.steps))
+        self._request = self.learner.request(at.update, at.steps, self._progress())
 
     def _start_update(self, update: int, due: bool) -> None:
         """Learn, on the thread if the learner overlaps; write a report later if it is due."""
-        arguments = update, self.at.steps, self._progress(self.at.steps)
+        arguments = update, self.at.steps, self._progress()
         # The means of episodes are of this moment, whatever the length of the update.
         summary = self.episodes.summary() if due and self._on_tick is not None else {}
         self.at.report = Report(update + 1, self.at.steps, due, summary)
@@ -259,8 +263,13 @@ class _Loop:
         """Stop after a pending update, as it changes states in place."""
         self._thread.close()
 
-    def _progress(self, steps: int) -> float:
-        return min(1.0, steps / self.schedule_steps)
+    @property
+    def spent(self) -> int:
+        """The part of the budget that is spent."""
+        return self.at.update if self.counts == "updates" else self.at.steps
+
+    def _progress(self) -> float:
+        return min(1.0, self.spent / self.schedule_steps)
 
     def _take_time(self) -> None:
         self.at.seconds = time.perf_counter() - self._started
@@ -304,7 +313,7 @@ class _Loop:
 
 def resume(
     learner: Learner,
-    collectors: Collectors,
+    collectors: Source,
     episodes: Episodes,
     saved: dict[str, Tensor],
     at: Progress,
@@ -328,7 +337,7 @@ def resume(
 
 def begin_episodes(
     learner: Learner,
-    collectors: Collectors,
+    collectors: Source,
     saved: dict[str, Tensor],
     at: Progress,
     seeds: Seeds,
