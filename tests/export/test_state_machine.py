@@ -319,6 +319,17 @@ def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
         assert runner.act(obs, mask=with_mask) == player.act(obs, mask=with_mask) != 0
 
 
+def test_a_selector_that_samples_in_any_case_samples_when_exported(tmp_path: Path) -> None:
+    policy = trained(skill_set(Free, Left, greedy_selector=False))
+    write_export(tmp_path, policy, "walk")
+    told = json.loads((tmp_path / "policy.json").read_text())["policy"]
+    assert told["selector"]["noise"] == [["gumbel", 2]]
+    assert told["skills"][0]["policy"]["noise"] == []
+    chosen = ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right, greedy_selector=False))
+    with pytest.raises(SkillweaveError, match="selector is an automaton that draws .*greedy_sel"):
+        write_export(tmp_path / "other", chosen, "walk")
+
+
 @pytest.mark.slow
 def test_skills_that_sample_draw_as_often_as_their_network_says(tmp_path: Path) -> None:
     policy = trained(skill_set(Free, greedy=False))
