@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from cases import (
+from calls.cases import (
     EVENTS,
     POLICIES,
     REFLEXES,

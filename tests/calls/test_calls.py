@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import BY_HAND, LEFT, SEEN, ZIGZAG, Case, LevelCase, SkillCase, cases
+from calls.cases import BY_HAND, LEFT, SEEN, ZIGZAG, Case, LevelCase, SkillCase, cases
+from calls.reference import Call, Moment, calls, episode, moments_of
+from calls.users import GAMMA, SEED, USERS, Got, Played
 from hypothesis import HealthCheck, given, settings
-from reference import Call, Moment, calls, episode, moments_of
 from reference_calls import T, scripted, seeds_of
-from users import GAMMA, SEED, USERS, Got, Played
 
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.ends import CallEnd

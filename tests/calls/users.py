@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,10 +9,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import gymnasium as gym
 import numpy as np
-from cases import POLICIES, Case, LevelCase, Worth, guide_of, ready, selector_of, skill_set
-from reference_calls import Walk, seeds_of
+from calls.cases import POLICIES, Case, LevelCase, Worth, guide_of, ready, selector_of, skill_set
+from reference_calls import seeds_of
 
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
