@@ -132,7 +132,7 @@ def recorded(step: Step) -> Array:
 STOPS: dict[str, Any] = {
     "passed": lambda step: step.next_obs[:, POSITION] >= 2,
     "unlucky": lambda step: (step.elapsed >= 2) & (step.reward < -0.5),
-    "told": lambda step: step.timed_out | (step.info["t"] % 5 == 0),
+    "info": lambda step: step.timed_out | (step.info["t"] % 5 == 0),
     "acted": lambda step: (step.action == 0) & (step.obs[:, T] % 2 == 1),
 }
 WINS: dict[str, Any] = {
@@ -328,7 +328,7 @@ RIGHT = SkillCase("right", starts="left", stops="passed")
 ZIGZAG = SkillCase("zigzag")
 PAID = SkillCase("paid", max_steps=6, stops="unlucky", wins="rich")
 COUNTS = SkillCase("counts", call_steps=2, starts="mostly")
-NET = SkillCase("net", stops="told", wins="long")
+NET = SkillCase("net", stops="info", wins="long")
 EVEN = SkillCase("net", max_steps=1, starts="even")
 FOUR = (LEFT, RIGHT, ZIGZAG, PAID)
 BELOW = LevelCase((COUNTS, RIGHT, LEFT), 2, ("edge",), "counts")
@@ -351,7 +351,7 @@ BY_HAND: dict[str, Case] = {
         LevelCase((SkillCase(LevelCase((EVEN, COUNTS), 9, margin=-0.5)), ZIGZAG), 6), masked=True
     ),
     "an automaton": Case(LevelCase(FOUR, 3, selector="automaton")),
-    "told of the last call": Case(LevelCase((LEFT, PAID, NET), 4, selector="last")),
+    "a function of the last call": Case(LevelCase((LEFT, PAID, NET), 4, selector="last")),
     "a guide": Case(LevelCase((NET, LEFT, COUNTS), (1, 4), guide="automaton")),
     "a guide that restricts nothing": Case(
         LevelCase(FOUR, 4, selector="counts", guide="last", guide_restricts=False)

@@ -57,12 +57,12 @@ def agree(played: Played, got: dict[str, Any], want: dict[str, Any], where: str)
             assert got[name] == value, f"{where}: {name}"
 
 
-def compare_told(played: Played, found: list[list[Moment]]) -> None:
+def compare_finished(played: Played, found: list[list[Moment]]) -> None:
     """The episodes that are over have the reference's returns and lengths."""
     over = [moments for moments in found if moments[-1].terminated or moments[-1].truncated]
     wanted = sorted((sum(m.reward for m in moments), len(moments)) for moments in over)
-    assert played.told is not None
-    assert near(sorted(played.told), wanted)
+    assert played.finished is not None
+    assert near(sorted(played.finished), wanted)
 
 
 def near(got: Any, want: Any) -> bool:
@@ -135,8 +135,8 @@ def check(case: Case, user: str) -> list[list[Moment]]:
     played = play(case)
     case = as_played(case, user)
     found = compare(case, played)
-    if played.told is not None:
-        compare_told(played, found)
+    if played.finished is not None:
+        compare_finished(played, found)
     if played.columns is not None:
         root = SEED if user == "OptionsEnv" else (Seeds(SEED) / "env").integer()
         compare_decisions(case, played, root)

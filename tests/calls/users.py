@@ -10,6 +10,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import pytest
 from calls.cases import POLICIES, Case, LevelCase, Worth, guide_of, ready, selector_of, skill_set
 from reference_calls import seeds_of
 
@@ -50,7 +51,7 @@ class Got:
     acted: dict[str, Any]
     observed: dict[str, Any] = field(default_factory=dict)
     overridden: bool | None = None
-    """A reflex acted; None: this user does not tell."""
+    """A reflex acted; None: this user does not report it."""
 
 
 @dataclass
@@ -61,8 +62,8 @@ class Played:
     """Each with its seed; the last ones may be open."""
     columns: list[list[dict[str, Any]]] | None = None
     """Of each environment the decisions, as rows of experience; None: it gives none."""
-    told: list[tuple[float, float]] | None = None
-    """Return and length of the episodes that are over; None: it does not tell."""
+    finished: list[tuple[float, float]] | None = None
+    """Return and length of the episodes that are over; None: this user does not report them."""
     missing: str = "never"
     """A pattern of the names in memories that it does not have."""
     ready_is_guide: bool = False
@@ -111,7 +112,7 @@ class Watch:
         """Watch every step of an engine.
 
         Args:
-            memory: that of all N environments; "overridden" in it tells where reflexes acted.
+            memory: that of all N environments; "overridden" in it is true where reflexes acted.
         """
         step = engine.step
 
@@ -239,7 +240,7 @@ def _collect(case: Case, collector: Any, path: str, learners: dict[str, Any]) ->
     watch.on(collector.engine, lambda: collector.memory | more)
     collector.start(Seeds(SEED))
     columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
-    told: list[tuple[float, float]] = []
+    finished: list[tuple[float, float]] = []
     for i in range(STEPS // case.rows):
         request = Request(
             case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
@@ -248,7 +249,7 @@ def _collect(case: Case, collector: Any, path: str, learners: dict[str, Any]) ->
         collected = collector.collect(request)
         assert collected.steps == case.rows * N, "an environment waited"
         batches = collected.batches
-        told += map(tuple, collected.episodes[:, [0, 2]].tolist())
+        finished += map(tuple, collected.episodes[:, [0, 2]].tolist())
         watch.observed(np.arange(N), collector.memory)
         if path in batches:
             batch = batches[path]
@@ -259,7 +260,7 @@ def _collect(case: Case, collector: Any, path: str, learners: dict[str, Any]) ->
                     row["recurrent_state"] = batch["recurrent_state"][n]
                 columns[n].append(row)
     ready = case.level.ready
-    return Played(watch.episodes, None if ready else columns, told, ready_is_guide=ready)
+    return Played(watch.episodes, None if ready else columns, finished, ready_is_guide=ready)
 
 
 def leads_to_starts(case: Case) -> Played:
@@ -429,6 +430,7 @@ class Session:
 
 def exported(case: Case) -> Played:
     """The runner, which knows nothing of this library; its networks are those of the case."""
+    pytest.importorskip("onnxruntime")
     from skillweave.export import runner as file
 
     with (
