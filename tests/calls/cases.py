@@ -318,7 +318,8 @@ def selector_of(level: LevelCase) -> Any:
 def guide_of(level: LevelCase) -> ActiveGuide | None:
     if level.guide is None:
         return None
-    return ActiveGuide(ready(level, level.guide), level.guide_restricts, tells=True)
+    keeps = level.guide == "automaton"
+    return ActiveGuide(ready(level, level.guide), level.guide_restricts, tells=keeps)
 
 
 # Cases by hand ----------------------------------------------------------------------------------
@@ -353,8 +354,9 @@ BY_HAND: dict[str, Case] = {
     "an automaton": Case(LevelCase(FOUR, 3, selector="automaton")),
     "a function of the last call": Case(LevelCase((LEFT, PAID, NET), 4, selector="last")),
     "a guide": Case(LevelCase((NET, LEFT, COUNTS), (1, 4), guide="automaton")),
+    "a function as a guide": Case(LevelCase((NET, LEFT, COUNTS), 3, guide="last")),
     "a guide that restricts nothing": Case(
-        LevelCase(FOUR, 4, selector="counts", guide="last", guide_restricts=False)
+        LevelCase(FOUR, 4, selector="counts", guide="automaton", guide_restricts=False)
     ),
 }
 

@@ -62,6 +62,8 @@ class Decision:
     mask: list[bool]
     before: dict[str, Any]
     """What the selector remembered."""
+    chances: list[float] | None
+    """The probabilities of the guide's choices."""
 
 
 class Ready:
@@ -176,7 +178,7 @@ class Life:
             )  # fmt: skip
             choice = int(found[0])
         assert mask[choice], "the user of the player chose what may not start"
-        self.decision = Decision(choice, mask, before)
+        self.decision = Decision(choice, mask, before, self.chances)
         skill, length = divmod(choice, len(self.lengths))
         if skill != self.skill:
             policy = self.level.skills[skill].policy

@@ -1,4 +1,4 @@
-"""What a collector makes of a guide: masks, chances, and what is known of the next decision."""
+"""Guides that decide, and the probabilities that collectors keep; tests/calls has the rest."""
 
 from __future__ import annotations
 
@@ -24,39 +24,12 @@ AUTOMATON = Automaton(
 )
 
 
-class Drawn(Choices):
-    """Chooses at random among what is allowed."""
-
-    def __init__(self, num_envs, actions):
-        super().__init__(num_envs, actions)
-        self.rng = np.random.default_rng(0)
-
-    def some(self, rows, obs, mask, memory):
-        action = (mask * self.rng.random(mask.shape)).argmax(1)
-        return Acted(action, None, None)
-
-
 def collector_of(guide, call_steps=2):
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
-    acting = Drawn(N, skills.choices)
+    acting = Choices(N, skills.choices)
     found = DecisionCollector(make_engine(SPEC, N), acting, skills, guide=guide)
     found.start(Seeds(2))
     return found
-
-
-def test_who_is_not_restricted_is_told_what_the_guide_would_do():
-    collector = collector_of(ActiveGuide(bound(AUTOMATON), restricts=False, tells=True))
-    found = collector.collect(next(requests(80))).batches[""]
-    valid = found.valid_rows
-    key = found["obs"][..., KEY] == 1
-    starts = np.stack([key | True, key, key | True, key | True], -1)
-    np.testing.assert_array_equal(found["mask"][valid], starts[valid])
-    assert (found["action"][valid] == 2).any(), "leave is called where the automaton would not"
-    chances = np.exp(found["guide"][valid])
-    np.testing.assert_allclose(chances.sum(1), 1.0, atol=1e-6)
-    search = valid & ~key
-    expected = np.float32([0.95 / 2, 1e-8, 0, 0.95 / 2]) + np.float32([1, 0, 1, 1]) * 0.05 / 3
-    np.testing.assert_allclose(np.exp(found["guide"][search])[0], expected, atol=1e-6)
 
 
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
