@@ -131,6 +131,7 @@ def recorded(step: Step) -> Array:
 
 STOPS: dict[str, Any] = {
     "passed": lambda step: step.next_obs[:, POSITION] >= 2,
+    "home": lambda step: step.next_obs[:, POSITION] % 2 == 0,
     "unlucky": lambda step: (step.elapsed >= 2) & (step.reward < -0.5),
     "info": lambda step: step.timed_out | (step.info["t"] % 5 == 0),
     "acted": lambda step: (step.action == 0) & (step.obs[:, T] % 2 == 1),
@@ -331,6 +332,7 @@ PAID = SkillCase("paid", max_steps=6, stops="unlucky", wins="rich")
 COUNTS = SkillCase("counts", call_steps=2, starts="mostly")
 NET = SkillCase("net", stops="info", wins="long")
 EVEN = SkillCase("net", max_steps=1, starts="even")
+STEADY = SkillCase("net", starts="even", stops="home")  # elsewhere none could follow
 FOUR = (LEFT, RIGHT, ZIGZAG, PAID)
 BELOW = LevelCase((COUNTS, RIGHT, LEFT), 2, ("edge",), "counts")
 MIDDLE = LevelCase((SkillCase(BELOW, max_steps=3), ZIGZAG), 5)
@@ -348,6 +350,9 @@ BY_HAND: dict[str, Case] = {
     ),
     "stuck": Case(LevelCase((SkillCase(LevelCase((EVEN,))), ZIGZAG), 6)),
     "interrupted": Case(LevelCase((COUNTS, LEFT, NET), 9, margin=0.5)),
+    "interrupted where one may start": Case(
+        LevelCase((STEADY, replace(STEADY, policy="counts")), margin=-100.0)
+    ),
     "interrupted below": Case(
         LevelCase((SkillCase(LevelCase((EVEN, COUNTS), 9, margin=-0.5)), ZIGZAG), 6), masked=True
     ),
