@@ -225,6 +225,8 @@ class Case:
     deterministic: bool = True
     rows: int = 1
     """Of a request to a collector."""
+    resumed: bool = False
+    """Half way, another collector goes on from the first one's state."""
 
     @property
     def env(self) -> type[Stroll]:
@@ -339,14 +341,16 @@ MIDDLE = LevelCase((SkillCase(BELOW, max_steps=3), ZIGZAG), 5)
 BY_HAND: dict[str, Case] = {
     "four skills": Case(LevelCase(FOUR, 5)),
     "no limit": Case(LevelCase((LEFT, PAID, NET)), rows=4),
-    "memories": Case(LevelCase((COUNTS, PAID, LEFT), 4, selector="counts"), masked=True),
-    "lengths": Case(LevelCase((LEFT, COUNTS, NET), (1, 3, 8))),
+    "memories": Case(
+        LevelCase((COUNTS, PAID, LEFT), 4, selector="counts"), masked=True, resumed=True
+    ),
+    "lengths": Case(LevelCase((LEFT, COUNTS, NET), (1, 3, 8)), resumed=True),
     "reflexes": Case(LevelCase((LEFT, PAID), 3, ("clock", "shy", "back"))),
     "sampling": Case(
         LevelCase((NET, COUNTS, ZIGZAG), 3, greedy=False, greedy_selector=False), deterministic=True
     ),
     "in three levels": Case(
-        LevelCase((SkillCase(MIDDLE, stops="passed", wins="rich"), LEFT), 7, ("shy",))
+        LevelCase((SkillCase(MIDDLE, stops="passed", wins="rich"), LEFT), 7, ("shy",)), resumed=True
     ),
     "stuck": Case(LevelCase((SkillCase(LevelCase((EVEN,))), ZIGZAG), 6)),
     "interrupted": Case(LevelCase((COUNTS, LEFT, NET), 9, margin=0.5)),
@@ -356,12 +360,13 @@ BY_HAND: dict[str, Case] = {
     "interrupted below": Case(
         LevelCase((SkillCase(LevelCase((EVEN, COUNTS), 9, margin=-0.5)), ZIGZAG), 6), masked=True
     ),
-    "an automaton": Case(LevelCase(FOUR, 3, selector="automaton")),
+    "an automaton": Case(LevelCase(FOUR, 3, selector="automaton"), resumed=True),
     "a function of the last call": Case(LevelCase((LEFT, PAID, NET), 4, selector="last")),
     "a guide": Case(LevelCase((NET, LEFT, COUNTS), (1, 4), guide="automaton")),
     "a function as a guide": Case(LevelCase((NET, LEFT, COUNTS), 3, guide="last")),
     "a guide that restricts nothing": Case(
-        LevelCase(FOUR, 4, selector="counts", guide="automaton", guide_restricts=False)
+        LevelCase(FOUR, 4, selector="counts", guide="automaton", guide_restricts=False),
+        resumed=True,
     ),
 }
 
@@ -440,4 +445,4 @@ def cases(draw: Any) -> Case:
             for s in level.skills
         )
         level = replace(level, skills=tuple(below))
-    return Case(level, draw(st.booleans()), deterministic, draw(of(1, 1, 4)))
+    return Case(level, draw(st.booleans()), deterministic, draw(of(1, 1, 4)), draw(st.booleans()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -186,9 +187,9 @@ def decisions(case: Case) -> Played:
     """A selector that learns, above skills that can act."""
     guide, selector = _first(case)
     skills = skill_set(case.level, policies_of(case.level))
-    engine = engine_of(case)
-    collector = DecisionCollector(engine, selector, skills, keep_rewards=True, guide=guide)
-    return _collect(case, collector, "", {})
+    return _collect(
+        case, lambda: DecisionCollector(engine_of(case), selector, skills, True, guide), "", {}
+    )  # fmt: skip
 
 
 def joint(case: Case) -> Played:
@@ -220,8 +221,11 @@ def joint(case: Case) -> Played:
 
     guide, selector = _first(case)
     skills = skills_of(case.level, "")
-    collector = WovenCollector(engine_of(case), selector, skills, learners, margins, guide)
-    return _collect(case, collector, "selector", learners)
+
+    def make() -> WovenCollector:
+        return WovenCollector(engine_of(case), selector, skills, learners, margins, guide)
+
+    return _collect(case, make, "selector", learners)
 
 
 def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
@@ -233,24 +237,44 @@ def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
     return guide_of(level), Learner(selector_of(level), greedy)
 
 
-def _collect(case: Case, collector: Any, path: str, learners: dict[str, Any]) -> Played:
-    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
-    overridden = getattr(collector, "overridden", None)
-    more = {} if overridden is None else {"overridden": overridden}
-    watch.on(collector.engine, lambda: collector.memory | more)
+def _rounds(
+    case: Case, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
+    learners: dict[str, Any],
+) -> Iterator[Any]:  # fmt: skip
+    """What a collector returns, request by request; perhaps another one goes on half way."""
+    collector, count = make(), STEPS // case.rows
     collector.start(Seeds(SEED))
-    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
-    finished: list[tuple[float, float]] = []
-    for i in range(STEPS // case.rows):
+    for i in range(count):
+        if case.resumed and i == count // 2:
+            state, collector = collector.state(), make()
+            assert not len(collector.restore(state)), "an environment did not repeat itself"
+        if i == 0 or (case.resumed and i == count // 2):
+            watch.on(collector.engine, partial(memory_of, collector))
         request = Request(
             case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
         )  # fmt: skip
-        request = replace(request, below=dict.fromkeys(learners, request))
-        collected = collector.collect(request)
+        collected = collector.collect(
+            replace(request, below=dict.fromkeys(learners, request))
+        )  # fmt: skip
         assert collected.steps == case.rows * N, "an environment waited"
+        watch.observed(np.arange(N), memory_of(collector))
+        yield collected
+
+
+def _collect(
+    case: Case, make: Callable[[], Any], path: str, learners: dict[str, Any]
+) -> Played:  # fmt: skip
+    def memory_of(collector: Any) -> Memory:
+        overridden = getattr(collector, "overridden", None)
+        more = {} if overridden is None else {"overridden": overridden}
+        return collector.memory | more
+
+    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
+    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    finished: list[tuple[float, float]] = []
+    for collected in _rounds(case, watch, make, memory_of, learners):
         batches = collected.batches
         finished += map(tuple, collected.episodes[:, [0, 2]].tolist())
-        watch.observed(np.arange(N), collector.memory)
         if path in batches:
             batch = batches[path]
             names = batch.keys() - {"valid", "recurrent_state"}
@@ -268,14 +292,13 @@ def leads_to_starts(case: Case) -> Played:
     sampled = replace(case.level, greedy=False)
     never = type("Never", (Skill,), {"initiation": lambda self, obs: np.zeros(len(obs), bool)})
     skills = skill_set(case.level, policies_of(sampled))
-    engine = engine_of(case)
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
-    collector = SkillCollector(engine, Anything(), never(), starters=skills)
-    watch.on(engine, lambda: collector._starters._calls)
-    collector.start(Seeds(SEED))
-    for i in range(STEPS):
-        collector.collect(Request(1, (), np.array([GAMMA]), Seeds(0) / i))
-        watch.observed(np.arange(N), collector._starters._calls)
+
+    def make() -> SkillCollector:
+        return SkillCollector(engine_of(case), Anything(), never(), starters=skills)
+
+    for _ in _rounds(case, watch, make, lambda collector: collector._starters._calls, {}):
+        pass
     return Played(watch.episodes, missing=r"^selector\.", chooses=False)
 
 
