@@ -19,6 +19,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.skills import Reflex, Skill
+from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Array, Memory, Step
 
 # The environment --------------------------------------------------------------------------------
@@ -53,6 +54,20 @@ class MaskedStroll(Stroll):
     masked = True
 
 
+ENVS: dict[str, Any] = {
+    "stroll": Stroll,
+    "masked": MaskedStroll,
+    "CartPole": lambda: gym.make("CartPole-v1", max_episode_steps=12),
+    "LunarLander": lambda: gym.make("LunarLander-v3", max_episode_steps=95),
+}
+
+
+@cache
+def spaces(env: str) -> tuple[gym.Space[Any], gym.Space[Any]]:
+    made = ENVS[env]()
+    return made.observation_space, made.action_space
+
+
 # What declarations are made of ------------------------------------------------------------------
 
 
@@ -62,10 +77,13 @@ class Net(AgentPolicy):
     Args:
         choices: among which it chooses.
         size: of its recurrent state: 0 or 1.
+        env: whose observations it acts on.
     """
 
-    def __init__(self, choices: int = 3, size: int = 0, turn: int = 1) -> None:
-        self.observation_space = Walk.observation_space
+    def __init__(
+        self, choices: int = 3, size: int = 0, turn: int = 1, env: str = "stroll"
+    ) -> None:  # fmt: skip
+        self.observation_space = spaces(env)[0]
         self.action_space = gym.spaces.Discrete(choices)
         self.size, self.turn = size, turn
 
@@ -101,6 +119,10 @@ def zigzag(obs: Array) -> Array:
     return (obs[:, T].astype(np.int64) + obs[:, TAG].astype(np.int64)) % 3
 
 
+def of_real(env: str, acts: Any) -> ScriptedPolicy:
+    return ScriptedPolicy(lambda obs: acts(obs).astype(np.int64), *spaces(env))
+
+
 POLICIES: dict[str, Any] = {
     "left": scripted(0),
     "right": scripted(2),
@@ -108,12 +130,21 @@ POLICIES: dict[str, Any] = {
     "net": Net(),
     "counts": Net(size=1),
     "paid": Counting(),  # remembers what it observes
+    "balance": of_real("CartPole", lambda obs: obs[:, 2] + obs[:, 3] > 0),
+    "push": of_real("CartPole", lambda obs: np.zeros(len(obs))),
+    "hover": of_real("LunarLander", lambda obs: np.where(obs[:, 3] < -0.1, 2, 0)),
+    "turn": of_real("LunarLander", lambda obs: np.where(obs[:, 4] > 0, 3, 1)),
 }
-STARTS: dict[str, Any] = {
+WALKS = ("left", "right", "zigzag", "net", "counts", "paid")
+WHERE: dict[str, Any] = {
     "even": lambda obs: obs[:, POSITION] % 2 == 0,
     "left": lambda obs: obs[:, POSITION] < 1,
     "early": lambda obs: obs[:, T] < 4,
     "mostly": lambda obs: obs[:, T] % 3 != 1,
+}
+STARTS = WHERE | {
+    "left of the middle": lambda obs: obs[:, 0] < 0.05,  # CartPole
+    "sinking": lambda obs: obs[:, 3] < 0,  # LunarLander
 }
 SEEN: list[tuple[Any, ...]] = []
 """What terminations that are "recorded" were shown, a row for each step and environment."""
@@ -129,12 +160,16 @@ def recorded(step: Step) -> Array:
     return np.zeros(len(step.reward), bool)
 
 
-STOPS: dict[str, Any] = {
+WHEN: dict[str, Any] = {
     "passed": lambda step: step.next_obs[:, POSITION] >= 2,
     "home": lambda step: step.next_obs[:, POSITION] % 2 == 0,
     "unlucky": lambda step: (step.elapsed >= 2) & (step.reward < -0.5),
     "info": lambda step: step.timed_out | (step.info["t"] % 5 == 0),
     "acted": lambda step: (step.action == 0) & (step.obs[:, T] % 2 == 1),
+}
+STOPS = WHEN | {
+    "fast": lambda step: np.abs(step.next_obs[:, 1]) > 0.4,  # CartPole
+    "rising": lambda step: step.next_obs[:, 3] > 0,  # LunarLander
 }
 WINS: dict[str, Any] = {
     "rich": lambda step: step.reward > 0,
@@ -188,6 +223,8 @@ class LevelCase:
     """Of interruption."""
     greedy: bool = True
     greedy_selector: bool = True
+    env: str = "stroll"
+    """Of the first level."""
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -221,7 +258,6 @@ class Case:
     """A declaration, and how it is played."""
 
     level: LevelCase
-    masked: bool = False
     deterministic: bool = True
     rows: int = 1
     """Of a request to a collector."""
@@ -229,8 +265,13 @@ class Case:
     """Half way, another collector goes on from the first one's state."""
 
     @property
-    def env(self) -> type[Stroll]:
-        return MaskedStroll if self.masked else Stroll
+    def env(self) -> Any:
+        return ENVS[self.level.env]
+
+    @property
+    def steps(self) -> int:
+        """How far collectors go."""
+        return 120 if self.level.env == "LunarLander" else 32
 
 
 # What they become -------------------------------------------------------------------------------
@@ -315,7 +356,7 @@ def selector_of(level: LevelCase) -> Any:
     if level.ready:
         return ready(level, level.selector)
     choices = len(level.skills) * max(1, len(level.lengths))
-    return Net(choices, int(level.selector == "counts"), turn=2)
+    return Net(choices, int(level.selector == "counts"), 2, level.env)
 
 
 def guide_of(level: LevelCase) -> ActiveGuide | None:
@@ -336,13 +377,16 @@ NET = SkillCase("net", stops="info", wins="long")
 EVEN = SkillCase("net", max_steps=1, starts="even")
 STEADY = SkillCase("net", starts="even", stops="home")  # elsewhere none could follow
 FOUR = (LEFT, RIGHT, ZIGZAG, PAID)
+PUSH, FALL = SkillCase("push", max_steps=2), SkillCase("hover", max_steps=5)
+BALANCE = SkillCase("balance", starts="left of the middle", stops="fast")
+HOVER, TURN = SkillCase("hover", starts="sinking", stops="rising"), SkillCase("turn")
 BELOW = LevelCase((COUNTS, RIGHT, LEFT), 2, ("edge",), "counts")
 MIDDLE = LevelCase((SkillCase(BELOW, max_steps=3), ZIGZAG), 5)
 BY_HAND: dict[str, Case] = {
     "four skills": Case(LevelCase(FOUR, 5)),
     "no limit": Case(LevelCase((LEFT, PAID, NET)), rows=4),
     "memories": Case(
-        LevelCase((COUNTS, PAID, LEFT), 4, selector="counts"), masked=True, resumed=True
+        LevelCase((COUNTS, PAID, LEFT), 4, selector="counts", env="masked"), resumed=True
     ),
     "lengths": Case(LevelCase((LEFT, COUNTS, NET), (1, 3, 8)), resumed=True),
     "reflexes": Case(LevelCase((LEFT, PAID), 3, ("clock", "shy", "back"))),
@@ -358,8 +402,10 @@ BY_HAND: dict[str, Case] = {
         LevelCase((STEADY, replace(STEADY, policy="counts")), margin=-100.0)
     ),
     "interrupted below": Case(
-        LevelCase((SkillCase(LevelCase((EVEN, COUNTS), 9, margin=-0.5)), ZIGZAG), 6), masked=True
+        LevelCase((SkillCase(LevelCase((EVEN, COUNTS), 9, margin=-0.5)), ZIGZAG), 6, env="masked")
     ),
+    "CartPole": Case(LevelCase((PUSH, BALANCE), 7, env="CartPole")),
+    "LunarLander": Case(LevelCase((FALL, HOVER, TURN), 7, env="LunarLander"), rows=4),
     "an automaton": Case(LevelCase(FOUR, 3, selector="automaton"), resumed=True),
     "a function of the last call": Case(LevelCase((LEFT, PAID, NET), 4, selector="last")),
     "a guide": Case(LevelCase((NET, LEFT, COUNTS), (1, 4), guide="automaton")),
@@ -380,15 +426,15 @@ def of(*values: Any) -> Any:
 
 @st.composite
 def skill_cases(draw: Any, depth: int, greedy: bool) -> SkillCase:
-    policy: Any = draw(of(*POLICIES))
+    policy: Any = draw(of(*WALKS))
     if depth and draw(of(False, True, True)):
         policy = draw(level_cases(depth - 1, greedy))
     return SkillCase(
         policy,
         max_steps=draw(of(None, 1, 2, 3, 5)),
         call_steps=draw(of(None, None, 1, 2, 4)),
-        starts=draw(of(None, None, *STARTS)),
-        stops=draw(of(None, *STOPS)),
+        starts=draw(of(None, None, *WHERE)),
+        stops=draw(of(None, *WHEN)),
         wins=draw(of(None, *WINS)),
     )
 
@@ -404,7 +450,7 @@ def level_cases(draw: Any, depth: int, sampled_by: bool) -> LevelCase:
     guide = None if selector in kinds[2:] else draw(of(None, None, *("automaton", "last")))
     skills = draw(st.lists(skill_cases(depth, greedy), min_size=1, max_size=3))
     free = SkillCase(
-        draw(of(*POLICIES)), draw(of(None, 2, 3)), stops=draw(of(None, *STOPS)),
+        draw(of(*WALKS)), draw(of(None, 2, 3)), stops=draw(of(None, *WHEN)),
         wins=draw(of(None, *WINS)),
     )  # fmt: skip
     if draw(st.booleans()):
@@ -445,4 +491,5 @@ def cases(draw: Any) -> Case:
             for s in level.skills
         )
         level = replace(level, skills=tuple(below))
-    return Case(level, draw(st.booleans()), deterministic, draw(of(1, 1, 4)), draw(st.booleans()))
+    level = replace(level, env=draw(of("stroll", "masked")))
+    return Case(level, deterministic, draw(of(1, 1, 4)), draw(st.booleans()))

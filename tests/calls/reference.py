@@ -296,7 +296,7 @@ def moments_of(case: Case, seed: int, choices: list[int] | None) -> Iterator[Mom
         step = Step(
             obs[None], np.array([action]), next_obs[None], np.array([reward], np.float32),
             np.array([terminated]), np.array([truncated]), np.zeros(1, bool), np.array([t]),
-            {"t": np.array([info["t"]])},
+            {k: np.array([v]) for k, v in info.items() if k == "t"},
         )  # fmt: skip
         life.observe(step)
         yield Moment(

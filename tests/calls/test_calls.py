@@ -200,8 +200,11 @@ def test_the_cases_by_hand_show_what_can_happen() -> None:
     """In the reference: ends of all kinds at each depth, memories that go on and that do not."""
     seen: Counter[str] = Counter()
     for case in BY_HAND.values():
-        for seed in range(40, 60):
-            moments = episode(case, seed)
+        if case.level.env == "LunarLander":
+            continue
+        episodes = [episode(case, seed) for seed in range(40, 60)]
+        assert {moments[-1].terminated for moments in episodes} == {False, True}
+        for moments in episodes:
             for one, then in itertools.pairwise(moments):
                 happened(one, then, seen)
     assert min(seen.values()) > 5, seen

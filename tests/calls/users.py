@@ -35,7 +35,7 @@ from skillweave.skills import Skill
 from skillweave.training.play import SeededEpisodes, play
 from skillweave.types import Array, Memory, Step
 
-N, STEPS, SEED = 3, 32, 5
+N, SEED = 3, 5
 GAMMA = 0.5  # so that sums are exact
 
 
@@ -242,7 +242,7 @@ def _rounds(
     learners: dict[str, Any],
 ) -> Iterator[Any]:  # fmt: skip
     """What a collector returns, request by request; perhaps another one goes on half way."""
-    collector, count = make(), STEPS // case.rows
+    collector, count = make(), case.steps // case.rows
     collector.start(Seeds(SEED))
     for i in range(count):
         if case.resumed and i == count // 2:
@@ -329,7 +329,7 @@ def alone(case: Case) -> Played:
     overridden = np.zeros(N, bool)
     watch.on(engine, lambda: memory | {"overridden": overridden})
     obs = engine.reset(SEED)
-    for _ in range(STEPS):
+    for _ in range(case.steps):
         overridden[:] = False
         turn = Turn(case.deterministic, overridden=overridden)
         action = player.act(memory, rows, obs, engine.mask(), turn)
@@ -356,7 +356,7 @@ def evaluated(case: Case) -> Played:
     """Whole episodes, in environments of which fewer and fewer act in the end."""
     seeds = [11, 12, 13, 14, 15, 16, 17]
     watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
-    episodes = SeededEpisodes(engine_of(case), seeds, 100)
+    episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
     for played in play(hierarchy(case.level), episodes, deterministic=case.deterministic):
         assert played.chosen is not None
         assert played.after is not None
@@ -402,7 +402,7 @@ def options_env(case: Case) -> Played:
     selector = selector_of(case.level)
     greedy, memory = case.deterministic and case.level.greedy_selector, selector.start(N)
     columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
-    for _ in range(STEPS // 3):
+    for _ in range(case.steps // 3):
         mask = info.get("action_mask")
         choice, memory = selector.act(memory, obs, mask, deterministic=greedy)
         rows = {"obs": obs, "action": choice}
