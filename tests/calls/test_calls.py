@@ -89,7 +89,7 @@ def compare_decisions(case: Case, played: Played, root: int) -> None:
     masks |= case.level.guide is not None
     for column, own in zip(played.columns, seeds, strict=True):
         calls_in_order = (call for seed in own for call in calls(episode(case, seed)))
-        assert len(column) > 2
+        assert len(column) >= 2, "two episodes are over at least"
         for row in column:
             assert ("mask" in row) == ("next_mask" in row) == masks
             assert ("guide" in row) == (case.level.guide == "automaton")
