@@ -39,6 +39,7 @@ TOOLS = (
 )
 TESTS = (
     "tests/algorithms/test_ppo.py",
+    "tests/calls",
     "tests/cli/test_cli.py",
     "tests/collecting/test_skill_rows.py",
     "tests/envs/test_engine.py",

@@ -12,7 +12,7 @@ from skillweave.envs.infos import info_rows, told_success
 from skillweave.errors import EnvError
 from skillweave.experience import INFO, Batch
 from skillweave.skills import Skill, asked
-from skillweave.skills.info_words import keys_told
+from skillweave.skills.info_words import missing_key
 from skillweave.types import Array, Step
 
 
@@ -142,7 +142,7 @@ def raw_columns(step: Step, elapsed: Array, wanted: Sequence[str]) -> dict[str, 
     for name in wanted:
         key = name.removeprefix(INFO)
         if name not in known and key not in step.info:
-            raise EnvError(f"info[{key!r}] is to be recorded, but {keys_told(step.info)}")
+            raise EnvError(f"info[{key!r}] is to be recorded, but {missing_key(step.info)}")
         found[name] = known[name] if name in known else np.asarray(step.info[key])
     return found
 

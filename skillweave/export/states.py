@@ -72,13 +72,14 @@ class States:
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
+        samples = sampled or not skills.greedy_selector
         guide: Any = None if policy.guide is None else policy.guide.selector
         judged = any(
             isinstance(x, Automaton) or getattr(x, "asks_last", False) for x in (selector, guide)
         )
         entry: dict[str, Any] = {
             "kind": "Hierarchy",
-            "selector": self._selector(selector, f"{prefix}selector", sampled),
+            "selector": self._selector(selector, f"{prefix}selector", samples),
             "guide": None if guide is None else self._selector(guide, f"{prefix}guide", False),
             "skills": [self._skill(skills, i, prefix, judged) for i in range(len(skills.skills))],
             "lengths": list(skills.lengths),
@@ -141,7 +142,8 @@ class States:
                 if sampled:
                     raise PolicyError(
                         f"{name} is an automaton that draws among the skills of a state, which the "
-                        "runner does not: train with greedy_skills=True for the skills around it"
+                        "runner does not: set greedy_selector=True for it, and greedy_skills=True "
+                        "for the skills around it"
                     )
                 return self._automaton(selector, name)
             case FunctionSelector():

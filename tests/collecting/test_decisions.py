@@ -1,4 +1,4 @@
-"""Decisions equal a scalar loop, call for call, though no environment waits for another."""
+"""What a selector learns from beside its calls, which tests/calls has: γ, success, info, errors."""
 
 import itertools
 
@@ -6,33 +6,27 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from calls.cases import SEEN, SkillCase, skill_of
 from reference_calls import (
-    EPISODE,
-    POSITION,
     Counter,
-    Counting,
     Left,
     Right,
-    Scalar,
     T,
     Walk,
     Zigzag,
     scripted,
-    seeds_of,
-    shy,
 )
-from toy_acting import Again, Choices, Counts, Given, requests, valid_rows
+from toy_acting import Again, Choices, Given, requests
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 
 N, ALL = 4, (Left, Right, Zigzag, Counter)
@@ -51,93 +45,6 @@ def collector_of(skills, n=N, keep_rewards=False, env=Walk, acting=None, **spec)
     return found
 
 
-def scalars_of(skills, call_steps, n=N, gamma=0.97, reflexes=(), env=Walk):
-    gamma = np.broadcast_to(gamma, n)
-    found = [Scalar(env(), skills, call_steps, float(g), reflexes) for g in gamma]
-    seed = (Seeds(7) / "env").integer()
-    for scalar, seeds in zip(found, seeds_of(seed, n), strict=True):
-        scalar.reset(seeds)
-        scalar.paid, scalar.length = 0.0, 0
-    return found
-
-
-def compare(collected, scalars, exact=False):
-    """Every decision is the scalar loop's next one; how many steps each column's calls took."""
-    experience, episodes = collected.batches[""], []
-    valid = experience.valid_rows
-    assert (valid[:-1] | ~valid[1:]).all(), "a gap within a column"
-    steps = np.zeros(len(scalars), int)
-    for t, n in zip(*np.nonzero(valid), strict=True):
-        scalar = scalars[n]
-        allowed, obs = scalar.allowed(), scalar.obs
-        np.testing.assert_array_equal(experience["obs"][t, n], obs)
-        if experience.get("mask") is not None:
-            assert experience["mask"][t, n].tolist() == allowed
-        want = scalar.call(int(experience["action"][t, n]))
-        assert experience["steps"][t, n] == want.steps
-        near = np.float32(want.reward) if exact else pytest.approx(want.reward, abs=1e-5)
-        assert experience["reward"][t, n] == near
-        assert experience["terminated"][t, n] == want.terminated
-        assert experience["truncated"][t, n] == (want.truncated and not want.terminated)
-        np.testing.assert_array_equal(experience["next_obs"][t, n], want.next_obs)
-        assert experience["dist_params"][t, n, 0] == experience["action"][t, n]
-        if experience.get("rewards") is not None:
-            each = experience["rewards"][t, n]
-            total = (each * scalar.gamma ** np.arange(len(each))).sum()
-            assert total == pytest.approx(want.reward, abs=1e-5)
-            assert not each[want.steps :].any()
-        steps[n] += want.steps
-        scalar.paid, scalar.length = scalar.paid + want.plain, scalar.length + want.steps
-        if want.terminated or want.truncated:
-            episodes.append((scalar.paid, scalar.length))
-            scalar.paid, scalar.length = 0.0, 0
-    told = sorted(map(tuple, collected.episodes[:, [0, 2]]))
-    np.testing.assert_allclose(np.reshape(told, (-1, 2)), np.reshape(sorted(episodes), (-1, 2)))
-    return steps
-
-
-@pytest.mark.fast_cases(2)
-@pytest.mark.parametrize("call_steps", [1, 2, 5, 40])
-@pytest.mark.parametrize("rows", [1, 7, 64])
-def test_every_decision_is_that_of_a_scalar_loop(call_steps, rows):
-    skills = skill_set(*ALL, call_steps=call_steps, reflexes=(shy(),))
-    collector = collector_of(skills, keep_rewards=True)
-    scalars = scalars_of(skills.skills, call_steps, reflexes=skills.reflexes)
-    taken, ticks, ended = np.zeros(N, int), 0, 0
-    for request in itertools.islice(requests(rows), -(-200 // rows)):
-        collected = collector.collect(request)
-        taken += compare(collected, scalars)
-        ticks, ended = ticks + rows, ended + len(collected.episodes)
-        assert collected.steps == rows * N
-    # What is not in a decision yet is in an open call: no step is lost, none invented.
-    open_calls = np.where(collector.memory["end"] == CallEnd.RUNNING, collector.kept["tau"], 0)
-    np.testing.assert_array_equal(taken + open_calls, ticks)
-    assert ended > 20
-
-
-BACK = Reflex(lambda obs: obs[:, POSITION] <= -2, lambda obs: 1 + (obs[:, T] % 2).astype(int))
-
-
-@pytest.mark.parametrize("call_steps", [3, None])
-@pytest.mark.parametrize("reflexes", [(BACK, shy()), (shy(), BACK)])
-def test_reflexes_override_and_the_last_one_wins(call_steps, reflexes):
-    skills = skill_set(Left, Counter, call_steps=call_steps, reflexes=reflexes)
-    collector = collector_of(skills)
-    scalars = scalars_of(skills.skills, call_steps, reflexes=reflexes)
-    for request in itertools.islice(requests(40), 4):
-        compare(collector.collect(request), scalars)
-    for env, scalar in zip(collector.engine._envs.envs, scalars, strict=True):
-        assert env.unwrapped.log[: len(scalar.env.log)] == scalar.env.log
-    assert {a for s in scalars for _, _, a in s.env.log} == {0, 1, 2}
-
-
-def test_a_power_of_two_as_gamma_agrees_to_the_last_bit():
-    skills = skill_set(*ALL, call_steps=7)
-    collector, scalars = collector_of(skills), scalars_of(skills.skills, 7, gamma=0.5)
-    for request in itertools.islice(requests(50, gamma=0.5), 3):
-        assert compare(collector.collect(request), scalars, exact=True).sum() > 100
-
-
 class Members(Choices):
     """As many members as environments, each with a γ of its own."""
 
@@ -149,129 +56,14 @@ class Members(Choices):
 def test_every_member_has_its_own_gamma_and_the_rewards_of_each_step_are_kept():
     skills, gamma = skill_set(*ALL, call_steps=40), np.linspace(0.5, 1.0, N)
     collector = collector_of(skills, keep_rewards=True, acting=Members(N, len(ALL)))
-    scalars = scalars_of(skills.skills, 40, gamma=gamma)
-    widths = set()
     for request in itertools.islice(requests(60, gamma), 3):
-        collected = collector.collect(request)
-        compare(collected, scalars)
-        widths.add(collected.batches[""]["rewards"].shape)
-    assert all(width >= 13 for _, _, width in widths)
+        found = collector.collect(request).batches[""]
+        each = found["rewards"]
+        assert each.shape[2] >= 13
+        kept = gamma[:, None] ** np.arange(each.shape[2])
+        np.testing.assert_allclose(found["reward"], (kept * each).sum(-1), atol=1e-5)
     plain = collector_of(skills).collect(next(requests(60))).batches[""]
     assert "rewards" not in plain
-
-
-class Push(Skill):
-    """CartPole: to the left."""
-
-    max_steps = 2
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
-
-
-class Balance(Skill):
-    """CartPole: against the fall, while the cart is left of the middle."""
-
-    policy = ScriptedPolicy(lambda obs: (obs[:, 2] + obs[:, 3] > 0).astype(np.int64), None, None)
-
-    def initiation(self, obs):
-        return obs[:, 0] < 0.05
-
-    def termination(self, step):
-        return np.abs(step.next_obs[:, 1]) > 0.4
-
-
-class Hover(Skill):
-    """LunarLander: the main engine while sinking, until rising."""
-
-    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 3] < -0.1, 2, 0), None, None)
-
-    def initiation(self, obs):
-        return obs[:, 3] < 0
-
-    def termination(self, step):
-        return step.next_obs[:, 3] > 0
-
-
-class Turn(Skill):
-    """LunarLander: against the lean."""
-
-    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 4] > 0, 3, 1), None, None)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kinds", "limit"),
-    [("CartPole-v1", (Push, Balance), 23), ("LunarLander-v3", (Push, Hover, Turn), 95)],
-)
-def test_real_environments_agree_with_a_scalar_loop(env_id, kinds, limit):
-    def make():
-        return gym.make(env_id, max_episode_steps=limit)
-
-    skills = skill_set(*kinds, call_steps=7)
-    collector, scalars = collector_of(skills, env=make), scalars_of(skills.skills, 7, env=make)
-    terminated = truncated = 0
-    for request in itertools.islice(requests(100), 4):
-        collected = collector.collect(request)
-        compare(collected, scalars)
-        valid = collected.batches[""]["valid"]
-        valid = ... if valid is None else valid
-        terminated += collected.batches[""]["terminated"][valid].sum()
-        truncated += collected.batches[""]["truncated"][valid].sum()
-    assert terminated
-    assert truncated
-
-
-def test_calls_of_different_lengths_do_not_wait_for_each_other():
-    class Long(Skill):
-        max_steps = 50
-        policy = Zigzag.policy
-
-    class Short(Skill):
-        max_steps = 1
-        policy = Zigzag.policy
-
-    collector = collector_of(skill_set(Long, Short, call_steps=None))
-    counts = np.zeros(N, int)
-    for request in itertools.islice(requests(32), 6):
-        experience = collector.collect(request).batches[""]
-        counts += experience.valid_rows.sum(0)
-    assert counts.max() > counts.min(), "columns are not ragged"
-
-
-def test_masks_of_successors_are_those_of_the_next_decision():
-    collector = collector_of(skill_set(*ALL))
-    experience = collector.collect(next(requests(128))).batches[""]
-    checked = 0
-    for n in range(N):
-        for now, then in itertools.pairwise(valid_rows(experience, n)):
-            mask = experience["next_mask"][now, n]
-            if experience["terminated"][now, n]:
-                assert mask.all()
-            elif not experience["truncated"][now, n]:
-                assert mask.tolist() == experience["mask"][then, n].tolist()
-                checked += 1
-    assert checked > 20
-
-
-def test_where_no_skill_may_start_it_says_so():
-    collector = collector_of(skill_set(Right, call_steps=3))
-    with pytest.raises(SkillweaveError, match="no skill may start in observation"):
-        collector.collect(next(requests(256)))
-
-
-@pytest.mark.parametrize("rows", [3, 64])
-def test_restored_it_goes_on_as_if_it_had_not_been_stopped(rows):
-    def fresh():
-        return collector_of(skill_set(*ALL), keep_rewards=True, env=Again)
-
-    first, asked = fresh(), requests(rows)
-    for _ in range(3):
-        first.collect(next(asked))
-    again = fresh()
-    assert not len(again.restore(first.state()))
-    for request in [next(asked) for _ in range(3)]:
-        one, two = first.collect(request), again.collect(request)
-        for name in ("obs", "action", "reward", "steps", "terminated", "next_obs", "rewards"):
-            np.testing.assert_array_equal(one.batches[""][name], two.batches[""][name])
-        np.testing.assert_array_equal(one.episodes, two.episodes)
 
 
 class Told(Again):
@@ -312,122 +104,24 @@ def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selecto
     assert kinds == {"0.0", "1.0", "nan"}
 
 
-# Memory ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rows", [1, 7, 60])
-def test_a_selectors_memory_goes_on_from_decision_to_decision_within_an_episode(rows):
-    skills = skill_set(*ALL)
-    collector = collector_of(skills, acting=Counts(N, len(ALL)))
-    scalars, remembered, begun, across = scalars_of(skills.skills, 5), np.zeros(N), 0, 0
-    begins = np.ones(N, bool)
-    for request in itertools.islice(requests(rows), 140 // rows):
-        experience = collector.collect(request).batches[""]
-        for n in range(N):
-            for at, t in enumerate(valid_rows(experience, n)):
-                want = scalars[n].call(int(experience["action"][t, n]))
-                remembered[n] = 0 if begins[n] else remembered[n]
-                assert experience["episode_start"][t, n] == begins[n]
-                assert experience["dist_params"][t, n, 0] == remembered[n]
-                if at == 0:
-                    assert experience["recurrent_state"][n, 0] == remembered[n]
-                    across += not begins[n]
-                begun += begins[n]
-                begins[n] = want.terminated or want.truncated
-                remembered[n] += 1
-    assert begun > 20
-    assert across
-
-
-def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory():
-    class Remembering(Skill):
-        policy = Counting(1000, action_space=gym.spaces.Discrete(1000))
-
-    class Long(Walk):
-        action_space = gym.spaces.Discrete(1000)
-
-        def reset(self, **how):
-            found = super().reset(**how)
-            self.length, self.end = 11, 0
-            return found
-
-        def step(self, action):
-            obs, _, *rest = super().step(action)
-            return obs, 0.0, *rest
-
-    acting = Given(2)
-    skills = skill_set(Remembering, Zigzag, call_steps=3)
-    collector, asked = collector_of(skills, 2, env=Long, acting=acting), requests(1)
-    for t in range(14):  # a call has three steps; that in which the episode ends has two
-        acting.then = np.array([0, int(3 <= t < 6)])
-        collector.collect(next(asked))
-    acted = [[a for _, _, a in e.unwrapped.log] for e in collector.engine._envs.envs]
-    assert acted[0] == [*range(11), *range(3)]
-    assert acted[1][:3] + acted[1][6:] == [0, 1, 2, *range(5), *range(3)]
-
-
 # What skills see -------------------------------------------------------------------------------
 
 
-def recorder(seen, max_steps=None):
-    """A skill that writes down every step that its termination was shown."""
-
-    def termination(self, step):
-        for i in range(len(step.reward)):
-            key = (step.obs[i, 0].item(), step.obs[i, EPISODE].item(), step.obs[i, T].item())
-            seen[key] = (
-                step.next_obs[i].tolist(), step.reward[i].item(), bool(step.terminated[i]),
-                bool(step.truncated[i]), bool(step.timed_out[i]), int(step.elapsed[i]),
-                int(np.asarray(step.info["t"]).reshape(-1)[i]), int(step.action[i]),
-            )  # fmt: skip
-        return np.zeros(len(step.reward), bool)
-
-    attributes = {"termination": termination, "max_steps": max_steps, "policy": scripted(2)}
-    return type("Recorder", (Skill,), attributes)
-
-
-def test_termination_sees_the_step_of_its_own_environment_and_call():
-    seen, expected = {}, 0
-    collector = collector_of(skill_set(Left, recorder(seen, 3), call_steps=4))
-    for request in itertools.islice(requests(60), 3):
-        experience = collector.collect(request).batches[""]
-        for n in range(N):
-            for t in valid_rows(experience, n):
-                if experience["action"][t, n] != 1:
-                    continue
-                tag, episode, time, position = experience["obs"][t, n].tolist()
-                tau = experience["steps"][t, n]
-                for k in range(1, tau + 1):
-                    row, _, ended, _, timed_out, elapsed, told, _ = seen[tag, episode, time + k - 1]
-                    assert row == [tag, episode, time + k, position + k]
-                    assert (elapsed, told) == (k, time + k)
-                    assert ended == (experience["terminated"][t, n] and k == tau)
-                    assert ended or timed_out == (k == 3)
-                    expected += 1
-    assert expected > 100
-
-
 def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training():
-    in_training, in_calls, rows = {}, {}, next(requests(3))
+    shows, seen = SkillCase("right", max_steps=3, stops="recorded"), []
     engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
-    alone = SkillCollector(engine, Given(200), recorder(in_training, 3)())
+    alone = SkillCollector(engine, Given(200), skill_of(shows, "shows"))
     alone.start(Seeds(7))
     alone.acting.then = np.full(200, 2)
-    called = collector_of(skill_set(recorder(in_calls, 3), call_steps=None), 200)
-    alone.collect(rows)
-    called.collect(rows)
-    ends = [v for v in in_calls.values() if v[5] == 3]
-    assert any(v[2] for v in ends), "no episode terminated on the skill's last step"
-    assert any(not v[2] for v in ends)
-    assert in_calls == in_training
-    assert len(in_calls) == 600
-
-
-def test_a_skill_that_watches_sees_the_action_that_reflexes_left():
-    seen, late = {}, Reflex(lambda obs: obs[:, T] >= 5, 0)
-    collector = collector_of(skill_set(recorder(seen), reflexes=(late,)))
-    collector.collect(next(requests(60)))
-    assert {(t >= 5, told[-1]) for (_, _, t), told in seen.items()} == {(False, 2), (True, 0)}
+    skills = SkillSet((skill_of(shows, "shows"),), (scripted(2),))
+    for collector in (alone, collector_of(skills, 200)):
+        SEEN.clear()
+        collector.collect(next(requests(3)))
+        seen.append(set(SEEN))
+    assert seen[0] == seen[1]
+    assert len(seen[0]) == 600
+    ends = [row for row in seen[0] if row[-2] == 3]
+    assert {row[-5] for row in ends} == {True, False}, "terminated on the skill's last step or not"
 
 
 class Nested(gym.Env):
@@ -475,12 +169,6 @@ def test_a_skill_sees_its_own_rows_of_info_however_deep():
 
 
 # What is wrong ---------------------------------------------------------------------------------
-
-
-def test_without_initiation_sets_there_is_no_mask():
-    experience = collector_of(skill_set(Left, Zigzag)).collect(next(requests(9))).batches[""]
-    assert experience.get("mask") is None
-    assert experience.get("next_mask") is None
 
 
 def test_where_no_skill_may_start_the_error_names_them_all():
@@ -583,19 +271,3 @@ def test_skills_go_on_sampling_anew_from_call_to_call():
         collector.collect(request)
     acted = [a for _, _, a in collector.engine._envs.envs[0].unwrapped.log]
     assert len({tuple(acted[i : i + 3]) for i in range(0, 90, 3)}) > 10
-
-
-def test_greedy_skills_are_told_so_and_others_are_not():
-    asked = []
-
-    class Asked(Sampler):
-        def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
-            asked.append(deterministic)
-            return np.zeros(len(obs), np.int64), memory
-
-    for greedy in (True, False):
-        policy = Asked(None, Walk.observation_space, Walk.action_space)
-        skills = SkillSet((Die(),), (policy,), call_steps=2, greedy=greedy)
-        collector_of(skills).collect(next(requests(3)))
-        assert asked == [greedy] * 3
-        asked.clear()

@@ -1,20 +1,17 @@
-"""What a collector makes of a guide: masks, chances, and what is known of the next decision."""
+"""Guides that decide, and the probabilities that collectors keep; tests/calls has the rest."""
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from ready_selectors.chain import DOOR, KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
-from toy_acting import Choices, requests, valid_rows
+from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
+from toy_acting import Choices, requests
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import joined_collected
 from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.guide import SMOOTHED, ActiveGuide, as_logits
-from skillweave.collecting.lengths import Lengths
 from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
 from skillweave.selectors import Automaton
@@ -27,62 +24,12 @@ AUTOMATON = Automaton(
 )
 
 
-class Drawn(Choices):
-    """Chooses at random among what is allowed."""
-
-    def __init__(self, num_envs, actions):
-        super().__init__(num_envs, actions)
-        self.rng = np.random.default_rng(0)
-
-    def some(self, rows, obs, mask, memory):
-        action = (mask * self.rng.random(mask.shape)).argmax(1)
-        return Acted(action, None, None)
-
-
-def of_state(obs):
-    """The skills that the automaton allows: here its state can be told from the observation."""
-    key, door = obs[..., KEY] == 1, obs[..., DOOR] == 1
-    return np.stack([~key, key & ~door, door, ~door], -1)
-
-
 def collector_of(guide, call_steps=2):
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
-    acting = Drawn(N, skills.choices)
+    acting = Choices(N, skills.choices)
     found = DecisionCollector(make_engine(SPEC, N), acting, skills, guide=guide)
     found.start(Seeds(2))
     return found
-
-
-@pytest.mark.parametrize("call_steps", [2, Lengths(1, 3)])
-def test_only_what_the_automatons_state_allows_is_called(call_steps):
-    collector, seen = collector_of(ActiveGuide(bound(AUTOMATON)), call_steps), set()
-    lengths = collector.skills.choices // 4
-    for request in itertools.islice(requests(60), 3):
-        found = collector.collect(request).batches[""]
-        assert found.get("guide") is None
-        valid = found.valid_rows
-        allowed = of_state(found["obs"]).repeat(lengths, -1)
-        np.testing.assert_array_equal(found["mask"][valid], allowed[valid])
-        on = valid & ~found["terminated"]
-        ahead = of_state(found["next_obs"]).repeat(lengths, -1)
-        np.testing.assert_array_equal(found["next_mask"][on], ahead[on])
-        seen |= set(np.unique(found["action"][valid] // lengths).tolist())
-    assert seen == {0, 1, 2, 3}
-
-
-def test_who_is_not_restricted_is_told_what_the_guide_would_do():
-    collector = collector_of(ActiveGuide(bound(AUTOMATON), restricts=False, tells=True))
-    found = collector.collect(next(requests(80))).batches[""]
-    valid = found.valid_rows
-    key = found["obs"][..., KEY] == 1
-    starts = np.stack([key | True, key, key | True, key | True], -1)
-    np.testing.assert_array_equal(found["mask"][valid], starts[valid])
-    assert (found["action"][valid] == 2).any(), "leave is called where the automaton would not"
-    chances = np.exp(found["guide"][valid])
-    np.testing.assert_allclose(chances.sum(1), 1.0, atol=1e-6)
-    search = valid & ~key
-    expected = np.float32([0.95 / 2, 1e-8, 0, 0.95 / 2]) + np.float32([1, 0, 1, 1]) * 0.05 / 3
-    np.testing.assert_allclose(np.exp(found["guide"][search])[0], expected, atol=1e-6)
 
 
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
@@ -109,27 +56,6 @@ def test_logits_are_smoothed_among_what_is_allowed():
     assert found[1].tolist() == pytest.approx(
         [(1 - SMOOTHED) / 2 + SMOOTHED / 3] * 2 + [SMOOTHED / 3]
     )
-
-
-def test_events_see_the_time_of_the_episode_as_they_do_when_the_hierarchy_acts():
-    def late(step):
-        return step.elapsed == 4
-
-    clock = Automaton({"early": "get_key", "late": "wait"}, {("early", "late"): late})
-    skills = (Leave(), Wait(), type("Again", (Leave,), {"name": "get_key"})())
-    skill_set = SkillSet(skills, tuple(s.policy for s in skills), call_steps=1)
-    names = tuple(s.name for s in skills)
-    guide = ActiveGuide(bound(clock, names), decides=True)
-    collector = DecisionCollector(
-        make_engine(SPEC, N), Choices(N, len(SKILLS)), skill_set, guide=guide
-    )
-    collector.start(Seeds(2))
-    found = collector.collect(next(requests(60))).batches[""]
-    for n in range(N):
-        t = 0
-        for row in valid_rows(found, n):
-            assert names[found["action"][row, n]] == ("get_key" if t < 4 else "wait"), t
-            t = 0 if found.ended[row, n] else t + int(found["steps"][row, n])
 
 
 @pytest.mark.parametrize("tells", [False, True])

@@ -11,13 +11,12 @@ from test_woven import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
 
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.seeding import Seeds
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Reflex
 
 
 def far(obs):
@@ -25,18 +24,6 @@ def far(obs):
 
 
 BACK = Reflex(far, 0)
-
-
-class Inside(Skill):
-    """A hierarchy."""
-
-
-class Chooser(Learner):
-    """A selector of two skills."""
-
-    def __init__(self, num_envs):
-        super().__init__(num_envs)
-        self.actions = 2
 
 
 class Begins(Down):
@@ -88,39 +75,6 @@ def test_rows_of_skills_that_learn_under_a_selector():
             np.testing.assert_array_equal(moved[clear], rows["action"][clear] - 1)
             seen += mine.sum()
     assert seen > 4
-
-
-def low(obs):
-    return obs[:, POSITION] < 2
-
-
-def test_reflexes_of_a_hierarchy_below_hold_where_it_acts_and_those_above_come_last():
-    inner = SkillSet((Down(), Stay()), (None, Stay.policy), (Reflex(low, 2), Reflex(far, 2)), 2)
-    skills = SkillSet(
-        (Up(), Inside()), (None, UntrainedHierarchy(inner, None)), (BACK,), call_steps=3
-    )
-    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    learners = {"up": Learner(N), "inside/down": Learner(N), "inside/selector": Chooser(N)}
-    collector = WovenCollector(engine, Choices(N, 2), skills, learners)
-    collector.start(Seeds(7))
-    seen = np.zeros(3, int)
-    for request in itertools.islice(asked(40, learners), 4):
-        batches = collector.collect(request).batches
-        up, down = batches["up"], batches["inside/down"]
-        position = up["obs"][..., POSITION]
-        moved = up["next_obs"][..., POSITION] - position
-        for rows, below in ((up, False), (down, True)):
-            high, beneath = rows["valid"] & (position > 1), rows["valid"] & (position < 2)
-            np.testing.assert_array_equal(
-                rows["overridden"][rows["valid"]],
-                ((position > 1) | (below & (position < 2)))[rows["valid"]],
-            )
-            assert (moved[high] == -1).all()
-            assert not below or (moved[beneath] == 1).all()
-            own = rows["valid"] & ~rows["overridden"]
-            np.testing.assert_array_equal(moved[own], rows["action"][own] - 1)
-            seen += (below * high.sum(), below * beneath.sum(), (not below) * beneath.sum())
-    assert (seen > 2).all()
 
 
 def test_reflexes_are_in_force_while_skills_learn():

@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference_calls import EPISODE, POSITION, T, Walk
+from reference_calls import EPISODE, POSITION, Walk
 from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import Interruption, SkillSet
+from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.player import Player
 from skillweave.collecting.woven import WovenCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
@@ -156,48 +155,6 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
 
 
 # Of three skills; the last column, where there is one, is what deciding anew is worth.
-ANEW = np.array(
-    [[0.0, 1.0, 9.0, 1.6], [0.0, 1.0, 9.0, 1.4], [2.0, 1.0, 3.0, 3.1], [0.0, 9.0, 9.0, 0.0]]
-)
-
-
-def test_a_call_is_cut_where_it_is_worth_clearly_more_to_decide_anew():
-    worth = ANEW
-    skills = tuple(kind() for kind in (Down, Stay, Down))
-    policy = Stay.policy
-    cuts = Interruption(lambda obs: worth[obs[:, T].astype(int)], 0.5)
-    found = Player(SkillSet(skills, (policy,) * 3, call_steps=9, interruption=cuts))
-    memory, rows = found.start(4), np.arange(4)
-    found.begin(memory, rows, np.array([1, 1, 2, 0]))
-    obs = np.zeros((4, 3), np.float32)
-    obs[:, T] = np.arange(4)
-    no = np.zeros(4, bool)
-    step = Step(obs, np.ones(4, int), obs, np.zeros(4), no, no, no, np.ones(4, int), {})
-    why = found.observe(memory, rows, step)
-    assert why.tolist() == [CallEnd.INTERRUPTED, CallEnd.RUNNING, CallEnd.RUNNING, CallEnd.RUNNING]
-
-
-class AtFirst(Down):
-    """May start at the first step alone."""
-
-    def initiation(self, obs):
-        return obs[:, T] == 0
-
-
-def test_a_call_goes_on_where_no_skill_may_start():
-    worth = np.array([0.0, 9.0, 9.0])
-    cuts = Interruption(lambda obs: np.tile(worth, (len(obs), 1)), 0.5)
-    skills = (AtFirst(), AtFirst())
-    found = Player(SkillSet(skills, (Stay.policy,) * 2, call_steps=9, interruption=cuts))
-    memory, rows = found.start(2), np.arange(2)
-    found.begin(memory, rows, np.array([0, 0]))
-    obs = np.zeros((2, 3), np.float32)
-    obs[1, T] = 1
-    no = np.zeros(2, bool)
-    step = Step(obs, np.ones(2, int), obs, np.zeros(2), no, no, no, np.ones(2, int), {})
-    assert found.observe(memory, rows, step).tolist() == [CallEnd.INTERRUPTED, CallEnd.RUNNING]
-
-
 @pytest.mark.parametrize("margin", [None, 0.5])
 def test_a_critic_is_told_where_calls_begin(margin):
     collector = collector_of(5, margin)
@@ -215,21 +172,6 @@ def test_a_critic_is_told_where_calls_begin(margin):
             assert (stream["call_start"][:at, n] == begins[:at]).all()
             assert stream["call_start"][at:, n].sum() <= 1  # the call that is open at the end
             assert begins.sum() > 3
-
-
-def test_a_choice_is_a_skill_and_a_length():
-    skills = SkillSet((Down(), Stay()), (Stay.policy,) * 2, call_steps=Lengths(1, 4, 16))
-    assert skills.choices == 6
-    player, rows, no = Player(skills), np.arange(3), np.zeros(3, bool)
-    memory = player.start(3)
-    player.begin(memory, rows, np.array([0, 4, 5]))
-    assert memory["skill"].tolist() == [0, 1, 1]
-    assert memory["limit"].tolist() == [1, 4, 16]
-    obs = np.zeros((3, 4), np.float32)
-    step = Step(obs, np.ones(3, int), obs, np.zeros(3), no, no, no, np.ones(3, int), {})
-    found = [player.observe(memory, rows, step).tolist() for _ in range(4)]
-    assert found[0] == [CallEnd.LIMIT, CallEnd.RUNNING, CallEnd.RUNNING]
-    assert found[3] == [CallEnd.LIMIT, CallEnd.LIMIT, CallEnd.RUNNING]
 
 
 def test_a_learner_of_the_library_acts_and_its_head_is_kept():

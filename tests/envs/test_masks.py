@@ -23,13 +23,9 @@ from skillweave import (
 )
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
 from skillweave.collecting.skill_rows import SkillCollector
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.hierarchy.options import OptionsEnv
-from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Array
@@ -294,55 +290,7 @@ def test_a_hierarchy_learns_to_drive_gymnasiums_taxi_by_its_masks(tmp_path):
         assert run.evaluate(5, skill=skill, deterministic=False).mean >= -20
 
 
-# Skills under a selector -------------------------------------------------------------------------
-
-
-class Masked(ScriptedPolicy):
-    """Takes the first action that is allowed; writes down what it was told."""
-
-    def __init__(self) -> None:
-        super().__init__(lambda obs: None, Gate.observation_space, Gate.action_space)
-        self.seen: list[tuple[Array, Array]] = []
-
-    def act(self, memory: Any, obs: Array, mask: Any = None, **_: Any) -> Any:
-        self.seen.append((obs.copy(), mask.copy()))
-        return first_allowed(mask), memory
-
-
-def constant(choice: int, count: int) -> ScriptedPolicy:
-    space = gym.spaces.Discrete(count)
-    return ScriptedPolicy(lambda obs: np.full(len(obs), choice), Gate.observation_space, space)
-
-
-def woven(policies: tuple[Any, ...]) -> SkillSet:
-    kinds = [type(f"S{i}", (Skill,), {"max_steps": 1 + i})() for i in range(len(policies))]
-    return SkillSet(tuple(kinds), policies, call_steps=4)
-
-
-@pytest.mark.parametrize("nested", [False, True])
-def test_each_skill_is_told_the_masks_of_its_own_environments(nested):
-    masked = Masked(), Masked()
-    inner: Any = masked[1]
-    if nested:
-        inner = HierarchyPolicy(constant(0, 1), woven((masked[1],)))
-    skills = woven((masked[0], inner))
-    env = OptionsEnv(make_engine(EnvSpec(Gate), 4), skills, 0.9)
-    env.reset(seed=0)
-    for t in range(30):
-        _, info = env.step((np.arange(4) + t) % 2)[-2:]
-        assert "action_mask" not in info, "the selector's masks are of skills"
-    learner = make_algorithm(LEARNERS[0], Gate.observation_space, gym.spaces.Discrete(2))
-    params = learner.acting_params(learner.init([Seeds(0)]), 0.0)
-    decides = DecisionCollector(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skills)
-    decides.start(Seeds(0))
-    told = decides.collect(Request(60, (params,), np.array([0.9]), Seeds(1))).batches[""]
-    assert "mask" not in told, "the selector's masks are of skills"
-    policy = HierarchyPolicy(constant(1, 2), skills)
-    evaluate(policy, EnvSpec(Gate), episodes=7, num_envs=3)
-    for part in masked:
-        assert len(part.seen) > 20
-        for obs, mask in part.seen:
-            assert mask.tolist() == wanted(obs).tolist()
+# Policies made elsewhere ------------------------------------------------------------------------
 
 
 def test_what_a_policy_made_elsewhere_takes_is_for_the_environment_to_judge():

@@ -7,44 +7,19 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from reference_calls import Counter, Left, Right, Walk, Zigzag, shy
+from reference_calls import Counter, Left, Walk
 from test_networks import NESTED, agent, one_by_one
-from test_state_machine import LongWalk, nested, skill_set, trained
 
-from skillweave import PPO, EnvSpec, Hierarchy, Network, SkillweaveError, evaluate, from_function
+from skillweave import PPO, EnvSpec, Hierarchy, Network, SkillweaveError, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
 
 torch.set_num_threads(1)
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize(
-    "make",
-    [nested, lambda: trained(skill_set(Counter, Right, Zigzag, reflexes=(shy(),)))],
-    ids=["nested", "memory"],
-)
-def test_a_player_gets_the_returns_of_an_evaluation(make: Any) -> None:
-    policy = make()
-    found = evaluate(policy, EnvSpec(LongWalk), episodes=4, num_envs=4)
-    player, returns = Player(policy), []
-    for i in range(4):
-        env = LongWalk()  # it shows the number of its episode
-        obs, info = env.reset(seed=1_000_000 + i)
-        player.reset()
-        reward, total, over = 0.0, 0.0, False
-        while not over:
-            action = player.act(obs, reward=reward, info=info)
-            obs, reward, terminated, truncated, info = env.step(action)
-            total, over = total + reward, terminated or truncated
-        returns.append(total)
-    assert returns == pytest.approx(found.returns, rel=1e-5)
 
 
 def test_a_run_acts_and_forgets_when_told(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A hierarchy's state machine: the runner calls the same skills as the hierarchy, step by step."""
+"""A hierarchy with networks, exported; tests/calls compares the state machine with the player."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ import torch
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 
-from skillweave import PPO, RNN, Automaton, Lengths, Network, Reflex, SkillweaveError, tree
+from skillweave import PPO, RNN, Automaton, Network, Reflex, SkillweaveError, tree
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.export import states
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
@@ -106,13 +105,6 @@ def trained(skills: SkillSet, seed: int = 1) -> HierarchyPolicy:
     return HierarchyPolicy(network(skills.choices, seed=seed), skills)
 
 
-def by_place(obs: Array, last: Any) -> Array:
-    """Goes on with a skill whose call succeeded."""
-    turn = (obs[:, T].astype(int) + last.why) % 3
-    again = np.where(last.succeeded & (last.skill == 1), 1, turn)
-    return np.where(obs[:, POSITION] % 2 == 0, again, 2 * (turn > 0))  # where it may start
-
-
 def far(step: Step) -> Array:
     return np.abs(step.next_obs[:, POSITION]) + step.reward * 0 > 2
 
@@ -127,31 +119,6 @@ def nested() -> HierarchyPolicy:
     return trained(skill_set(Inner, Zigzag, call_steps=8), seed=5)
 
 
-class Even(Skill):
-    """May start at even positions alone, and takes one step."""
-
-    max_steps = 1
-    policy = network(3, seed=7)
-
-    def initiation(self, obs: Array) -> Array:
-        return obs[:, POSITION] % 2 == 0
-
-
-def waiting() -> HierarchyPolicy:
-    """A hierarchy that may act only where its skill may start, and so stops elsewhere."""
-
-    class Inner(Skill):
-        policy = trained(skill_set(Even))
-
-    return trained(skill_set(Inner, Zigzag, call_steps=6), seed=5)
-
-
-def guided(guide: Any, **how: Any) -> HierarchyPolicy:
-    skills = skill_set(Careful, Left, Zigzag, Right, **how)
-    asked: Any = ready(guide, skills).selector
-    return HierarchyPolicy(network(skills.choices, seed=6), skills, ActiveGuide(asked))
-
-
 def critic_of(skills: int, **how: Any) -> Any:
     algorithm = SkillCritic(network=Network((8,)), normalize_obs=False, **how)
     return agent(algorithm, OBS, gym.spaces.Discrete(skills), seed=2)
@@ -162,49 +129,16 @@ def interrupted(margin: float, **how: Any) -> HierarchyPolicy:
     return trained(with_interruption(skills, critic_of(3, **how), margin))
 
 
-class Steady(Even):
-    """Starts and ends at even positions: at odd ones nobody could follow."""
-
-    max_steps = None
-
-    def termination(self, step: Step) -> Array:
-        return step.next_obs[:, POSITION] % 2 == 0
-
-
-class Steadier(Steady):
-    policy = network(3, seed=8)
-
-
-def always_better() -> HierarchyPolicy:
-    """Deciding anew is always worth more, so calls are cut wherever a skill may start."""
-    skills = skill_set(Steady, Steadier, call_steps=None)
-    return trained(with_interruption(skills, critic_of(2, deciding=True), -100.0))
-
-
 AUTOMATON = Automaton(
     {"near": ["careful", "left"], "far": "zigzag", "home": ["right", "zigzag"]},
     {("near", "far"): far, ("far", "home"): "failure", ("home", "near"): "success",
      ("home", "far"): "failure"},
 )  # fmt: skip
 POLICIES: dict[str, Any] = {
-    "initiation and termination": lambda: trained(skill_set(Careful, Right, Free)),
-    "lengths": lambda: trained(skill_set(Left, Right, Free, call_steps=Lengths(1, 3, 8)), 4),
-    "memories": lambda: trained(skill_set(Remembers, Left, Free), 2),
-    "reflexes": lambda: trained(skill_set(
-        Left, Zigzag, Free,
-        reflexes=(shy(), Reflex(lambda o: o[:, T] % 4 == 1, lambda o: o[:, T].astype(int) % 3)),
-    )),
     "nested": nested,
-    "nested, waiting": waiting,
+    "memories": lambda: trained(skill_set(Remembers, Left, Free), 2),
     "interrupted": lambda: interrupted(0.02, deciding=True),
-    "interrupted where somebody may start": always_better,
-    "an automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
-    "a guide": lambda: guided(AUTOMATON),
-    "a guide of lengths": lambda: guided(
-        lambda o: 1 + o[:, T].astype(int) // 4 % 2, call_steps=Lengths(1, 2, 6)
-    ),
-    "a function": lambda: ready(by_place, skill_set(Left, Careful, Zigzag, call_steps=5)),
-}  # fmt: skip
+}
 
 
 def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple[int, int, bool]]:
@@ -235,20 +169,6 @@ def test_the_runner_calls_the_same_skills(make: Any, tmp_path: Path) -> None:
     assert len(skills) > 1  # so that choices are compared, and calls of several steps
     assert len(actions) > 1
     assert decisions == {True, False}
-
-
-def test_why_calls_are_interrupted_is_the_same(tmp_path: Path) -> None:
-    policy = interrupted(0.02, deciding=True)
-    export = write_export(tmp_path, policy, "walk")
-    runner = Runner(tmp_path, export.functions)
-    env, player, whys = LongWalk(), Player(policy), set()
-    obs, info = env.reset(seed=1)
-    for _ in range(29):
-        assert player.act(obs, info=info) == runner.act(obs, info=info)
-        obs, _, _, _, info = env.step(1)
-        seen = runner.root
-        whys.add((seen.why, seen.skill))
-    assert len(whys) > 1
 
 
 def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
@@ -317,6 +237,17 @@ def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
     with_mask = np.array([False, True, True])
     for obs in np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32):
         assert runner.act(obs, mask=with_mask) == player.act(obs, mask=with_mask) != 0
+
+
+def test_a_selector_that_samples_in_any_case_samples_when_exported(tmp_path: Path) -> None:
+    policy = trained(skill_set(Free, Left, greedy_selector=False))
+    write_export(tmp_path, policy, "walk")
+    told = json.loads((tmp_path / "policy.json").read_text())["policy"]
+    assert told["selector"]["noise"] == [["gumbel", 2]]
+    assert told["skills"][0]["policy"]["noise"] == []
+    chosen = ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right, greedy_selector=False))
+    with pytest.raises(SkillweaveError, match=r"is an automaton that draws .*greedy_selector"):
+        write_export(tmp_path / "other", chosen, "walk")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""OptionsEnv equals a scalar loop, call for call, and is an ordinary Gymnasium vector."""
+"""OptionsEnv is an ordinary Gymnasium vector, and its errors; tests/calls has its calls."""
 
 import inspect
 
@@ -13,16 +13,11 @@ from reference_calls import (
     POSITION,
     TAG,
     Counter,
-    Counting,
     Left,
     Right,
-    Scalar,
     T,
     Walk,
     Zigzag,
-    scripted,
-    seeds_of,
-    shy,
 )
 from toys import cartpole
 
@@ -34,7 +29,7 @@ from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Step
 
@@ -95,344 +90,7 @@ def test_a_call_that_nothing_ends_is_told_and_not_waited_for(options, monkeypatc
         env.step(np.zeros(2, np.int64))
 
 
-def agree(env: OptionsEnv, scalars: list[Scalar], calls: int, seed: int) -> dict[str, list]:
-    """Play the same random allowed calls in both and compare everything."""
-    rng, seen = np.random.default_rng(seed), {"steps": [], "terminated": [], "truncated": []}
-    obs, info = env.reset(seed=seed)
-    first = [s.reset(at) for s, at in zip(scalars, seeds_of(seed, len(scalars)), strict=True)]
-    np.testing.assert_array_equal(obs, first)
-    for _ in range(calls):
-        allowed = np.array([s.allowed() for s in scalars])
-        np.testing.assert_array_equal(info.get("action_mask", np.ones_like(allowed)), allowed)
-        choice = np.array([rng.choice(np.flatnonzero(a)) for a in allowed])
-        obs, reward, terminated, truncated, info = env.step(choice)
-        want = [s.call(int(c)) for s, c in zip(scalars, choice, strict=True)]
-
-        def wanted(name, want=want):
-            return np.array([getattr(w, name) for w in want])
-
-        np.testing.assert_array_equal(info["steps"], wanted("steps"))
-        np.testing.assert_array_equal(obs, wanted("obs"))
-        np.testing.assert_array_equal(info["next_obs"], wanted("next_obs"))
-        np.testing.assert_array_equal(terminated, wanted("terminated"))
-        ended = wanted("terminated") | wanted("truncated")
-        np.testing.assert_array_equal(terminated | truncated, ended)
-        np.testing.assert_array_equal(truncated & ~terminated, ended & ~wanted("terminated"))
-        np.testing.assert_allclose(info["call_return"], wanted("plain"), rtol=0, atol=1e-12)
-        for got, name in ((reward, "reward"), (info["discount"], "discount")):
-            single = wanted(name).astype(np.float32)
-            np.testing.assert_array_max_ulp(np.asarray(got, np.float32), single, 1)
-        seen["steps"].append(info["steps"].copy())
-        seen["terminated"].append(terminated.copy())
-        seen["truncated"].append(truncated & ~terminated)
-    return {k: np.array(v) for k, v in seen.items()}
-
-
-@pytest.mark.fast_cases(4)
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("call_steps", [1, 2, 5, 40])
-def test_every_call_is_that_of_a_scalar_loop(options, call_steps, seed):
-    env = options(skill_set(*ALL, call_steps=call_steps))
-    skills = env.skills.skills
-    seen = agree(env, [Scalar(Walk(), skills, call_steps, 0.97) for _ in range(N)], 60, seed)
-    assert seen["terminated"].any()
-    assert seen["truncated"].any()
-    if call_steps > 2:
-        assert (seen["steps"].min(axis=1) < seen["steps"].max(axis=1)).any(), "calls alike"
-
-
-def test_a_power_of_two_as_gamma_agrees_to_the_last_bit(options):
-    env = options(skill_set(*ALL, call_steps=7), gamma=0.5)
-    scalars = [Scalar(Walk(), env.skills.skills, 7, 0.5) for _ in range(N)]
-    rng = np.random.default_rng(0)
-    env.reset(seed=1)
-    for scalar, seed in zip(scalars, seeds_of(1, N), strict=True):
-        scalar.reset(seed)
-    for _ in range(40):
-        choice = np.array([rng.choice(np.flatnonzero(s.allowed())) for s in scalars])
-        _, reward, _, _, info = env.step(choice)
-        want = [s.call(int(c)) for s, c in zip(scalars, choice, strict=True)]
-        assert reward.tolist() == [float(np.float32(w.reward)) for w in want]
-        assert info["discount"].tolist() == [w.discount for w in want]
-        assert info["call_return"].tolist() == [w.plain for w in want]
-
-
-class Push(Skill):
-    """CartPole: to the left."""
-
-    max_steps = 2
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
-
-
-class Balance(Skill):
-    """CartPole: against the fall, while the cart is left of the middle."""
-
-    policy = ScriptedPolicy(lambda obs: (obs[:, 2] + obs[:, 3] > 0).astype(np.int64), None, None)
-
-    def initiation(self, obs):
-        return obs[:, 0] < 0.05
-
-    def termination(self, step):
-        return np.abs(step.next_obs[:, 1]) > 0.4
-
-
-class Fall(Skill):
-    """LunarLander: nothing."""
-
-    max_steps = 9
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
-
-
-class Hover(Skill):
-    """LunarLander: the main engine while sinking, until rising."""
-
-    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 3] < -0.1, 2, 0), None, None)
-
-    def initiation(self, obs):
-        return obs[:, 3] < 0
-
-    def termination(self, step):
-        return step.next_obs[:, 3] > 0
-
-
-class Turn(Skill):
-    """LunarLander: against the lean."""
-
-    policy = ScriptedPolicy(lambda obs: np.where(obs[:, 4] > 0, 3, 1), None, None)
-
-
-@pytest.mark.fast_cases(1)
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize(
-    ("env_id", "kinds", "limit"),
-    [("CartPole-v1", (Push, Balance), 23), ("LunarLander-v3", (Fall, Hover, Turn), 95)],
-)
-def test_real_environments_agree_with_a_scalar_loop(options, env_id, kinds, limit, seed):
-    env = options(
-        skill_set(*kinds, call_steps=7), env_id, 0.99, 4, kwargs={"max_episode_steps": limit}
-    )
-    made = [gym.make(env_id, max_episode_steps=limit) for _ in range(4)]
-    seen = agree(env, [Scalar(e, env.skills.skills, 7, 0.99) for e in made], 80, seed)
-    assert seen["terminated"].any()
-    assert seen["truncated"].any()
-    assert (seen["steps"].min(axis=1) < seen["steps"].max(axis=1)).any()
-
-
-def test_a_skill_that_is_called_again_at_once_goes_on_with_its_memory(options, walks):
-    class Remembering(Skill):
-        policy = Counting(1000, action_space=gym.spaces.Discrete(1000))
-
-    class Walks(Walk):
-        action_space = gym.spaces.Discrete(1000)
-
-        def reset(self, **how):
-            found = super().reset(**how)
-            self.length, self.end = 11, 0
-            return found
-
-        def step(self, action):
-            obs, _, *rest = super().step(action)
-            return obs, 0.0, *rest
-
-    made = []
-
-    def make():
-        made.append(Walks())
-        return made[-1]
-
-    env = options(skill_set(Remembering, Zigzag, call_steps=3), make, num_envs=2)
-    env.reset(seed=0)
-    for choice in ([0, 0], [0, 1], [0, 0], [0, 0], [0, 0]):
-        env.step(np.array(choice))
-    # the episode ends within the fourth call, so the fifth is the first of a new episode
-    acted = [[a for _, _, a in w.log] for w in made[-2:]]
-    assert acted[0] == [*range(11), *range(3)]
-    assert acted[1][:3] + acted[1][6:] == [0, 1, 2, *range(5), *range(3)]
-
-
-def test_a_waiting_environment_is_not_stepped(options, walks):
-    env = options(skill_set(Left, Zigzag, call_steps=5), walks, num_envs=4)
-    env.reset(seed=0)
-    stepped = np.array([w.steps for w in walks.made[-4:]])
-    for _ in range(20):
-        *_, info = env.step(np.array([0, 1, 0, 1]))
-        now = np.array([w.steps for w in walks.made[-4:]])
-        assert (now - stepped).tolist() == info["steps"].tolist()
-        stepped = now
-
-
-def test_an_episode_that_ends_within_a_call_starts_anew_once_and_then_waits(options, walks):
-    env = options(skill_set(Zigzag, call_steps=40), walks)
-    env.reset(seed=0)
-    mine = walks.made[-N:]
-    for call in range(1, 6):
-        obs, _, terminated, truncated, _ = env.step(np.zeros(N, int))
-        assert (terminated | truncated).all()
-        assert [w.episode for w in mine] == [call] * N
-        assert obs[:, EPISODE].tolist() == [call] * N
-        assert (obs[:, T] == 0).all()
-
-
-def test_without_call_steps_a_skill_goes_on_until_it_stops(options):
-    env = options(skill_set(Left, Counter, call_steps=None))
-    scalars = [Scalar(Walk(), env.skills.skills, None, 0.97) for _ in range(N)]
-    seen = agree(env, scalars, 60, seed=4)
-    assert seen["steps"].max() > 3
-
-
-def test_a_time_limit_keeps_the_discount_and_a_termination_makes_it_zero(options):
-    env = options(skill_set(Zigzag, call_steps=40), gamma=0.5)
-    env.reset(seed=0)
-    limits = 0
-    for _ in range(10):
-        _, _, terminated, truncated, info = env.step(np.zeros(N, int))
-        assert info["discount"][terminated].tolist() == [0.0] * int(terminated.sum())
-        only = truncated & ~terminated
-        assert info["discount"][only].tolist() == (0.5 ** info["steps"][only]).tolist()
-        limits += int(only.sum())
-    assert limits
-
-
-@pytest.mark.parametrize("call_steps", [3, 40])
-def test_reflexes_override_and_the_last_one_wins(options, walks, call_steps):
-    back = Reflex(lambda obs: obs[:, POSITION] <= -2, lambda obs: 1 + (obs[:, T] % 2).astype(int))
-    reflexes = (back, shy())
-    env = options(skill_set(Left, Zigzag, call_steps=call_steps, reflexes=reflexes), walks)
-    skills = env.skills.skills
-    scalars = [Scalar(Walk(), skills, call_steps, 0.97, reflexes) for _ in range(N)]
-    agree(env, scalars, 60, seed=3)
-    assert walks.made[-1].log == scalars[-1].env.log
-    lefts = [a for w in walks.made[-N:] for _, _, a in w.log]
-    assert {0, 1, 2} <= set(lefts)
-
-
-@pytest.mark.usefixtures("unprobed")
-def test_a_skill_that_watches_sees_the_action_that_reflexes_left(options):
-    seen = []
-
-    class Watching(Left):
-        def termination(self, step):
-            seen.extend(zip(step.obs[:, POSITION], step.action, strict=True))
-            return np.zeros(len(step.reward), bool)
-
-    env = options(skill_set(Watching, reflexes=(shy(),)))
-    env.reset(seed=0)
-    for _ in range(10):
-        env.step(np.zeros(N, int))
-    assert {a for x, a in seen if x == -3} == {2}
-    assert {a for x, a in seen if x != -3} == {0}
-
-
-# What a skill's termination sees -------------------------------------------------------------
-
-
-def recorder(seen: dict, max_steps=None, stops=False):
-    """A skill that writes down every step that its termination was shown."""
-
-    def termination(self, step):
-        for i in range(len(step.reward)):
-            key = (step.obs[i, 0].item(), step.obs[i, EPISODE].item(), step.obs[i, T].item())
-            seen[key] = (
-                step.next_obs[i].tolist(), step.reward[i].item(), bool(step.terminated[i]),
-                bool(step.truncated[i]), bool(step.timed_out[i]), int(step.elapsed[i]),
-                int(np.asarray(step.info["t"]).reshape(-1)[i]),
-            )  # fmt: skip
-        return np.full(len(step.reward), stops)
-
-    attributes = {"termination": termination, "max_steps": max_steps, "policy": scripted(2)}
-    return type("Recorder", (Skill,), attributes)
-
-
-@pytest.mark.usefixtures("unprobed")
-def test_termination_sees_the_step_of_its_own_environment_and_call(options, walks):
-    seen = {}
-    env = options(skill_set(Left, recorder(seen, max_steps=3), call_steps=4), walks)
-    rng = np.random.default_rng(0)
-    obs, _ = env.reset(seed=0)
-    expected = 0
-    for _ in range(30):
-        seen.clear()
-        choice = rng.integers(2, size=N)
-        before = obs.copy()
-        obs, _, terminated, _, info = env.step(choice)
-        mine = np.flatnonzero(choice == 1)
-        assert len(seen) == info["steps"][mine].sum()
-        for i in mine:
-            tag, episode, t, position = before[i].tolist()
-            for k in range(1, int(info["steps"][i]) + 1):
-                row, _, ended, _, timed_out, elapsed, told = seen[tag, episode, t + k - 1]
-                assert row == [tag, episode, t + k, position + k]
-                assert (elapsed, told) == (k, t + k)
-                assert ended == (bool(terminated[i]) and k == info["steps"][i])
-                assert ended or timed_out == (k == 3)
-                expected += 1
-    assert expected > 100
-
-
-class Nested(gym.Env):
-    """Tells a number of its own, which is its observation too, in three depths of info."""
-
-    observation_space = gym.spaces.Box(0, 1 << 20, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.number = float(self.np_random.integers(1 << 20))
-        return np.array([self.number], np.float32), {}
-
-    def step(self, action):
-        deep = {"id": self.number, "deeper": {"id": self.number}, "word": f"env {self.number}"}
-        obs = np.array([self.number], np.float32)
-        return obs, 0.0, False, False, {"id": self.number, "deep": deep}
-
-
-@pytest.mark.usefixtures("unprobed")
-def test_a_skill_sees_its_own_rows_of_info_however_deep(options):
-    seen = []
-
-    class Watching(Skill):
-        policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
-
-        def termination(self, step):
-            seen.append((step.obs[:, 0].tolist(), step.info))
-            return np.zeros(len(step.reward), bool)
-
-    class Short(Skill):
-        policy, max_steps = Watching.policy, 2
-
-    env = options(skill_set(Short, Watching, call_steps=4), Nested, num_envs=4)
-    env.reset(seed=0)
-    env.step(np.array([0, 1, 0, 1]))
-    assert len(seen) == 4
-    for rows, info in seen:
-        assert len(set(rows)) == 2
-        deep = info["deep"]
-        for found in (info["id"], deep["id"], deep["deeper"]["id"]):
-            assert found.tolist() == rows
-        assert list(deep["word"]) == [f"env {r}" for r in rows]
-
-
 # Initiation sets -----------------------------------------------------------------------------
-
-
-def test_initiation_sets_are_the_action_mask_of_what_to_act_on_next(options):
-    env = options(skill_set(Left, Right, Zigzag, call_steps=6))
-    obs, info = env.reset(seed=0)
-    forbidden = 0
-    for _ in range(30):
-        mask = info["action_mask"]
-        assert (mask.shape, mask.dtype) == ((N, 3), np.bool_)
-        assert mask[:, [0, 2]].all()
-        assert mask[:, 1].tolist() == (obs[:, POSITION] < 2).tolist()
-        forbidden += int((~mask).sum())
-        obs, *_, info = env.step(np.where(mask[:, 1], 1, 2))
-    assert forbidden
-
-
-def test_without_initiation_sets_there_is_no_mask(options):
-    env = options(skill_set(Left, Zigzag))
-    assert "action_mask" not in env.reset(seed=0)[1]
-    assert "action_mask" not in env.step(np.zeros(N, int))[-1]
 
 
 def test_choosing_a_skill_that_may_not_start_names_it_and_the_environment(options):
@@ -666,6 +324,25 @@ def test_gymnasiums_own_vector_wrapper_counts_its_episodes(options):
 
 
 # EnvPool -------------------------------------------------------------------------------------
+
+
+class Push(Skill):
+    """CartPole: to the left."""
+
+    max_steps = 2
+    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), None, None)
+
+
+class Balance(Skill):
+    """CartPole: against the fall, while the cart is left of the middle."""
+
+    policy = ScriptedPolicy(lambda obs: (obs[:, 2] + obs[:, 3] > 0).astype(np.int64), None, None)
+
+    def initiation(self, obs):
+        return obs[:, 0] < 0.05
+
+    def termination(self, step):
+        return np.abs(step.next_obs[:, 1]) > 0.4
 
 
 @pytest.mark.filterwarnings("ignore:.*precision lowered")

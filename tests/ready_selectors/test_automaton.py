@@ -105,20 +105,6 @@ def test_it_solves_a_chain_of_skills():
         assert story(policy, seed) == [("get_key", place), ("open_door", 6), ("leave", 1)]
 
 
-def test_a_transition_ends_no_call():
-    # The door opens, and waiting begins, within the call of a skill that goes on to the right.
-    arrows = {("search", "go"): got_key, ("go", "wait"): lambda step: step.info["door"] == 1}
-    automaton = Automaton({"search": "get_key", "go": "open_door", "wait": "wait"}, arrows)
-    place = int(Corridor().reset(seed=0)[0][0])
-    calls = story(hierarchy(automaton), 0, most=place + 6 + 5)
-    assert calls == [("get_key", place), ("open_door", 6), ("wait", 2), ("wait", 2), ("wait", 1)]
-    # Calls of one step: the transition counts at the next decision.
-    arrows = {("search", "go"): got_key, ("go", "wait"): above(2)}
-    automaton = Automaton({"search": "get_key", "go": "leave", "wait": "wait"}, arrows)
-    calls = story(hierarchy(automaton), 0, most=place + 5)
-    assert calls == [("get_key", place), ("leave", 1), ("leave", 1), ("leave", 1), ("wait", 2)]
-
-
 def test_an_automaton_whose_skills_may_not_start_says_so():
     policy = hierarchy(Automaton({"all": {"open_door"}}, {}))
     with pytest.raises(

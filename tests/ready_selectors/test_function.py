@@ -11,16 +11,12 @@ from ready_selectors.chain import (
     KEY,
     NAMES,
     Corridor,
-    GetKey,
-    Leave,
-    Wait,
     bound,
     hierarchy,
     story,
 )
 
-from skillweave import LastCall, SkillweaveError
-from skillweave.collecting.ends import CallEnd
+from skillweave import SkillweaveError
 
 
 def by_number(obs: Any) -> Any:
@@ -41,65 +37,6 @@ def test_numbers_and_names_choose_the_same(function):
         place = int(Corridor().reset(seed=seed)[0][0])
         wanted = [("get_key", place), ("open_door", 6), ("leave", 1)]
         assert story(hierarchy(function), seed) == wanted
-
-
-@pytest.mark.usefixtures("unprobed")
-def test_a_function_of_two_arguments_is_told_how_the_last_call_ended():
-    told: list[tuple[int, int, bool]] = []
-
-    def choose(obs: Any, last: LastCall) -> Any:
-        told.append((int(last.skill[0]), int(last.why[0]), bool(last.succeeded[0])))
-        # Wait once, then get the key until that succeeds, then open the door.
-        return np.where(last.skill == -1, 3, np.where(last.succeeded & (last.skill == 0), 1, 0))
-
-    place = int(Corridor().reset(seed=0)[0][0])
-    assert place > 2
-    calls = story(hierarchy(choose, call_steps=place - 1), 0, most=2 + place + 1)
-    assert calls == [("wait", 2), ("get_key", place - 1), ("get_key", 1), ("open_door", 1)]
-    assert told == [
-        (-1, CallEnd.EPISODE, False),
-        (3, CallEnd.LIMIT, False),
-        (0, CallEnd.LIMIT, False),
-        (0, CallEnd.OWN, True),
-    ]
-
-
-class Lucky(Wait):
-    """Its own end never comes; success says when it has succeeded."""
-
-    name = "lucky"
-
-    def success(self, step: Any) -> Any:
-        return step.elapsed == 2
-
-
-class Unlucky(GetKey):
-    """It ends by itself, and has not succeeded."""
-
-    name = "unlucky"
-
-    def success(self, step: Any) -> Any:
-        return np.zeros(len(step.reward), bool)
-
-
-def test_success_is_what_the_skill_says_else_its_own_end():
-    seen: dict[str, bool] = {}
-    skills = (GetKey(), Wait(), Lucky(), Unlucky(), Leave())
-    names = [s.name for s in skills]
-
-    def choose(obs: Any, last: LastCall) -> Any:
-        if last.skill[0] >= 0:
-            seen[names[int(last.skill[0])]] = bool(last.succeeded[0])
-        return last.skill + 1 if last.skill[0] < 4 else last.skill
-
-    story(hierarchy(choose, skills=skills), 0, most=20)
-    assert seen == {
-        "get_key": True,
-        "wait": False,
-        "lucky": True,
-        "unlucky": False,
-        "leave": False,
-    }
 
 
 WRONG = {

@@ -20,7 +20,7 @@ from ready_selectors.chain import (
     has_key,
 )
 
-from skillweave import PPO, Automaton, Hierarchy, LastCall, SkillweaveError, evaluate, tree
+from skillweave import PPO, Automaton, Hierarchy, LastCall, SkillweaveError, tree
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.runs.directory import RunDirectory
@@ -65,29 +65,6 @@ def test_it_solves_the_corridor_without_training(kind, tmp_path):
     assert set(score.lengths) == {p + 7 for p in range(1, 6)}
     assert run.info()["stages"] == []
     assert RunDirectory.open(run.path).finished
-
-
-@pytest.mark.fast_cases(7)
-@pytest.mark.parametrize("nested", [False, True])
-@pytest.mark.parametrize("kind", SELECTORS)
-def test_many_environments_at_once_are_each_as_alone(kind, nested, tmp_path):
-    run = declare(SELECTORS[kind]).train(tmp_path / "run", quiet=True)
-    policy = run.policy
-    if nested:
-        # Calls of 5 steps, and of Wait between them where the place is even: then it begins anew.
-        def choose(obs: Any, last: LastCall) -> Any:
-            waits = (obs[:, PLACE] % 2 == 0) & (last.skill == 0)
-            return np.where(waits, 1, 0)
-
-        inner = run.as_skill("inner", call_steps=5)
-        outer = Hierarchy(SPEC, [inner, Wait()], selector=choose, call_steps=None, learn="apart")
-        policy = outer.train(tmp_path / "outer", quiet=True).policy
-    alone = evaluate(policy, SPEC, episodes=12, num_envs=1)
-    together = evaluate(policy, SPEC, episodes=12, num_envs=5)
-    assert alone == together
-    assert sum(alone.returns) > 0
-    if nested:
-        assert alone.skill_steps["wait"] > 0
 
 
 @pytest.mark.fast_cases(2)

@@ -18,7 +18,6 @@ from reference_calls import (
     T,
     Walk,
     Zigzag,
-    one_step,
     scripted,
     shy,
 )
@@ -92,38 +91,17 @@ def reference(kinds, episodes, call_steps, reflexes):
     skills = tuple(k() for k in kinds)
     found = {s.name: defaultdict(list) for s in skills}
     for e in range(episodes):
-        env = Recorded()
-        one = Scalar(env, skills, call_steps, 1.0, reflexes)
-        one.reset(iter([FIRST_SEED + e, 0]))
-        over = False
-        while not over:
+        one = Scalar(Walk(), skills, call_steps, reflexes, FIRST_SEED + e)
+        while not one.over:
             i = int(wish(one.obs[None], len(skills))[0])
-            env.steps_of_call = []
-            out = one.call(i)
-            over = out.terminated or out.truncated
-            skill, told = skills[i], found[skills[i].name]
-            steps = [one_step(*s[:6], k + 1, skill, {}) for k, s in enumerate(env.steps_of_call)]
-            last = steps[-1]
+            steps = one.call(i)
+            skill, told, last = skills[i], found[skills[i].name], steps[-1]
             own = bool(skill.termination(last)[0])
-            told["ended"].append("episode" if over else "own" if own else "limit")
+            told["ended"].append("episode" if one.over else "own" if own else "limit")
             told["steps"].append(len(steps))
             told["success"].append(bool(skill.success(last)[0]))
             told["return"].append(sum(float(np.float32(skill.reward(s)[0])) for s in steps))
     return found
-
-
-class Recorded(Walk):
-    """Keeps the steps of a call."""
-
-    def reset(self, **how):
-        self.now, info = super().reset(**how)
-        return self.now, info
-
-    def step(self, action):
-        before = self.now
-        self.now, reward, terminated, truncated, info = super().step(action)
-        self.steps_of_call.append((before, action, self.now, reward, terminated, truncated))
-        return self.now, reward, terminated, truncated, info
 
 
 @pytest.mark.parametrize("reflexes", [(), (shy(),)], ids=["", "reflex"])

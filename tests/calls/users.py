@@ -1,0 +1,521 @@
+"""All that let skills act: each plays a case and returns what happened, for the comparison."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from calls.cases import POLICIES, Case, LevelCase, Worth, guide_of, ready, selector_of, skill_set
+from reference_calls import seeds_of
+
+from skillweave.api.player import Player as Deployed
+from skillweave.collecting.acting import Acted, Request
+from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.levels import UntrainedHierarchy
+from skillweave.collecting.player import Player, Turn
+from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.woven import WovenCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.export import states
+from skillweave.export.graphs import Graph
+from skillweave.export.write import write_export
+from skillweave.hierarchy.options import OptionsEnv
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.seeding import Seeds
+from skillweave.skills import Skill
+from skillweave.training.play import SeededEpisodes, play
+from skillweave.types import Array, Memory, Step
+
+N, SEED = 3, 5
+GAMMA = 0.5  # so that sums are exact
+
+
+# What happened ----------------------------------------------------------------------------------
+
+
+@dataclass
+class Got:
+    """One step, as a user made it; memories by name, of this environment."""
+
+    action: int
+    next_obs: list[float]
+    reward: float
+    acted: dict[str, Any]
+    observed: dict[str, Any] = field(default_factory=dict)
+    overridden: bool | None = None
+    """A reflex acted; None: this user does not report it."""
+
+
+@dataclass
+class Played:
+    """What a user did."""
+
+    episodes: list[tuple[int, list[Got]]] = field(default_factory=list)
+    """Each with its seed; the last ones may be open."""
+    columns: list[list[dict[str, Any]]] | None = None
+    """Of each environment the decisions, as rows of experience; None: it gives none."""
+    finished: list[tuple[float, float]] | None = None
+    """Return and length of the episodes that are over; None: this user does not report them."""
+    missing: str = "never"
+    """A pattern of the names in memories that it does not have."""
+    ready_is_guide: bool = False
+    """A ready selector is remembered as a guide."""
+    chooses: bool = True
+    """The case's selector chooses; else the user does, and the reference follows it."""
+
+
+class Watch:
+    """Writes down the steps of N environments.
+
+    Args:
+        seeds: of each environment, those of its episodes.
+    """
+
+    def __init__(self, seeds: list[Iterator[int]]) -> None:
+        self.episodes: list[tuple[int, list[Got]]] = []
+        self._seeds, self._latest = seeds, [Got(0, [], 0.0, {})] * len(seeds)
+        self._over = np.ones(len(seeds), bool)
+        self._open: list[list[Got]] = [[] for _ in seeds]
+
+    def step(self, ids: Array, action: Array, raw: Any, memory: Memory, aligned: bool) -> None:
+        """A step in environments ``ids``; ``aligned``: the memory's rows are of these alone."""
+        for k, i in enumerate(ids.tolist()):
+            if self._over[i]:
+                self._open[i] = []
+                self.episodes.append((next(self._seeds[i]), self._open[i]))
+            row = k if aligned else i
+            remembered = {name: v[row].tolist() for name, v in memory.items()}
+            overridden = remembered.pop("overridden", None)
+            got = Got(
+                int(action[k]), raw.next_obs[k].tolist(), float(raw.reward[k]), remembered,
+                overridden=overridden,
+            )  # fmt: skip
+            self._open[i].append(got)
+            self._latest[i] = got
+            self._over[i] = raw.terminated[k] or raw.truncated[k]
+
+    def observed(self, ids: Array, memory: Memory, aligned: bool = False) -> None:
+        """What is remembered after the latest step of environments ``ids``."""
+        for k, i in enumerate(ids.tolist()):
+            row = k if aligned else i
+            self._latest[i].observed = {name: v[row].tolist() for name, v in memory.items()}
+
+    def on(self, engine: Any, memory: Callable[[], Memory]) -> None:
+        """Watch every step of an engine.
+
+        Args:
+            memory: that of all N environments; "overridden" in it is true where reflexes acted.
+        """
+        step = engine.step
+
+        def watched(action: Array, ids: Array | None = None) -> Any:
+            rows = np.arange(engine.num_envs) if ids is None else ids
+            before = {k: v.copy() for k, v in memory().items()}
+            raw = step(action, ids)
+            self.step(rows, action, raw, before, False)
+            return raw
+
+        engine.step = watched
+
+
+def engine_of(case: Case, n: int = N) -> Any:
+    return make_engine(EnvSpec(case.env, engine="sync"), n)
+
+
+# Policies ---------------------------------------------------------------------------------------
+
+
+def policies_of(level: LevelCase) -> tuple[Any, ...]:
+    return tuple(
+        hierarchy(s.policy) if isinstance(s.policy, LevelCase) else POLICIES[s.policy]
+        for s in level.skills
+    )
+
+
+def hierarchy(level: LevelCase) -> HierarchyPolicy:
+    return HierarchyPolicy(
+        selector_of(level), skill_set(level, policies_of(level)), guide_of(level)
+    )
+
+
+class Learner:
+    """A ``Net`` where ``Acting`` stands: acts as it would under the case's settings."""
+
+    members = 1
+
+    def __init__(self, net: Any, greedy: bool = True) -> None:
+        self.net, self.memory_size, self.greedy = net, net.size, greedy
+        self.each, self.stacks = N, ((net, 1),)
+
+    def begin(self, request: Request, every_step: bool = True) -> None:
+        pass
+
+    def to_env(self, action: Array) -> Array:
+        return action
+
+    def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
+        before = {} if memory is None else {"rnn": memory}
+        action, after = self.net.act(before, obs, mask, deterministic=self.greedy)
+        return Acted(action, action[:, None].astype(np.float32), after.get("rnn"))
+
+
+class Critic(Learner):
+    """A ``Worth`` where ``Acting`` stands."""
+
+    memory_size = 0
+
+    def __init__(self, skills: int) -> None:
+        self.worth, self.each = Worth(skills), N
+
+    def some(self, rows: Array, obs: Array, mask: Any, memory: Any) -> Acted:
+        return Acted(np.zeros(len(obs), np.int64), self.worth.heads(obs), None)
+
+
+# Collectors -------------------------------------------------------------------------------------
+
+
+def decisions(case: Case) -> Played:
+    """A selector that learns, above skills that can act."""
+    guide, selector = _first(case)
+    skills = skill_set(case.level, policies_of(case.level))
+    return _collect(
+        case, lambda: DecisionCollector(engine_of(case), selector, skills, True, guide), "", {}
+    )  # fmt: skip
+
+
+def joint(case: Case) -> Played:
+    """A selector and all skills that can learn; hierarchies below are trained, too."""
+    learners: dict[str, Any] = {}
+    margins: dict[str, float] = {}
+
+    def skills_of(level: LevelCase, path: str) -> Any:
+        policies: list[Any] = []
+        for i, skill in enumerate(level.skills):
+            name = f"{path}s{i}"
+            if isinstance(skill.policy, LevelCase):
+                below = skill.policy
+                greedy = level.greedy and below.greedy_selector
+                if not below.ready:
+                    learners[f"{name}/selector"] = Learner(selector_of(below), greedy)
+                chooser = selector_of(below) if below.ready else None
+                inner = skills_of(below, f"{name}/")
+                policies.append(UntrainedHierarchy(inner, chooser, guide_of(below)))
+            elif skill.policy in ("net", "counts"):
+                learners[name] = Learner(POLICIES[skill.policy], level.greedy)
+                policies.append(None)
+            else:
+                policies.append(POLICIES[skill.policy])
+        if level.margin is not None:
+            learners[f"{path}skill_critic"] = Critic(len(level.skills))
+            margins[f"{path}skill_critic"] = level.margin
+        return skill_set(level, tuple(policies))
+
+    guide, selector = _first(case)
+    skills = skills_of(case.level, "")
+
+    def make() -> WovenCollector:
+        return WovenCollector(engine_of(case), selector, skills, learners, margins, guide)
+
+    return _collect(case, make, "selector", learners)
+
+
+def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
+    """The first guide and selector of a collector; a ready selector is a guide that decides."""
+    level = case.level
+    if level.ready:
+        return ActiveGuide(ready(level, level.selector), decides=True), None
+    greedy = case.deterministic and level.greedy_selector
+    return guide_of(level), Learner(selector_of(level), greedy)
+
+
+def _rounds(
+    case: Case, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
+    learners: dict[str, Any],
+) -> Iterator[Any]:  # fmt: skip
+    """What a collector returns, request by request; perhaps another one goes on half way."""
+    collector, count = make(), case.steps // case.rows
+    collector.start(Seeds(SEED))
+    for i in range(count):
+        if case.resumed and i == count // 2:
+            state, collector = collector.state(), make()
+            assert not len(collector.restore(state)), "an environment did not repeat itself"
+        if i == 0 or (case.resumed and i == count // 2):
+            watch.on(collector.engine, partial(memory_of, collector))
+        request = Request(
+            case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
+        )  # fmt: skip
+        collected = collector.collect(
+            replace(request, below=dict.fromkeys(learners, request))
+        )  # fmt: skip
+        assert collected.steps == case.rows * N, "an environment waited"
+        watch.observed(np.arange(N), memory_of(collector))
+        yield collected
+
+
+def _collect(
+    case: Case, make: Callable[[], Any], path: str, learners: dict[str, Any]
+) -> Played:  # fmt: skip
+    def memory_of(collector: Any) -> Memory:
+        overridden = getattr(collector, "overridden", None)
+        more = {} if overridden is None else {"overridden": overridden}
+        return collector.memory | more
+
+    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
+    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    finished: list[tuple[float, float]] = []
+    for collected in _rounds(case, watch, make, memory_of, learners):
+        batches = collected.batches
+        finished += map(tuple, collected.episodes[:, [0, 2]].tolist())
+        if path in batches:
+            batch = batches[path]
+            names = batch.keys() - {"valid", "recurrent_state"}
+            for t, n in zip(*np.nonzero(batch.valid_rows), strict=True):
+                row = {k: batch[k][t, n] for k in names}
+                if t == 0 and "recurrent_state" in batch:
+                    row["recurrent_state"] = batch["recurrent_state"][n]
+                columns[n].append(row)
+    ready = case.level.ready
+    return Played(watch.episodes, None if ready else columns, finished, ready_is_guide=ready)
+
+
+def leads_to_starts(case: Case) -> Played:
+    """The skills as those that lead to where another one may start; they sample."""
+    sampled = replace(case.level, greedy=False)
+    never = type("Never", (Skill,), {"initiation": lambda self, obs: np.zeros(len(obs), bool)})
+    skills = skill_set(case.level, policies_of(sampled))
+    watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
+
+    def make() -> SkillCollector:
+        return SkillCollector(engine_of(case), Anything(), never(), starters=skills)
+
+    for _ in _rounds(case, watch, make, lambda collector: collector._starters._calls, {}):
+        pass
+    return Played(watch.episodes, missing=r"^selector\.", chooses=False)
+
+
+class Anything:
+    """A learner whose turn never comes."""
+
+    memory_size = 0
+
+    def begin(self, request: Request) -> None:
+        pass
+
+    def to_env(self, action: Array) -> Array:
+        return action
+
+    def all(self, obs: Array, mask: Any, memory: Any) -> Acted:
+        return Acted(np.zeros(len(obs), np.int64), None, None)
+
+
+# The player alone -------------------------------------------------------------------------------
+
+
+def alone(case: Case) -> Played:
+    """The player in a plain loop."""
+    level, engine = case.level, engine_of(case)
+    player = Player(skill_set(level, policies_of(level)), selector_of(level), guide_of(level))
+    watch, rows = Watch(seeds_of(SEED, N)), np.arange(N)
+    memory, age = player.start(N), np.zeros(N, np.int64)
+    overridden = np.zeros(N, bool)
+    watch.on(engine, lambda: memory | {"overridden": overridden})
+    obs = engine.reset(SEED)
+    for _ in range(case.steps):
+        overridden[:] = False
+        turn = Turn(case.deterministic, overridden=overridden)
+        action = player.act(memory, rows, obs, engine.mask(), turn)
+        raw = engine.step(action)
+        age += 1
+        step = Step(
+            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
+            np.zeros(N, bool), age.copy(), raw.info,
+        )  # fmt: skip
+        end = player.observe(memory, rows, step)
+        watch.observed(rows, memory)
+        np.testing.assert_array_equal(end, memory["end"])
+        obs, over = raw.next_obs.copy(), np.flatnonzero(end == CallEnd.EPISODE)
+        if len(over):
+            obs[over], age[over] = engine.reset_some(over), 0
+            player.restart(memory, over)
+    return Played(watch.episodes)
+
+
+# Policies in evaluation and deployment -----------------------------------------------------------
+
+
+def evaluated(case: Case) -> Played:
+    """Whole episodes, in environments of which fewer and fewer act in the end."""
+    seeds = [11, 12, 13, 14, 15, 16, 17]
+    watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
+    episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
+    for played in play(hierarchy(case.level), episodes, deterministic=case.deterministic):
+        assert played.chosen is not None
+        assert played.after is not None
+        watch.step(played.episode, played.step.action, played.step, played.chosen, True)
+        watch.observed(played.episode, played.after, True)
+    return Played(watch.episodes)
+
+
+def deployed(case: Case) -> Played:
+    """One observation at a time."""
+    player = Deployed(hierarchy(case.level), deterministic=case.deterministic)
+    return _one_by_one(case, player, lambda: player.memory)
+
+
+def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
+    found = Played()
+    env = case.env()
+    for seed in range(21, 25):
+        steps: list[Got] = []
+        obs, info = env.reset(seed=seed)
+        acts.reset()
+        reward, over = 0.0, False
+        while not over:
+            action = acts.act(obs, reward=reward, info=info)
+            remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in memory().items()}
+            obs, reward, terminated, truncated, info = env.step(action)
+            steps.append(Got(int(action), obs.tolist(), float(np.float32(reward)), remembered))
+            over = terminated or truncated
+        found.episodes.append((seed, steps))
+    return found
+
+
+# OptionsEnv -------------------------------------------------------------------------------------
+
+
+def options_env(case: Case) -> Played:
+    """The case's selector chooses the actions of an ordinary vector of environments."""
+    skills = skill_set(case.level, policies_of(case.level))
+    env = OptionsEnv(engine_of(case), skills, GAMMA)
+    watch = Watch(seeds_of(SEED, N))
+    watch.on(env.engine, lambda: env._memory)
+    obs, info = env.reset(seed=SEED)
+    selector = selector_of(case.level)
+    greedy, memory = case.deterministic and case.level.greedy_selector, selector.start(N)
+    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    for _ in range(case.steps // 3):
+        mask = info.get("action_mask")
+        choice, memory = selector.act(memory, obs, mask, deterministic=greedy)
+        rows = {"obs": obs, "action": choice}
+        rows |= {} if mask is None else {"mask": mask}
+        assert mask is None or mask.dtype == np.bool_
+        obs, reward, terminated, truncated, info = env.step(choice)
+        watch.observed(np.arange(N), env._memory)
+        rows |= {"reward": reward, "terminated": terminated, "truncated": truncated & ~terminated}
+        rows |= {"next_obs": info["next_obs"], "steps": info["steps"]}
+        rows |= {k: info[k] for k in ("discount", "call_return")}
+        if mask is not None:
+            rows["next_mask"] = info["next_action_mask"]
+        over = terminated | truncated
+        for k, v in selector.start(N).items():
+            memory[k][over] = v[over]
+        for n in range(N):
+            columns[n].append({k: v[n] for k, v in rows.items()})
+    return Played(watch.episodes, columns, missing=r"^selector\.")
+
+
+# The exported runner ----------------------------------------------------------------------------
+
+
+class Session:
+    """Stands for an ONNX session; the file's content is the number of a policy."""
+
+    known: list[tuple[Any, bool]] = []  # noqa: RUF012
+
+    def __init__(self, file: str, *options: Any, **where: Any) -> None:
+        self.policy, self.sampled = self.known[int(Path(file).read_bytes())]
+
+    def run(self, _: None, feeds: dict[str, Array]) -> list[Array]:
+        if isinstance(self.policy, Worth):
+            return [self.policy.heads(feeds["obs"])]
+        memory = {"rnn": feeds["memory"]} if "memory" in feeds else {}
+        action, after = self.policy.act(
+            memory, feeds["obs"], feeds["mask"], deterministic=not self.sampled
+        )  # fmt: skip
+        return [action, *after.values()]
+
+    @classmethod
+    def graph(cls, policy: Any, sampled: Any, where: str = "") -> Graph:
+        cls.known.append((policy, sampled is True))
+        if isinstance(policy, Worth):
+            return Graph(b"%d" % (len(cls.known) - 1))
+        return Graph(b"%d" % (len(cls.known) - 1), int(policy.action_space.n), policy.size)
+
+
+def exported(case: Case) -> Played:
+    """The runner, which knows nothing of this library; its networks are those of the case."""
+    pytest.importorskip("onnxruntime")
+    from skillweave.export import runner as file
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        patch.object(states, "agent_graph", Session.graph),
+        patch.object(states, "worth_graph", Session.graph),
+        patch.object(file.ort, "InferenceSession", Session),
+    ):
+        export = write_export(Path(folder), hierarchy(case.level), "walk")
+        runner = file.Runner(folder, export.functions)
+        found = _one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
+    found.missing = r"\blimit$|chances$|(selector|guide)\.(skill|why|succeeded)$"
+    return found
+
+
+def remembered_by(part: Any, level: LevelCase) -> dict[str, Any]:
+    """What the runner remembers, by a player's names."""
+    found = {"skill": part.skill, "elapsed": part.elapsed, "end": part.why}
+    running, policy = level.skills[part.skill].policy, part.policies[part.skill]
+    below: dict[str, Any] = {}
+    if isinstance(running, LevelCase):
+        below = remembered_by(policy, running)
+    elif running == "counts":
+        below = {"rnn": policy.memory["memory"]}
+    found |= {f"{part.skill}.{k}": v for k, v in below.items()}
+    if level.selector == "counts":
+        found["selector.rnn"] = part.selector.memory["memory"]
+    for name, kind, who in (
+        ("selector", level.selector, part.selector), ("guide", level.guide, part.guide)
+    ):  # fmt: skip
+        if kind == "automaton":
+            found[f"{name}.state"] = who.state
+    return found
+
+
+# Which user plays which case --------------------------------------------------------------------
+
+
+def drawn_by_automata(level: LevelCase) -> bool:
+    """An automaton would draw its choices if the skills of this level sampled."""
+    return any(below.selector == "automaton" for below in level.below)
+
+
+def can_be_exported(case: Case) -> bool:
+    """Its policies are networks and functions, and its guides restrict."""
+    levels = [*case.level.all]
+    paid = any(s.policy == "paid" for level in levels for s in level.skills)
+    restrict = all(level.guide is None or level.guide_restricts for level in levels)
+    return case.deterministic and restrict and not paid
+
+
+USERS: dict[str, tuple[Callable[[Case], Played], Callable[[Case], bool]]] = {
+    "player": (alone, lambda case: True),
+    "decisions": (decisions, lambda case: True),
+    "joint": (joint, lambda case: True),
+    "evaluation": (evaluated, lambda case: True),
+    "deployment": (deployed, lambda case: True),
+    "OptionsEnv": (options_env, lambda case: not case.level.ready and case.level.guide is None),
+    "start states": (
+        leads_to_starts,
+        lambda case: case.level.guide is None and not drawn_by_automata(case.level),
+    ),
+    "exported": (exported, can_be_exported),
+}
+"""By name, what plays a case, and whether it can play this one."""
