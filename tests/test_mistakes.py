@@ -188,7 +188,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "termination returns floats": (
         lambda: with_skill(termination=lambda _, step: step.next_obs[:, 0]),
-        "but yes or no (bool) is asked: compare with something",
+        "but yes or no (bool) is needed: return a comparison",
     ),
     "termination uses and": (
         lambda: with_skill(
@@ -198,15 +198,15 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "termination takes obs": (
         lambda: with_skill(termination=lambda _, obs: obs[:, 0] > 1),
-        "it is given a Step: write step.next_obs[:, 0]",
+        "its argument is a Step: write step.next_obs[:, 0]",
     ),
     "termination takes the mean of obs": (
         lambda: with_skill(termination=lambda _, obs: obs.mean(axis=1) > 1),
-        "it is given a Step: write step.next_obs[:, 0]",
+        "its argument is a Step: write step.next_obs[:, 0]",
     ),
     "initiation takes a step": (
         lambda: with_skill(initiation=lambda _, step: step.obs[:, 0] > 1),
-        "it is given observations, not a Step: write obs[:, 0]",
+        "its argument is observations, not a Step: write obs[:, 0]",
     ),
     "initiation False everywhere": (
         lambda: with_skill(initiation=lambda _, obs: np.zeros(len(obs), bool)),
@@ -226,7 +226,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "reward overwrites step.next_obs": (
         lambda: with_skill(reward=overwrite),
-        "what it is given cannot be changed: change a copy",
+        "its argument is read-only: change a copy",
     ),
     # Declarations
     "skill class": (lambda: train(skills=[Good]), "write Center(), not Center"),
@@ -332,7 +332,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: train(
             skills=[skill(policy=zeros)], selector=lambda obs: np.full(len(obs), "landd")
         ).evaluate(2),
-        "names 'landd', which is no skill of the hierarchy; there are: s",
+        "names 'landd', which is no skill of the hierarchy; its skills are: s",
     ),
     "selector of floats": (
         lambda: train(

@@ -127,7 +127,7 @@ WRONG = {
     "the start": (lambda: Automaton(STATES, {}, "begin"), "start names the state 'begin'.*search"),
     "to an unknown state": (
         lambda: Automaton(STATES, {("search", "fre"): got_key}),
-        r"\('search', 'fre'\) names the state 'fre', which is not there; there are: search",
+        r"\('search', 'fre'\) names the state 'fre', which does not exist; the states are: search",
     ),
     "from an unknown state": (
         lambda: Automaton(STATES, {("x", "free"): got_key}),
@@ -141,7 +141,7 @@ WRONG = {
     ),
     "an unknown skill": (
         lambda: bound(Automaton({"a": "walk"}, {})),
-        "state 'a' names 'walk'.*there are: get_key, open_door",
+        "state 'a' names 'walk'.*its skills are: get_key, open_door",
     ),
 }
 

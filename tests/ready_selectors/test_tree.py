@@ -123,9 +123,9 @@ def test_a_skill_that_may_not_start_has_failed_at_once():
 
 
 def test_a_tree_that_ends_without_a_skill_says_where():
-    with pytest.raises(SkillweaveError, match=r"tree came to its end \(FAILURE\).*\[0. 7. 0.\]"):
+    with pytest.raises(SkillweaveError, match=r"tree ended \(FAILURE\).*\[0. 7. 0.\]"):
         chosen(tree.Sequence(flag(0), "a"), [], [(0, 7, 0)])
-    with pytest.raises(SkillweaveError, match=r"tree came to its end \(SUCCESS\).*Fallback"):
+    with pytest.raises(SkillweaveError, match=r"tree ended \(SUCCESS\).*Fallback"):
         chosen(tree.Fallback(flag(0), "a"), [], [(1, 0, 0)])
     with pytest.raises(SkillweaveError, match="without a skill that may start"):
         chosen(tree.Sequence("a", "b"), [], masks=[(False, True, True)])
@@ -141,7 +141,7 @@ WRONG = {
     "no function": (lambda: tree.Condition("a"), "Condition is 'a'.*function of observations"),
     "an unknown skill": (
         lambda: made(tree.Sequence("a", tree.Fallback("d"))),
-        "leaf names 'd'.*there are: a, b, c",
+        "leaf names 'd'.*its skills are: a, b, c",
     ),
 }
 
@@ -233,7 +233,7 @@ def test_many_environments_at_once_are_each_as_the_definition_says(seed):
         wanted = [plain[i].choose(obs[i], mask[i], ended[i]) for i in rows]
         own = {k: v[rows] for k, v in memory.items()}
         if None in wanted:  # conditions that hold can bring a tree to its end without a skill
-            with pytest.raises(SkillweaveError, match="came to its end"):
+            with pytest.raises(SkillweaveError, match="ended"):
                 policy.act(own, obs[rows], mask[rows])
             return
         skill, own = policy.act(own, obs[rows], mask[rows])

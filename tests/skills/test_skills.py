@@ -173,7 +173,7 @@ def test_a_reward_of_another_kind_is_told(bad, says):
     [
         ([0, 7], "returned 7 at step 3 for environment 1, but yes or no"),
         ([np.nan, 1.0], "returned nan at step 3 for environment 0, but yes or no"),
-        ([0.0, 0.5], "returned 0.5 .*compare with something"),
+        ([0.0, 0.5], "returned 0.5 .*return a comparison"),
         (["no", ""], r"returned <U2 \('no'\)"),
         ([None, True], "returned object"),
         ([1j, 0], "returned complex128"),
