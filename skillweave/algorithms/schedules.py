@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.named import Named, known_names, named
 from skillweave.settings import (
     LARGEST_FLOAT,
@@ -98,7 +98,7 @@ def scheduled(config: Any, remaining: float) -> float:
         value = schedule(remaining)
         rate = float(value)
     except (Exception, SystemExit) as error:
-        message = f"{where}: {schedule}({remaining:g}) raised {told(error)}"
+        message = f"{where}: {schedule}({remaining:g}) raised {error_text(error)}"
         raise DeclarationError(message) from error
     if not 0.0 <= rate < LARGEST_FLOAT:
         raise DeclarationError(

@@ -16,7 +16,7 @@ import numpy as np
 from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.notices import notice
 from skillweave.spaces import obs_shape
 from skillweave.spaces.packing import parts
@@ -115,7 +115,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
-            raise self._wrong(f"reset() raised {told(error)}") from error
+            raise self._wrong(f"reset() raised {error_text(error)}") from error
         if not isinstance(result, tuple) or len(result) != 2:
             raise self._wrong(f"reset() returned {_many(result)}; Gymnasium needs obs, info")
         obs, info = result
@@ -135,7 +135,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
-            raise self._wrong(f"step() raised {told(error)}") from error
+            raise self._wrong(f"step() raised {error_text(error)}") from error
         if not isinstance(result, tuple) or len(result) != 5:
             raise self._wrong(
                 f"step() returned {_many(result)}; Gymnasium needs five: obs, reward, "
@@ -192,7 +192,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             try:
                 mask = self._masks()
             except (Exception, SystemExit) as error:
-                raise self._wrong(f"action_masks() raised {told(error)}") from error
+                raise self._wrong(f"action_masks() raised {error_text(error)}") from error
         others = {key: value for key, value in info.items() if key != MASK}
         if mask is None:  # all actions are allowed
             return others
@@ -207,7 +207,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             super().close()
         except (Exception, SystemExit) as error:
             notice(
-                f"{self._name}: close() raised {told(error)}. The training result is kept, but "
+                f"{self._name}: close() raised {error_text(error)}. The training result is kept, but "
                 "resources of the environment may not have been released"
             )
 

@@ -22,7 +22,7 @@ from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
-from skillweave.messages import close_matches, short, shortened, told
+from skillweave.messages import close_matches, error_text, short, shortened
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Check, check_fields
@@ -164,7 +164,7 @@ class EnvSpec:
             raise
         except (Exception, SystemExit) as error:
             which = "" if number is None else f" (environment {number})"
-            raise EnvError(f"{self.name}{which} could not be made: {told(error)}") from error
+            raise EnvError(f"{self.name}{which} could not be made: {error_text(error)}") from error
         return CheckedEnv(env, self.name, number)
 
     def _unchecked(self, render_mode: str | None) -> gym.Env[Any, Any]:

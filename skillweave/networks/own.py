@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.named import Named
 from skillweave.networks.stacked import Inputs, Views
 from skillweave.ops.device import Constant, usual_defaults
@@ -117,7 +117,7 @@ class ModuleEncoder:
                 raise
             except (Exception, SystemExit) as error:
                 raise DeclarationError(
-                    f"{self._label} raised {told(error)} when it was called with the observation "
+                    f"{self._label} raised {error_text(error)} when it was called with the observation "
                     f"space {short(self.space, 200)}"
                 ) from error
             if not isinstance(module, nn.Module):
@@ -140,7 +140,7 @@ class ModuleEncoder:
         except (Exception, SystemExit) as error:
             shapes = ", ".join(str(tuple(leaf.shape)) for leaf in examples)
             raise DeclarationError(
-                f"{self._label}: forward raised {told(error)} for observations of shape {shapes}"
+                f"{self._label}: forward raised {error_text(error)} for observations of shape {shapes}"
             ) from error
 
     def _check_constants(self) -> None:

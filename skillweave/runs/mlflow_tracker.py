@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import RunError
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import say
 from skillweave.types import flat
@@ -50,7 +50,7 @@ class MLflow:
             mlflow_run = self._existing(identifier) or self._new(identifier)
         except Exception as error:  # of any store
             raise RunError(
-                f"MLflow at {mlflow.get_tracking_uri()} does not answer: {told(error)}. Set "
+                f"MLflow at {mlflow.get_tracking_uri()} does not answer: {error_text(error)}. Set "
                 "MLFLOW_TRACKING_URI, or train without this tracker"
             ) from error
         self._id: str = mlflow_run.info.run_id
@@ -125,5 +125,5 @@ class MLflow:
                 sent.wait()
             self._client.set_terminated(self._id, status)
         except Exception as error:
-            text = f"MLflow did not take all metrics (they are in the run's files): {told(error)}"
+            text = f"MLflow did not take all metrics (they are in the run's files): {error_text(error)}"
             say(text)

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector.utils import batch_space
 
 from skillweave.errors import PolicyError, RunError, SkillweaveError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.types import Array, Memory, Memoryless, Policy
 
 
@@ -88,7 +88,7 @@ class Foreign(Memoryless):
         except (Exception, SystemExit) as error:
             space = short(self.observation_space, 300)
             raise PolicyError(
-                f"{self._who} fails on observations of {space}: {told(error)}"
+                f"{self._who} fails on observations of {space}: {error_text(error)}"
             ) from error
 
 

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.tracebacks import is_users
 from skillweave.types import Array, Step
@@ -46,7 +46,7 @@ def called(
         about = getattr(argument, "shape", None)
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
-        raise kind(f"{who} raised {told(error)}{at_step(elapsed)}{given}{advice}") from error
+        raise kind(f"{who} raised {error_text(error)}{at_step(elapsed)}{given}{advice}") from error
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:
@@ -94,7 +94,7 @@ def blame(error: BaseException, who: str) -> NoReturn:
     """
     if isinstance(error, SkillweaveError) or not is_users(error):
         raise error
-    raise PolicyError(f"{who} raised {told(error)}") from error
+    raise PolicyError(f"{who} raised {error_text(error)}") from error
 
 
 def at_step(elapsed: Any) -> str:
@@ -112,7 +112,9 @@ def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> 
     try:
         return np.asarray(value)
     except Exception as error:
-        raise kind(f"{who} returned {short(value)}, which is no array: {told(error)}") from error
+        raise kind(
+            f"{who} returned {short(value)}, which is no array: {error_text(error)}"
+        ) from error
 
 
 def checked_actions(

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.errors import SkillError, SkillweaveError
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.types import Array, Step, read_only
 
 MOST = 256
@@ -106,7 +106,7 @@ def probe(
                 if not certain:
                     return
                 raise kind(
-                    f"{who} answers for {n} environments, but for {m} it raised {told(error)}: "
+                    f"{who} answers for {n} environments, but for {m} it raised {error_text(error)}: "
                     f"{AXIS}"
                 ) from error
             actual, wanted = np.shape(answer), (m, *shape)

@@ -208,7 +208,7 @@ def test_who_may_not_write_is_told_what_to_do(
 def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -> None:
     hub.make("ada/else", {"config.json": b"{}"})
     hub.make("ada/code", {**files_of(run.path), "train.py": b""})
-    for name, why in (("ada/else", "something else"), ("ada/code", "'train.py'")):
+    for name, why in (("ada/else", "other files"), ("ada/code", "'train.py'")):
         before = hub.files(name)
         with pytest.raises(SkillweaveError, match=f"{name} holds {why}"):
             run.push(name)
