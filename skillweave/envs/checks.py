@@ -207,8 +207,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             super().close()
         except (Exception, SystemExit) as error:
             notice(
-                f"{self._name}: close() raised {error_text(error)}. The training result is kept, but "
-                "resources of the environment may not have been released"
+                f"{self._name}: close() raised {error_text(error)}. The training result is kept, "
+                "but resources of the environment may not have been released"
             )
 
     def _number_of(self, reward: Any) -> float:

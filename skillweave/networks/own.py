@@ -117,8 +117,8 @@ class ModuleEncoder:
                 raise
             except (Exception, SystemExit) as error:
                 raise DeclarationError(
-                    f"{self._label} raised {error_text(error)} when it was called with the observation "
-                    f"space {short(self.space, 200)}"
+                    f"{self._label} raised {error_text(error)} when it was called with the "
+                    f"observation space {short(self.space, 200)}"
                 ) from error
             if not isinstance(module, nn.Module):
                 raise DeclarationError(
@@ -140,7 +140,8 @@ class ModuleEncoder:
         except (Exception, SystemExit) as error:
             shapes = ", ".join(str(tuple(leaf.shape)) for leaf in examples)
             raise DeclarationError(
-                f"{self._label}: forward raised {error_text(error)} for observations of shape {shapes}"
+                f"{self._label}: forward raised {error_text(error)} for observations of "
+                f"shape {shapes}"
             ) from error
 
     def _check_constants(self) -> None:

@@ -125,5 +125,7 @@ class MLflow:
                 sent.wait()
             self._client.set_terminated(self._id, status)
         except Exception as error:
-            text = f"MLflow did not take all metrics (they are in the run's files): {error_text(error)}"
-            say(text)
+            say(
+                "MLflow did not take all metrics (they are in the run's files): "
+                f"{error_text(error)}"
+            )

@@ -106,8 +106,8 @@ def probe(
                 if not certain:
                     return
                 raise kind(
-                    f"{who} answers for {n} environments, but for {m} it raised {error_text(error)}: "
-                    f"{AXIS}"
+                    f"{who} answers for {n} environments, but for {m} it raised "
+                    f"{error_text(error)}: {AXIS}"
                 ) from error
             actual, wanted = np.shape(answer), (m, *shape)
             if actual != wanted and certain:
