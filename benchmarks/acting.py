@@ -19,7 +19,7 @@ import torch
 import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.seeding import Seeds
 
 ENV = "CartPole-v1"

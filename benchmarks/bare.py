@@ -12,9 +12,9 @@ from skillweave.collecting.group import Collectors
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
+from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
-from skillweave.training.scene import skill_scene
 
 
 def train_bare(
@@ -25,12 +25,12 @@ def train_bare(
     on_tick: Callable[[Tick, Stack], None],
 ) -> Stack:
     """Train an agent; ``on_tick`` is called with every report."""
-    scene = skill_scene(spec)
-    algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+    learning_task = skill_task(spec)
+    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
     stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))
     learner = learner_of(stack, config.num_envs, seeds)
     acting = Acting([(algorithm, 1)], config.num_envs)
-    collectors = Collectors([scene.collector(config.num_envs, acting)])
+    collectors = Collectors([learning_task.collector(config.num_envs, acting)])
     try:
         train(
             learner,

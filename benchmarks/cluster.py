@@ -322,18 +322,25 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
     from skillweave.algorithms.policy import make_algorithm
     from skillweave.seeding import Seeds
     from skillweave.training.learner import RolloutLearner, Stack
-    from skillweave.training.scene import skill_scene
+    from skillweave.training.learning_task import skill_task
     from skillweave.training.trainer import _collector
 
     found: dict[str, Any] = {}
     for name, env in (("CartPole", lambda: gym.make("CartPole-v1")), ("MiniGrid", grid)):
         each, rows, count = 16, 128, 2
-        scene, config = skill_scene(EnvSpec(env, engine="sync")), small(count, each, rows)
-        algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+        learning_task, config = skill_task(EnvSpec(env, engine="sync")), small(count, each, rows)
+        algorithm = make_algorithm(
+            config, learning_task.observation_space, learning_task.action_space
+        )
         learner = RolloutLearner(Stack(algorithm, algorithm.init([Seeds(0)])), Seeds(1))
 
-        def make(num_envs: int, first: int, scene: Any = scene, algorithm: Any = algorithm) -> Any:
-            return _collector(scene, algorithm, num_envs, first)
+        def make(
+            num_envs: int,
+            first: int,
+            learning_task: Any = learning_task,
+            algorithm: Any = algorithm,
+        ) -> Any:
+            return _collector(learning_task, algorithm, num_envs, first)
 
         alone = make(each, 0)
         alone.start(Seeds(0))

@@ -54,18 +54,18 @@ from skillweave import (
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.experience import Batch
 from skillweave.seeding import Seeds
 from skillweave.skills import ready_policy
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
+from skillweave.training.learning_task import CALL
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
-from skillweave.training.scene import CALL
 from skillweave.types import Array
 
 GAMMA, GOALS = 0.9, {"G1": G1, "G2": G2}

@@ -27,9 +27,9 @@ from skillweave.collecting.group import Collectors
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
+from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
-from skillweave.training.scene import skill_scene
 
 ROOT = Path(skillweave.__file__).parent
 PAGE = Path(__file__).parents[1] / "docs" / "one-gradient.md"
@@ -41,12 +41,12 @@ ROUNDS: dict[str, tuple[str, Any]] = {
 
 def one_round(env: str, config: Any, steps: int) -> Callable[[], None]:
     """Return a function that collects and learns, everything made before."""
-    scene = skill_scene(EnvSpec(env, engine="sync"))
-    algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+    learning_task = skill_task(EnvSpec(env, engine="sync"))
+    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
     stack = Stack(algorithm, algorithm.init([Seeds(0)]))
     learner = learner_of(stack, config.num_envs, Seeds(0))
     acting = Acting([(algorithm, 1)], config.num_envs)
-    collectors = Collectors([scene.collector(config.num_envs, acting)])
+    collectors = Collectors([learning_task.collector(config.num_envs, acting)])
     return lambda: void(train(learner, collectors, Episodes(), Seeds(0), steps))
 
 

@@ -54,9 +54,6 @@ def error_text(error: BaseException) -> str:
     return f"{text.removesuffix('.')} ({where})" if where else text
 
 
-told = error_text  # the name in rooms that are not yet rewritten
-
-
 def whole_number(value: object, name: str, least: int) -> int:
     """Return ``value`` as an int.
 

@@ -101,7 +101,7 @@ def test_stable_baselines3_is_told_final_observations_and_time_limits():
     import numpy as np
 
     from skillweave import EnvSpec, OptionsEnv
-    from skillweave.collecting.calls import SkillSet
+    from skillweave.collecting.skill_set import SkillSet
     from skillweave.envs.make import make_engine
 
     module = adapter()

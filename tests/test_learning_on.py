@@ -10,7 +10,7 @@ from test_together import Other, declare
 from skillweave import SkillweaveError
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.woven_learner import WovenLearner
+from skillweave.training.joint_learner import JointLearner
 
 
 def then(**how):
@@ -22,7 +22,7 @@ def whole(tmp_path_factory):
     """An uninterrupted run, and the states that stages ended and began with."""
     ended, begun = {}, {}
     with pytest.MonkeyPatch.context() as patch:
-        save, init = RunDirectory.save_checkpoint, WovenLearner.__init__
+        save, init = RunDirectory.save_checkpoint, JointLearner.__init__
 
         def saved(self, state, header, *more):
             ended[header["stage"]] = state
@@ -34,7 +34,7 @@ def whole(tmp_path_factory):
             init(self, parts, how, *more)
 
         patch.setattr(RunDirectory, "save_checkpoint", saved)
-        patch.setattr(WovenLearner, "__init__", made)
+        patch.setattr(JointLearner, "__init__", made)
         path = tmp_path_factory.mktemp("then") / "run"
         then().train(path, seed=3, quiet=True)
     return path, ended, begun

@@ -102,7 +102,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     # Environments
     "misspelt env id": (lambda: train("CartPol-v1"), "Close matches: CartPole-v1"),
     "old env id": (lambda: train("LunarLander-v2"), "use `LunarLander-v3` instead"),
-    "env of a package not imported": (lambda: train("ALE/Pong-v5"), "install and import that package"),
+    "env not imported": (lambda: train("ALE/Pong-v5"), "install and import that package"),
     "env instance": (lambda: train(gym.make("CartPole-v1")), "it must be a Gymnasium id"),
     "env of no package": (lambda: train("procgen-v0"), "no environment 'procgen-v0'"),
     "env raises in step": (lambda: train(Boom), "of its episode: step() raised ValueError"),

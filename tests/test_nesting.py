@@ -39,7 +39,7 @@ from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy import training
 from skillweave.hierarchy.nesting import every_hierarchy, every_skill
-from skillweave.hierarchy.select_best import settled
+from skillweave.hierarchy.select_best import resolve_greedy
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.call_log import CallLog
@@ -520,9 +520,9 @@ def stage(name, kept):
 )
 def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
     run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
-    found = settled(declare(), run)
+    found = resolve_greedy(declare(), run)
     assert tuple(own.selection.greedy_skills for _, own in every_hierarchy(found)) == greedy
-    said = settled(declare(inside(greedy_skills=False), greedy_skills=True), run)
+    said = resolve_greedy(declare(inside(greedy_skills=False), greedy_skills=True), run)
     assert [own.selection.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
 
 

@@ -34,8 +34,8 @@ from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
+from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import ReplayLearner
-from skillweave.training.scene import Scene
 from skillweave.training.stage import Stage
 from skillweave.training.trainer import train_stage
 
@@ -332,15 +332,15 @@ def stage_of(name: str, save_buffer: bool = True) -> Stage:
     config, shows, asks = REPLAYERS[name]
     config = dataclasses.replace(config, save_buffer=save_buffer)
 
-    def scene(_: Any) -> Scene:
+    def learning_task(_: Any) -> LearningTask:
         space, acts = Echo(1, shows, asks).observation_space, ASKS[asks][0]
 
         def collector(num_envs: int, acting: Any, first: int = 0, shared: bool = False) -> Any:
             return Echo(num_envs, shows, asks).collector(acting)
 
-        return Scene("Echo", space, acts, collector)
+        return LearningTask("Echo", space, acts, collector)
 
-    return Stage("echo", "agent", config, 650, scene)
+    return Stage("echo", "agent", config, 650, learning_task)
 
 
 def echo_run(path: Path, stage: Stage) -> RunDirectory:

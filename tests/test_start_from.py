@@ -37,7 +37,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
 from skillweave.training import stage_log
-from skillweave.training.woven_learner import WovenLearner
+from skillweave.training.joint_learner import JointLearner
 
 STILL = 1e-12
 """A learning rate by which nothing moves."""
@@ -208,13 +208,13 @@ def test_a_dqn_does_not_explore_anew(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, monkeypatch):
-    anchors, make = {}, WovenLearner.__init__
+    anchors, make = {}, JointLearner.__init__
 
     def made(self, parts, *more):
         anchors.update({name: getattr(part, "reference", None) for name, part in parts.items()})
         make(self, parts, *more)
 
-    monkeypatch.setattr(WovenLearner, "__init__", made)
+    monkeypatch.setattr(JointLearner, "__init__", made)
     declare("together").train(tmp_path / "a", quiet=True, start_from=source)
     assert set(anchors.values()) == {None}
     # What an earlier stage of the same run taught is an anchor, as ever.

@@ -194,8 +194,8 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("envs.make", "def f():\n    from skillweave.algorithms.ppo import State"),
         ("envs.make", "if TYPE_CHECKING:\n    from skillweave.api import Run"),
         ("envs.make", "from ..collecting import calls"),
-        ("collecting.calls", "from skillweave.training.learner import Learner"),
-        ("collecting.calls", "from skillweave.hierarchy.options import OptionsEnv"),
+        ("collecting.skill_set", "from skillweave.training.learner import Learner"),
+        ("collecting.skill_set", "from skillweave.hierarchy.options import OptionsEnv"),
         ("buffers.replay", "from skillweave.collecting.collector import Collected"),
         ("envs.make", "from skillweave import PPO"),
         ("envs.make", "from skillweave import recipes"),
@@ -206,7 +206,7 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("networks.config", "from skillweave.networks.stacked import mlp"),
         ("seeding", "from skillweave.types import Step"),
         ("reporting.plots", "from skillweave.compat import x"),
-        ("recipes.x", "from skillweave.collecting.calls import SkillSet"),
+        ("recipes.x", "from skillweave.collecting.skill_set import SkillSet"),
         ("api.declared", "def f():\n    from skillweave import recipes"),
     ],
 )
@@ -226,7 +226,7 @@ def test_the_search_finds_an_import_against_the_order(module: str, source: str) 
         ("ops.returns", "from skillweave.seeding import Seeds"),
         ("collecting.acting", "from skillweave.algorithms.base import Algorithm"),
         ("training.loop", "from skillweave.collecting.group import Collectors"),
-        ("hierarchy.options", "from skillweave.collecting.calls import SkillSet"),
+        ("hierarchy.options", "from skillweave.collecting.skill_set import SkillSet"),
     ],
 )
 def test_the_search_lets_pass_what_the_order_allows(module: str, source: str) -> None:

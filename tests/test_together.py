@@ -137,7 +137,7 @@ def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch)
         each = num_envs // workers
         return group.Collectors([make(each, i * each) for i in range(workers)], members)
 
-    places = where.Where(here, where.HERE.workers)
+    places = where.Placement(here, where.LOCAL.workers)
     monkeypatch.setattr("skillweave.api.running.HERE", places)
     declare(workers=2).train(tmp_path / "here", seed=3, quiet=True)
     assert_same(tmp_path / "processes", tmp_path / "here")
@@ -167,7 +167,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
 
     rates = [ON.learning_rate, slow.learning_rate]
     assert sorted(train("shared")) == sorted([*rates, ON.learning_rate]), "the selector's is apart"
-    monkeypatch.setattr(woven.WovenAgents, "_made", lambda *told: None)
+    monkeypatch.setattr(woven.JointAgents, "_made", lambda *told: None)
     assert len(train("apart")) == 4
     assert_same(tmp_path / "shared", tmp_path / "apart")
 

@@ -17,11 +17,11 @@ from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill

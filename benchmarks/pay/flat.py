@@ -15,8 +15,8 @@ from skillweave.api import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
+from skillweave.training.learning_task import skill_task
 from skillweave.training.periodic import PeriodicEvaluation
-from skillweave.training.scene import skill_scene
 from skillweave.training.stage import Stage
 from skillweave.training.stage_run import StageRun
 from skillweave.training.trainer import OneAgent
@@ -35,7 +35,7 @@ class Flat(Agent):
         """Return its only stage."""
         spec, skill = self.spec, self.learns
         return [
-            Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_scene(spec, skill))
+            Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_task(spec, skill))
         ]
 
     def run(self, path: Path, seed: int) -> Run:
@@ -69,7 +69,7 @@ class _FlatLearner(OneAgent):
         """Make the environments and the agent."""
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
-            skill_scene(self._flat.spec),
+            skill_task(self._flat.spec),
             self.stage.seeds,
             manifest["eval_every"],
             manifest["eval_episodes"],

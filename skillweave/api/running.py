@@ -15,8 +15,8 @@ from skillweave.api.adoption import Trained, caller_of
 from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.starting import Directories, Spaces, starts
 from skillweave.collecting.cluster import Ray
+from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.collecting.start_methods import runs_again, why_no_processes
-from skillweave.collecting.where import HERE, Where
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
@@ -267,7 +267,9 @@ def apart_to_evolve(declared: H) -> tuple[H, str]:
     )
 
 
-def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack) -> Where:
+def _where(
+    cluster: Ray | None, run: RunDirectory, progress: Progress, stack: ExitStack
+) -> Placement:
     """Return the placement of a run's collectors, and of parts of its populations.
 
     A cluster is left when ``stack`` is closed.
@@ -277,7 +279,7 @@ def _where(cluster: Ray | None, run: RunDirectory, progress: Progress, stack: Ex
     """
     _check(cluster)
     if cluster is None or run.finished:
-        return HERE
+        return LOCAL
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
     counts = [s.get("workers", 1) for s in left]
     wanted = cluster.collectors

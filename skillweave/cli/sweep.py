@@ -247,7 +247,7 @@ def _task() -> Callable[..., Any]:
     It returns the node's versions where they do not fit, else None; and the run's result. It is
     sent to the nodes as code, so that it can report a node without Skillweave.
     """
-    from skillweave.collecting.stationed import actor_class
+    from skillweave.collecting.actor_host import actor_class
 
     place = actor_class()()
 

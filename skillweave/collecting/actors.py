@@ -25,12 +25,12 @@ from ray.util.placement_group import (
 )
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
+from skillweave.collecting.actor_host import COMPUTING, actor_class
 from skillweave.collecting.collector import Collected
 from skillweave.collecting.shipping import packed
-from skillweave.collecting.stationed import COMPUTING, actor_class
-from skillweave.collecting.workers import MakeStanding, WorkerCollectors, WorkerLost, Workers
+from skillweave.collecting.workers import WorkerCollectors, WorkerFactory, WorkerLost, Workers
 from skillweave.errors import TrainingError, make_error
-from skillweave.messages import told
+from skillweave.messages import error_text
 
 PATIENCE = 1.0
 """Seconds that actors have to close their environments."""
@@ -141,7 +141,7 @@ class RayWorkers(Workers):
         self._workers[0].let_close()
 
 
-def ray_workers(actors: Actors, make: MakeStanding, count: int, name: str) -> Workers:
+def ray_workers(actors: Actors, make: WorkerFactory, count: int, name: str) -> Workers:
     """``count`` workers in actors; ``make`` is given 1 and the worker's number."""
     return RayWorkers(_workers(actors, make, 1, count, name), name)
 
@@ -162,7 +162,7 @@ class RayCollectors(RayWorkers, WorkerCollectors):
     """
 
     def __init__(
-        self, actors: Actors, make: MakeStanding, each: int, count: int, members: int, name: str
+        self, actors: Actors, make: WorkerFactory, each: int, count: int, members: int, name: str
     ) -> None:
         super().__init__(_workers(actors, make, each, count, name), each, members, name)
 
@@ -234,7 +234,7 @@ class ActorWorker:
 
 
 def _workers(
-    actors: Actors, make: MakeStanding, each: int, count: int, name: str
+    actors: Actors, make: WorkerFactory, each: int, count: int, name: str
 ) -> list[ActorWorker]:
     code = _put(packed(make, f"what collectors of {name} are made of"))
     return [ActorWorker(actors, code, each, i) for i in range(count)]
@@ -249,8 +249,8 @@ def _put(thing: Any) -> Any:
 
 def _full(error: Exception) -> TrainingError:
     return TrainingError(
-        f"the object store of the Ray cluster is full ({told(error)}). Experience goes through it: "
-        "give it more memory (ray start --object-store-memory=BYTES), or ask for less at once "
+        f"the object store of the Ray cluster is full ({error_text(error)}). Batches "
+        "go through it: give it more memory (ray start --object-store-memory=BYTES), or ask for less at once "
         "(num_envs, n_steps)"
     )
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from skillweave.collecting.group import Collectors, MakeCollector, share_of
-from skillweave.collecting.where import Where
-from skillweave.collecting.workers import MakeStanding, Workers
+from skillweave.collecting.placement import Placement
+from skillweave.collecting.workers import WorkerFactory, Workers
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, MissingExtra, TrainingError
-from skillweave.messages import short, told
+from skillweave.messages import error_text, short
 from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
 PATIENCE = 5.0
@@ -94,7 +94,7 @@ class Ray:
                 ray.shutdown()
 
     @contextmanager
-    def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[Where]:
+    def connected(self, most: int, tell: Callable[[str], None]) -> Iterator[Placement]:
         """Be connected to the cluster; what makes collectors and other workers on it.
 
         Args:
@@ -115,11 +115,11 @@ class Ray:
                 each = share_of(num_envs, workers, members, name)
                 return RayCollectors(actors, make, each, workers, members, name)
 
-            def make_workers(make: MakeStanding, count: int, name: str) -> Workers:
+            def make_workers(make: WorkerFactory, count: int, name: str) -> Workers:
                 return ray_workers(actors, make, count, name)
 
             try:
-                yield Where(make_collectors, make_workers)
+                yield Placement(make_collectors, make_workers)
             finally:
                 actors.close()
 
@@ -139,13 +139,13 @@ class Ray:
                 ) from error
             raise TrainingError(
                 f"a program listens at {short(address)}, but Ray could not connect "
-                f"({told(error)}). Perhaps it is no Ray cluster, or one that asks for a token, as "
+                f"({error_text(error)}). Perhaps it is no Ray cluster, or one that needs a token, as "
                 "those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
                 "page on token authentication)"
             ) from error
         except (RuntimeError, ValueError) as error:  # another version of Ray or Python
             raise TrainingError(
-                f"the Ray cluster at {short(address)} cannot be used: {told(error)}"
+                f"the Ray cluster at {short(address)} cannot be used: {error_text(error)}"
             ) from error
 
 

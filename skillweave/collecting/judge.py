@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.envs.infos import info_rows, told_success
 from skillweave.errors import EnvError
 from skillweave.experience import INFO, Batch

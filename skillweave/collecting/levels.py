@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.call_end import CallEnd, Interruption
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.ends import CallEnd, Interruption
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.open_calls import Decisions, OpenCalls
+from skillweave.collecting.pending_calls import Decisions, PendingCalls
 from skillweave.collecting.player import LearnerActor, Player
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.experience import Batch
 from skillweave.skills import Skill
 from skillweave.types import Array, Memory, Policy, unprefixed
@@ -177,7 +177,7 @@ class NestedLevel(Level):
         """None: it is ready."""
         if self.selector is not None:
             own = unprefixed(prefix.removesuffix("."), memory)
-            self.calls = OpenCalls(collector, player, self.selector, own, prefix=path)
+            self.calls = PendingCalls(collector, player, self.selector, own, prefix=path)
             self.acted = np.zeros(collector.num_envs, bool)  # in the step before
             self.open = np.zeros(collector.num_envs, bool)  # a call of its selector is open
             collector.kept |= {f"{path}acted": self.acted, f"{path}open": self.open}

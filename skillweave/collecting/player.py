@@ -21,10 +21,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acted, Acting
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import CallEnd, Interruption
+from skillweave.collecting.call_end import CallEnd, Interruption
 from skillweave.collecting.guide import ActiveGuide, LastCall
 from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError
 from skillweave.skills import apply_reflexes, path_of

@@ -23,14 +23,14 @@ from skillweave.collecting.shipping import packed, unpacked
 from skillweave.collecting.start_methods import GUARD
 from skillweave.collecting.worker_process import TorchModes, work
 from skillweave.collecting.workers import (
-    MakeStanding,
     WorkerCollectors,
+    WorkerFactory,
     WorkerLost,
     Workers,
     environments_of,
 )
 from skillweave.errors import TrainingError, make_error
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.notices import notice
 
 PATIENCE = 1.0
@@ -42,7 +42,7 @@ SILENCE = 60.0
 class _Maker:
     """A function that makes a collector; it is sent with the user's code to unforked processes."""
 
-    def __init__(self, make: MakeStanding) -> None:
+    def __init__(self, make: WorkerFactory) -> None:
         self.make = make
 
     def __getstate__(self) -> bytes:
@@ -62,7 +62,7 @@ class ProcessWorker:
         who: its name in messages.
     """
 
-    def __init__(self, make: MakeStanding, each: int, number: int, who: str) -> None:
+    def __init__(self, make: WorkerFactory, each: int, number: int, who: str) -> None:
         self._make, self._each, self._number, self._who = make, each, number, who
         self._context: Any = mp.get_context()
         self._modes = TorchModes.here()
@@ -82,9 +82,9 @@ class ProcessWorker:
             _in_starter(self._start)
         except OSError as error:
             raise TrainingError(
-                f"{self._who} could not be started: {told(error)}. The system limits descriptors "
-                "(ulimit -n), processes (ulimit -u) and memory: raise the limit, or have fewer "
-                "processes, EnvSpec(workers=...)"
+                f"{self._who} could not be started: {error_text(error)}. The system limits "
+                "descriptors (ulimit -n), processes (ulimit -u) and memory: raise the limit, or have "
+                "fewer processes, EnvSpec(workers=...)"
             ) from error
         self._answered = False
         self._expect("making its environments")
@@ -122,7 +122,7 @@ class ProcessWorker:
             raise WorkerLost(self._end()) from None
         except Exception as error:
             raise TrainingError(
-                f"{self._who}: its next task ({self._asked}) could not be sent: {told(error)}"
+                f"{self._who}: its next task ({self._asked}) could not be sent: {error_text(error)}"
             ) from error
 
     def receive(self) -> Any:
@@ -300,7 +300,7 @@ class ProcessWorkers(Workers):
         close_all(self._workers)
 
 
-def process_workers(make: MakeStanding, count: int, name: str) -> Workers:
+def process_workers(make: WorkerFactory, count: int, name: str) -> Workers:
     """Return ``count`` workers in processes; ``make`` is called with 1 and the worker's number."""
     workers = [ProcessWorker(make, 1, i, f"{name}: worker {i}") for i in range(count)]
     return ProcessWorkers(workers, name)
@@ -317,7 +317,7 @@ class ProcessCollectors(ProcessWorkers, WorkerCollectors):
         name: the environment's name in messages.
     """
 
-    def __init__(self, make: MakeStanding, each: int, count: int, members: int, name: str) -> None:
+    def __init__(self, make: WorkerFactory, each: int, count: int, members: int, name: str) -> None:
         workers = [
             ProcessWorker(make, each, i, f"{name}: worker {i}{environments_of(i, each)}")
             for i in range(count)

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.player import Player
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed

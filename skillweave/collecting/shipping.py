@@ -19,7 +19,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.config import add_registration, own_registrations
 from skillweave.errors import DeclarationError
-from skillweave.messages import told
+from skillweave.messages import error_text
 
 _FOLDERS: list[str] = []
 """Folders of recipes, whose files these may import."""
@@ -54,8 +54,8 @@ def packed(thing: Any, who: str) -> bytes:
             found: bytes = cloudpickle.dumps((*known, thing))
         except Exception as error:
             raise DeclarationError(
-                f"{who} cannot be sent to another process: {told(error)}. Make what cannot be sent "
-                "where it is used: in the function that makes the environment, or in a method"
+                f"{who} cannot be sent to another process: {error_text(error)}. Make what cannot "
+                "be sent where it is used: in the function that makes the environment, or in a method"
             ) from error
     return found
 

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 from skillweave.collecting.channel import Channel
 from skillweave.collecting.process_groups import kill_group, lead_group
-from skillweave.collecting.workers import SentError, Station, error_to_send
+from skillweave.collecting.workers import SentError, WorkerHost, error_to_send
 from skillweave.notices import Notices, collect_notices
 from skillweave.signals import handle_here
 
@@ -83,12 +83,12 @@ def work(
     modes.set()
     other_end.close()
     notices = collect_notices()
-    station: Station | None = None
+    station: WorkerHost | None = None
     try:
         try:
             _end_with(parent)
             _may_have_processes()
-            station = Station(maker.make, each, number)
+            station = WorkerHost(maker.make, each, number)
             _send(channel, None, None, notices)
             for what, task in _tasks(channel):
                 torch.set_num_threads(1)  # the user's code may have changed it

@@ -20,7 +20,7 @@ from skillweave.collecting.collector import Collected
 from skillweave.collecting.group import Collectors, joined_states, split_states
 from skillweave.envs.engine import checksums
 from skillweave.errors import SkillweaveError, TrainingError, kind_of, reworded
-from skillweave.messages import told
+from skillweave.messages import error_text
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 
@@ -28,7 +28,7 @@ SNAPSHOT_EVERY = 16
 """Requests after which workers say where they stand, so that less need be done again."""
 
 
-MakeStanding = Callable[[int, int], Any]
+WorkerFactory = Callable[[int, int], Any]
 """Makes what stands at a worker and does its tasks, as ``MakeCollector`` makes a collector."""
 
 
@@ -40,7 +40,7 @@ def error_to_send(error: BaseException) -> SentError:
     """Return the kind of an error and its message; the environment's own errors are EnvErrors."""
     if isinstance(error, SkillweaveError):
         return kind_of(error), str(error)
-    return "TrainingError" if isinstance(error, MemoryError) else "EnvError", told(error)
+    return "TrainingError" if isinstance(error, MemoryError) else "EnvError", error_text(error)
 
 
 class WorkerLost(Exception):
@@ -76,7 +76,7 @@ class Worker(Protocol):
         ...
 
 
-class Station:
+class WorkerHost:
     """The object at a worker that answers tasks: a collector, or part of a population.
 
     Args:
@@ -84,7 +84,7 @@ class Station:
         number: of the worker.
     """
 
-    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
+    def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
         self.number, self.collector = number, make(each, number * each)
 
     def answer(self, what: str, task: Any) -> Any:
@@ -108,9 +108,9 @@ class LocalWorker:
         number: of the worker.
     """
 
-    def __init__(self, make: MakeStanding, each: int, number: int) -> None:
+    def __init__(self, make: WorkerFactory, each: int, number: int) -> None:
         self._make, self._each, self._number = make, each, number
-        self._station: Station | None = None
+        self._station: WorkerHost | None = None
         self._due = deque[tuple[str, Any]]()
 
     def begin(self) -> None:
@@ -125,7 +125,7 @@ class LocalWorker:
         """The answer to the oldest task that has none."""
         what, task = self._due.popleft()
         if self._station is None:
-            self._station = Station(self._make, self._each, self._number)
+            self._station = WorkerHost(self._make, self._each, self._number)
             return None
         return self._station.answer(what, task)
 

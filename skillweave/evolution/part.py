@@ -18,16 +18,16 @@ from skillweave.collecting.collector import Collector, joined_from, parted
 from skillweave.collecting.group import Collectors
 from skillweave.envs.joined import JoinedEngines
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.stacks import Member, grouped, join, split
 from skillweave.ops.device import resolve_device
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.episodes import Episodes, EpisodeTally, Tick
 from skillweave.training.learner import RolloutLearner, Stack
+from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Progress, train
 from skillweave.training.replay_learner import ReplayLearner, check_counts, store_of
-from skillweave.training.scene import Scene
 from skillweave.types import Array, prefixed, unprefixed
 
 OnGenerationTick = Callable[[int, dict[str, float]], None]
@@ -40,7 +40,7 @@ class Part:
     Results are a function of members, seeds and its state.
 
     Args:
-        scene: the task that members learn.
+        learning_task: the task that members learn.
         config: settings of any member.
         seeds: the stage's seeds.
         count: the number of places.
@@ -51,22 +51,27 @@ class Part:
     """Environment steps of fitness measurements in other processes."""
 
     def __init__(
-        self, scene: Scene, config: AlgorithmConfig, seeds: Seeds, count: int, first: int = 0
+        self,
+        learning_task: LearningTask,
+        config: AlgorithmConfig,
+        seeds: Seeds,
+        count: int,
+        first: int = 0,
     ) -> None:
-        self.spaces, self.row_steps = spaces_of(scene), scene.row_steps
+        self.spaces, self.row_steps = spaces_of(learning_task), learning_task.row_steps
         self._seeds, self._first, each = seeds, first, config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
         self.places: list[Collector] = []
         """The collectors in which members act: an heir continues its place's open episodes."""
         try:
             for i in range(first, first + count):
-                place = scene.learners_collector(each, None, i * each, self.replays)
+                place = learning_task.learners_collector(each, None, i * each, self.replays)
                 self.places.append(place)
         except SkillweaveError as error:
             self.close()
             raise too_many(error, f"{count * each} of them to train in") from error
         self.num_envs = count * each
-        self.episodes = Episodes(scene.log_info)
+        self.episodes = Episodes(learning_task.log_info)
         self.rounds = 0
         """Rounds of the loop in which all members learn from one store."""
         self.store: ReplayStore | None = None
@@ -186,11 +191,11 @@ class Part:
         """Return the tally of logged keys of ``info``."""
         return self.episodes.tally
 
-    def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
+    def fitness(self, members: Sequence[Member], eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
         """Return each member's mean return in the same episodes; −inf if it has diverged."""
         return np.array(
             [
-                -np.inf if has_diverged(m) else arena.score(policy_of(m, self.spaces), seeds)
+                -np.inf if has_diverged(m) else eval_envs.score(policy_of(m, self.spaces), seeds)
                 for m in members
             ]
         )
@@ -246,9 +251,9 @@ def too_many(error: SkillweaveError, needed: str) -> EnvError:
     )
 
 
-def spaces_of(scene: Scene) -> tuple[Any, Any]:
+def spaces_of(learning_task: LearningTask) -> tuple[Any, Any]:
     """Return the spaces of the algorithms: (observation space, action space)."""
-    return scene.observation_space, scene.action_space
+    return learning_task.observation_space, learning_task.action_space
 
 
 def _telling(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:

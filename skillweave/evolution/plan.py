@@ -7,7 +7,7 @@ from contextlib import closing
 from typing import Any
 
 from skillweave.algorithms.config import config_from_json
-from skillweave.collecting.where import HERE, Where
+from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_to_json
@@ -15,8 +15,8 @@ from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short
+from skillweave.training.joint import agents_of
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
-from skillweave.training.woven import agents_of
 
 Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every stage, or for the named ones."""
@@ -63,7 +63,9 @@ def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
             raise too_many(error, f"{needed} of them to train in") from error
 
 
-def make_learner(stages: list[dict[str, Any]], evolve: Evolve, where: Where = HERE) -> MakeLearner:
+def make_learner(
+    stages: list[dict[str, Any]], evolve: Evolve, where: Placement = LOCAL
+) -> MakeLearner:
     """Return a function that makes a stage's learner: a population, or one agent.
 
     ``evolve`` has selections of the user, of which a run records only names. ``where`` is the

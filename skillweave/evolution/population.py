@@ -14,14 +14,14 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.evolution.config import Evolution
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.part import OnGenerationTick, Part, policy_of, spaces_of
 from skillweave.evolution.selection import select
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin, copy, grouped
 from skillweave.seeding import Seeds
-from skillweave.training.scene import Scene
+from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
 
 
@@ -31,7 +31,7 @@ class Population:
     Members of one stack are adjacent in ``members``.
 
     Args:
-        scene: the task that they learn.
+        learning_task: the task that they learn.
         part: trains them; None: all in this process.
     """
 
@@ -39,26 +39,26 @@ class Population:
         self,
         members: list[Member],
         evolution: Evolution,
-        scene: Scene,
+        learning_task: LearningTask,
         seeds: Seeds,
         part: Part | Parts | None = None,
     ) -> None:
         self.members, self.evolution = members, evolution
-        self.spaces = spaces_of(scene)
+        self.spaces = spaces_of(learning_task)
         self.next_number = len(members)
-        self.part = part or Part(scene, members[0].config, seeds, len(members))
+        self.part = part or Part(learning_task, members[0].config, seeds, len(members))
 
     @classmethod
     def fresh(
         cls,
         config: AlgorithmConfig,
         evolution: Evolution,
-        scene: Scene,
+        learning_task: LearningTask,
         seeds: Seeds,
         part: Part | Parts | None = None,
     ) -> Population:
         """Create the first generation, each member with its own weights."""
-        members, spaces = [], spaces_of(scene)
+        members, spaces = [], spaces_of(learning_task)
         for i in range(evolution.population):
             settings = config
             if evolution.start == "random":
@@ -68,7 +68,7 @@ class Population:
             member.state = member.algorithm(spaces).init([seeds / "member" / i])
             members.append(member)
         ordered = [m for group in grouped(members, spaces) for m in group]
-        return cls(ordered, evolution, scene, seeds, part)
+        return cls(ordered, evolution, learning_task, seeds, part)
 
     @property
     def steps(self) -> int:
@@ -84,9 +84,9 @@ class Population:
         """Train every member until it has ``until`` steps."""
         self.part.train(self.members, until, schedule_steps, seeds, on_tick)
 
-    def fitness(self, arena: FitnessArena, seeds: Seeds) -> Array:
+    def fitness(self, eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
         """Return each member's mean return in the same episodes; −inf if it has diverged."""
-        return self.part.fitness(self.members, arena, seeds)
+        return self.part.fitness(self.members, eval_envs, seeds)
 
     def state(self) -> dict[str, Tensor]:
         """Return the state of the environments for a checkpoint."""

@@ -19,13 +19,13 @@ from torch import Tensor
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.group import joined_states, split_states
-from skillweave.collecting.where import MakeWorkers
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.collecting.placement import MakeWorkers
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import OnGenerationTick, Part
 from skillweave.evolution.stacks import Member
 from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.training.episodes import EpisodeTally
-from skillweave.training.scene import Scene
+from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
 
 Sent = tuple[int, dict[str, Any], int, dict[str, Array]]
@@ -58,7 +58,7 @@ class Parts:
 
     Args:
         make_workers: creates their workers.
-        scene, config, seeds: see ``Part``.
+        learning_task, config, seeds: see ``Part``.
         count: the number of places.
         parts: the number of parts; their sizes differ by at most one.
         episodes: episodes whose mean return is a member's fitness.
@@ -70,7 +70,7 @@ class Parts:
     def __init__(
         self,
         make_workers: MakeWorkers,
-        scene: Scene,
+        learning_task: LearningTask,
         config: AlgorithmConfig,
         seeds: Seeds,
         count: int,
@@ -84,8 +84,8 @@ class Parts:
         """Environment steps of fitness measurements in other processes."""
         self.tally = EpisodeTally()
         """The tally of logged keys of ``info``."""
-        make = partial(_stationed, scene, _alone(config), seeds, self._bounds, episodes)
-        self._workers, self._closed = make_workers(make, parts, scene.name), False
+        make = partial(_stationed, learning_task, _alone(config), seeds, self._bounds, episodes)
+        self._workers, self._closed = make_workers(make, parts, learning_task.name), False
 
     def train(
         self,
@@ -107,8 +107,8 @@ class Parts:
             for member, state, steps in zip(group, trained.states, trained.steps, strict=True):
                 member.state, member.steps = type(member.state)(**_tensors(state)), steps
 
-    def fitness(self, members: Sequence[Member], arena: FitnessArena, seeds: Seeds) -> Array:
-        """Return fitness as ``Part.fitness`` does, each part in its own arena."""
+    def fitness(self, members: Sequence[Member], eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
+        """Return fitness as ``Part.fitness`` does, each part in its own environments."""
         tasks = [(_sent(group), seeds) for group in self._divided(members)]
         results = self._workers.ask("fitness", tasks, kept=False)
         self.steps_elsewhere += sum(steps for _, steps in results)
@@ -145,8 +145,8 @@ class Parts:
 class StationedPart:
     """A part at its worker; arguments and results are plain data."""
 
-    def __init__(self, part: Part, arena: FitnessArena) -> None:
-        self._part, self._arena = part, arena
+    def __init__(self, part: Part, eval_envs: FitnessEnvs) -> None:
+        self._part, self._arena = part, eval_envs
 
     def train(self, task: Training) -> Trained:
         """Train members."""
@@ -179,7 +179,7 @@ class StationedPart:
 
 
 def _stationed(
-    scene: Scene,
+    learning_task: LearningTask,
     config: AlgorithmConfig,
     seeds: Seeds,
     bounds: Sequence[int],
@@ -189,8 +189,8 @@ def _stationed(
 ) -> StationedPart:
     seed_global_generators(seeds / "global" / number)
     first, end = bounds[number], bounds[number + 1]
-    part = Part(scene, config, seeds, end - first, first)
-    return StationedPart(part, FitnessArena(scene, episodes, config.num_envs))
+    part = Part(learning_task, config, seeds, end - first, first)
+    return StationedPart(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 
 
 def _alone(config: AlgorithmConfig) -> AlgorithmConfig:

@@ -18,9 +18,9 @@ from torch import Tensor
 
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
-from skillweave.collecting.where import HERE, Where
+from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.evolution.config import evolution_from_json
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.part import spaces_of
 from skillweave.evolution.population import Population
@@ -60,7 +60,7 @@ class EvolvingPopulation:
 
     schema: Any = Generation
 
-    def __init__(self, stage: StageRun, selection: Any = None, where: Where = HERE) -> None:
+    def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
         self.stage, self.run, self.seeds = stage, stage.run, stage.seeds
         label = f"{stage.run.path}: stage {stage.name!r}"
         self.evolution = evolution_from_json(stage.entry["evolution"], label, selection)
@@ -74,9 +74,11 @@ class EvolvingPopulation:
 
     def open(self) -> None:
         """Create the environments of fitness measurements."""
-        self.arena = FitnessArena(self.stage.scene, self.evolution.episodes, self.config.num_envs)
-        self._open.callback(self.arena.close)
-        self.spaces = spaces_of(self.stage.scene)
+        self.eval_envs = FitnessEnvs(
+            self.stage.learning_task, self.evolution.episodes, self.config.num_envs
+        )
+        self._open.callback(self.eval_envs.close)
+        self.spaces = spaces_of(self.stage.learning_task)
         self.parts = self._parts()
         if self.parts is not None:
             self._open.callback(self.parts.close)
@@ -88,7 +90,7 @@ class EvolvingPopulation:
             self._restore(log.at, extra)
         else:
             self.population = Population.fresh(
-                self.config, self.evolution, self.stage.scene, self.seeds, self.parts
+                self.config, self.evolution, self.stage.learning_task, self.seeds, self.parts
             )
         self._open.callback(self.population.close)
         if extra:
@@ -102,7 +104,7 @@ class EvolvingPopulation:
             return None
         return Parts(
             self._where.workers,
-            self.stage.scene,
+            self.stage.learning_task,
             self.config,
             self.seeds,
             evolution.population,
@@ -161,7 +163,7 @@ class EvolvingPopulation:
         seeds = self.seeds / "generation" / self.done
         self.population.train(*self._until(before), seeds, on_tick)
         measured = self._measured
-        fitness = self.population.fitness(self.arena, seeds / "fitness")
+        fitness = self.population.fitness(self.eval_envs, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
         self.fitness_steps = self._measured - measured
         self.log.at["steps"] += self.fitness_steps
@@ -178,7 +180,7 @@ class EvolvingPopulation:
     @property
     def _measured(self) -> int:
         """Return the environment steps of fitness measurements since this process began."""
-        return self.arena.steps_made + self.population.part.steps_elsewhere
+        return self.eval_envs.steps_made + self.population.part.steps_elsewhere
 
     def _finish(self) -> AgentPolicy:
         """Return the final policy of the stage."""
@@ -216,7 +218,7 @@ class EvolvingPopulation:
     def _keep_best(self, fitness: Array, seeds: Seeds) -> None:
         """Keep the best policy so far: the old one plays this generation's episodes, too."""
         if self.best is not None:
-            self.best.fitness = self.arena.score(self.best.policy, seeds)
+            self.best.fitness = self.eval_envs.score(self.best.policy, seeds)
         # The latest of equal ones: it has learnt for longer.
         if self.best is None or fitness.max() >= self.best.fitness:
             member = self.population.members[int(fitness.argmax())]
@@ -283,8 +285,8 @@ class EvolvingPopulation:
             self._restored(entry, unprefixed(str(i), tensors), f"{where}: member {i}")
             for i, entry in enumerate(at["members"])
         ]
-        scene = self.stage.scene
-        self.population = Population(members, self.evolution, scene, self.seeds, self.parts)
+        learning_task = self.stage.learning_task
+        self.population = Population(members, self.evolution, learning_task, self.seeds, self.parts)
         self.population.part.rounds = at["rounds"]
         self.population.next_number = at["next_number"]
 

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import file_graph, module_graph
 from skillweave.export.graphs import Graph, agent_graph, worth_graph

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.levels import UntrainedHierarchy
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.guidance import learning_guide, restricting_guide
 from skillweave.hierarchy.nesting import below, inner_of

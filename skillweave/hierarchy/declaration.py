@@ -10,8 +10,8 @@ import gymnasium as gym
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.lengths import Lengths
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.budgets import budgets_of, scale_budgets

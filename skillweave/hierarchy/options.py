@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.player import Player, Turn
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import allowed_rows

@@ -9,10 +9,10 @@ from typing import Any, cast
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import Interruption
+from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.player import Player, Turn
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.types import Array, Memory, Policy, Step, unprefixed

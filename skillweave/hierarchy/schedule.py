@@ -15,12 +15,12 @@ from skillweave.hierarchy.guidance import active_guide
 from skillweave.hierarchy.nesting import below, every_hierarchy, inner_hierarchies, inner_of
 from skillweave.networks.config import Network
 from skillweave.skills import Skill
-from skillweave.training.scene import (
-    Scene,
-    WovenScene,
-    selector_scene,
-    skill_scene,
-    woven_scene,
+from skillweave.training.learning_task import (
+    JointTask,
+    LearningTask,
+    joint_task,
+    selector_task,
+    skill_task,
 )
 from skillweave.training.stage import (
     CRITIC,
@@ -85,8 +85,8 @@ def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> 
     """Return the stage in which skills and selectors learn from the same steps."""
     settings = declaration.together
 
-    def scene(policies: Policies) -> WovenScene:
-        return woven_scene(
+    def learning_task(policies: Policies) -> JointTask:
+        return joint_task(
             declaration.spec,
             learning_set(declaration, policies),
             active_guide(declaration),
@@ -111,7 +111,7 @@ def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> 
         "together",
         config,
         budget,
-        scene,
+        learning_task,
         target=target_of(declaration.selection.target_return, None, TOGETHER),
         beside=others,
         together=settings,
@@ -229,12 +229,12 @@ def _apart(
         config = skill.algorithm or declaration.algorithm
         target = check_target(skill)
 
-        def scene(policies: Policies) -> Scene:
+        def learning_task(policies: Policies) -> LearningTask:
             others = [s for s in declaration.skills if can_act(s, policies)]
             callable_skills = declaration.skill_set(
                 [policy_of(s, policies) for s in others], others
             )
-            return skill_scene(
+            return skill_task(
                 declaration.spec,
                 skill,
                 declaration.reflexes,
@@ -244,14 +244,14 @@ def _apart(
                 apart.episode_calls,
             )
 
-        return Stage(skill.name, "skill", config, budgets[skill.name], scene, target)
+        return Stage(skill.name, "skill", config, budgets[skill.name], learning_task, target)
 
-    def selector_calls(policies: Policies) -> Scene:
+    def selector_calls(policies: Policies) -> LearningTask:
         skills = declaration.skill_set([policy_of(s, policies) for s in declaration.skills])
         guide = active_guide(declaration)
         if declaration.together.interrupt:
-            return woven_scene(declaration.spec, skills, guide, as_skill)
-        return selector_scene(declaration.spec, skills, guide, as_skill)
+            return joint_task(declaration.spec, skills, guide, as_skill)
+        return selector_task(declaration.spec, skills, guide, as_skill)
 
     skill_stages = [skill_stage(s) for s in declaration.skills if s.policy is None]
     if not isinstance(config := declaration.selector, AlgorithmConfig):

@@ -119,7 +119,7 @@ def _scores(
         name = "selector_samples" if better == "greedy" else "both_sample"
         scores[name] = sampling(name)
     if entry["compared"]:
-        scores["before"] = score(settled(declaration, run, nodes), _inside(before, nodes))
+        scores["before"] = score(resolve_greedy(declaration, run, nodes), _inside(before, nodes))
     return scores
 
 
@@ -135,7 +135,7 @@ def _best(scores: Mapping[str, Evaluation]) -> str:
     return best
 
 
-def settled(
+def resolve_greedy(
     declaration: Declaration, run: RunDirectory, nodes: tuple[str, ...] = ()
 ) -> Declaration:
     """Return a copy with every choice of greedy or sampling set as the run records it.

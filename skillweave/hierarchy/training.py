@@ -18,7 +18,7 @@ from skillweave.hierarchy.nesting import (
     inner_of,
 )
 from skillweave.hierarchy.schedule import own_stages, stages_of
-from skillweave.hierarchy.select_best import select_best, settled
+from skillweave.hierarchy.select_best import resolve_greedy, select_best
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.runs.command_words import resume_words
@@ -27,12 +27,12 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.defaults import TrainDefaults
+from skillweave.training.joint import agents_of
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.training.stage import SELECTOR, Policies
 from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
 from skillweave.training.trainer import train_stages
-from skillweave.training.woven import agents_of
 from skillweave.types import Policy
 
 
@@ -94,7 +94,7 @@ def train(
     for name, policy in ready.items():
         keep_policy(run, name, policy)
     policies = _trained(declaration, run, listeners, ready, make_learner)
-    return assembled(settled(declaration, run), policies)
+    return assembled(resolve_greedy(declaration, run), policies)
 
 
 def _trained(
@@ -117,7 +117,7 @@ def _trained(
         for skill, inner in inner_hierarchies(declaration.skills):
             below = (*nodes, skill.name)
             policies = _trained(inner, run, listeners, policies, make_learner, below, skill)
-    stages = own_stages(settled(declaration, run, nodes), as_skill)
+    stages = own_stages(resolve_greedy(declaration, run, nodes), as_skill)
     for name in reversed(nodes):
         stages = [stage.inside(name) for stage in stages]
     apart = [s for s in stages if s.kind != "together"]
@@ -146,7 +146,7 @@ def load(declaration: Declaration | PlainAgent, run: RunDirectory) -> Policy:
             f"{run.path}: {', '.join(map(repr, absent))} did not learn there: declare the skills "
             "with the policies that they had when it was trained"
         )
-    policy = assembled(settled(declaration, run), policies)
+    policy = assembled(resolve_greedy(declaration, run), policies)
     check_parts(declaration, policy, str(run.path))
     return policy
 

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short

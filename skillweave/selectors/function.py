@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Discrete
 
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillError
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs

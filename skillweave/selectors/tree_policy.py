@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.selectors.base import ReadySelector, shown_obs

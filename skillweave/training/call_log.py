@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from skillweave.collecting.calls import skills_below
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.skill_set import skills_below
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.plain_agent import AGENT

@@ -11,7 +11,7 @@ from skillweave.collecting.collector import RETURN, SUCCESS, Collector
 from skillweave.errors import SkillweaveError, reworded
 from skillweave.seeding import Seeds
 from skillweave.training.learner import crossed
-from skillweave.training.scene import Scene
+from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
 
 
@@ -27,7 +27,12 @@ class PeriodicEvaluation:
     """
 
     def __init__(
-        self, scene: Scene, seeds: Seeds, every: int | None, episodes: int, num_envs: int
+        self,
+        learning_task: LearningTask,
+        seeds: Seeds,
+        every: int | None,
+        episodes: int,
+        num_envs: int,
     ) -> None:
         self._episodes = episodes
         self._seeds = seeds / "probe"
@@ -40,12 +45,12 @@ class PeriodicEvaluation:
         """Seconds of the training before it."""
         self._arena: Collector | None = None
         if every is not None:
-            self._arena = self._make_arena(scene, min(episodes, num_envs))
+            self._arena = self._make_arena(learning_task, min(episodes, num_envs))
 
     @staticmethod
-    def _make_arena(scene: Scene, num_envs: int) -> Collector:
+    def _make_arena(learning_task: LearningTask, num_envs: int) -> Collector:
         try:
-            return scene.collector(num_envs, None)
+            return learning_task.collector(num_envs, None)
         except SkillweaveError as error:
             raise reworded(
                 error,
@@ -67,7 +72,7 @@ class PeriodicEvaluation:
         Args:
             since: steps of training at the report before.
             steps: at this one.
-            play: plays an episode in each environment of an arena: (n, 4), as
+            play: plays an episode in each evaluation environment: (n, 4), as
                 ``Collected.episodes``.
             also: evaluate at this report in any case, if there are evaluations at all.
         """
@@ -85,11 +90,11 @@ class PeriodicEvaluation:
             return metrics
         return metrics | {"eval_success": float((success == 1.0).mean())}
 
-    def _play_all(self, arena: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
+    def _play_all(self, eval_envs: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
         """Play all episodes, (n, 4 + I), in rounds of one episode in each environment."""
-        episodes = [play(arena, self._seeds)]
-        rounds = -(-self._episodes // arena.num_envs)
-        episodes += [play(arena, self._seeds / "round" / i) for i in range(1, rounds)]
+        episodes = [play(eval_envs, self._seeds)]
+        rounds = -(-self._episodes // eval_envs.num_envs)
+        episodes += [play(eval_envs, self._seeds / "round" / i) for i in range(1, rounds)]
         return np.concatenate(episodes)[: self._episodes]
 
     def spent(self) -> int:

@@ -15,7 +15,7 @@ from skillweave.settings import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
 from skillweave.training.defaults import TrainDefaults
-from skillweave.training.scene import skill_scene
+from skillweave.training.learning_task import skill_task
 from skillweave.training.stage import Stage, target_of
 
 AGENT = "agent"
@@ -87,7 +87,7 @@ class PlainAgent:
                 "agent",
                 self.algorithm,
                 self.steps,
-                lambda _: skill_scene(spec),
+                lambda _: skill_task(spec),
                 target,
             )
         ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skillweave.collecting.calls import skills_below
+from skillweave.collecting.skill_set import skills_below
 from skillweave.skills import Reflex
 from skillweave.training.play import Played
 from skillweave.training.skill_report import played_below

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet, skills_below
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.judge import Outcome, judge, seen_by
+from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.settings import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill

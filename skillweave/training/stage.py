@@ -21,8 +21,8 @@ from skillweave.errors import DeclarationError, EnvError, SkillweaveError, rewor
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
 from skillweave.settings import AtLeastOne, Fraction, NonNegative, Positive, checked_settings
+from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
-from skillweave.training.scene import Scene
 from skillweave.types import Policy
 
 SELECTOR = levels.SELECTOR
@@ -133,8 +133,8 @@ class Stage:
     """The algorithm's settings."""
     budget: int
     """Environment steps."""
-    scene: Callable[[Policies], Scene]
-    """Makes the scene in which it learns, from the policies so far."""
+    learning_task: Callable[[Policies], LearningTask]
+    """Makes the task in which it learns, from the policies so far."""
     target: Target | None = None
     """A target at which it ends early; None: without target."""
     beside: Mapping[str, AlgorithmConfig] = field(default_factory=dict)
@@ -168,9 +168,9 @@ class Stage:
     def inside(self, name: str) -> Stage:
         """Return this stage in a hierarchy that is the skill ``name`` of another one."""
 
-        def scene(policies: Policies) -> Scene:
+        def learning_task(policies: Policies) -> LearningTask:
             inside = {k.removeprefix(path): v for k, v in policies.items() if k.startswith(path)}
-            return self.scene(inside)
+            return self.learning_task(inside)
 
         path = f"{name}/"
         return replace(
@@ -179,7 +179,7 @@ class Stage:
             node=path + self.node,
             beside={path + k: v for k, v in self.beside.items()},
             task_weights={path + k: v for k, v in self.task_weights.items()},
-            scene=scene,
+            learning_task=learning_task,
         )
 
     def entry(self) -> dict[str, Any]:

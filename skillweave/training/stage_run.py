@@ -14,7 +14,7 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
-from skillweave.training.scene import Scene
+from skillweave.training.learning_task import LearningTask
 from skillweave.training.stage import Policies, Target
 from skillweave.training.stage_log import StageLog
 
@@ -28,7 +28,7 @@ class StageRun:
     run: RunDirectory
     seeds: Seeds
     """The stage's node of the seed tree."""
-    scene: Scene
+    learning_task: LearningTask
     policies: Policies
     """Policies by path: ready skills, and those that earlier stages trained."""
 

@@ -16,22 +16,22 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.where import MakeCollectors, make_collectors
+from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Checkpoint
 from skillweave.runs.starts import drop_starts, start_of
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
-from skillweave.training.arena import episodes_of
 from skillweave.training.episodes import Episodes, Tick
+from skillweave.training.eval_envs import episodes_of
 from skillweave.training.interrupts import deferred
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
+from skillweave.training.learning_task import LearningTask
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import ReplayLearner, learner_of
-from skillweave.training.scene import Scene
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
@@ -59,25 +59,29 @@ class OneAgent:
 
     def open(self) -> Any:
         """Make the environments and the agent; return the agent's state."""
-        stage, config, scene = self.stage, self.stage.config, self.stage.scene
+        stage, config, learning_task = self.stage, self.stage.config, self.stage.learning_task
         manifest = stage.run.manifest
         every = manifest.get("eval_every")
         episodes = manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
         workers = int(stage.entry.get("workers", 1))
         make = partial(_seeded, self.maker(), stage.seeds / "global")
-        self.collectors = self._make_collectors(make, config.num_envs, workers, 1, scene.name)
+        self.collectors = self._make_collectors(
+            make, config.num_envs, workers, 1, learning_task.name
+        )
         self._resources.callback(self.collectors.close)
-        self.evaluation = PeriodicEvaluation(scene, stage.seeds, every, episodes, config.num_envs)
+        self.evaluation = PeriodicEvaluation(
+            learning_task, stage.seeds, every, episodes, config.num_envs
+        )
         self._resources.callback(self.evaluation.close)
-        self.episodes = Episodes(scene.log_info)
+        self.episodes = Episodes(learning_task.log_info)
         self.best = stage.best
         return fresh
 
     def make_agents(self) -> Any:
         """Make the learning algorithms; return the fresh state that checkpoints hold, or None."""
-        stage, scene = self.stage, self.stage.scene
-        spaces = scene.observation_space, scene.action_space
+        stage, learning_task = self.stage, self.stage.learning_task
+        spaces = learning_task.observation_space, learning_task.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
         self.start = None
         if not stage.continues:
@@ -93,7 +97,7 @@ class OneAgent:
 
     def maker(self) -> MakeCollector:
         """Return a function that makes collectors; it may be sent to other machines."""
-        return partial(_collector, self.stage.scene, self.algorithm)
+        return partial(_collector, self.stage.learning_task, self.algorithm)
 
     def learner_from(self, state: Any, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """Return the learner that continues from ``state``."""
@@ -103,7 +107,7 @@ class OneAgent:
             stack,
             config.num_envs,
             stage.seeds,
-            row_steps=stage.scene.row_steps,
+            row_steps=stage.learning_task.row_steps,
             goes_on_at=log.at["steps"],
         )
         keep_to_guide(learner, stage.entry.get("guide_kl"))
@@ -121,10 +125,10 @@ class OneAgent:
         (stack,) = self.learner.stacks
         return {self.stage.name: state_to(stack.state, "cpu")}
 
-    def play(self, arena: Collector, seeds: Seeds) -> Array:
-        """Play an episode in each environment of an arena, (n, 4); see ``episodes_of``."""
+    def play(self, eval_envs: Collector, seeds: Seeds) -> Array:
+        """Play an episode in each evaluation environment, (n, 4); see ``episodes_of``."""
         (policy,) = self.policies().values()
-        return episodes_of(policy, arena, seeds)
+        return episodes_of(policy, eval_envs, seeds)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[Any, dict[str, Tensor]]:
         """Return the state and all other tensors of a checkpoint, ``extra`` included."""
@@ -256,8 +260,10 @@ def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Col
     return make(num_envs, first)
 
 
-def _collector(scene: Scene, algorithm: Algorithm, num_envs: int, first: int) -> Collector:
-    return scene.learners_collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
+def _collector(
+    learning_task: LearningTask, algorithm: Algorithm, num_envs: int, first: int
+) -> Collector:
+    return learning_task.learners_collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
 
 class _TargetReached(Exception):
@@ -292,10 +298,10 @@ def train_stage(
         drop_starts(run, stage.name)  # the run may have been killed just before
         return run.load_policies(stage.name)
     earlier = policies or {}
-    scene = stage.scene(earlier)
+    learning_task = stage.learning_task(earlier)
     if keys := run.manifest.get("log_info"):
-        scene = replace(scene, log_info=tuple(keys))
-    learner = make_learner(StageRun(entry, run, seeds, scene, earlier))
+        learning_task = replace(learning_task, log_info=tuple(keys))
+    learner = make_learner(StageRun(entry, run, seeds, learning_task, earlier))
     evolves = entry.get("evolution") is not None
     with (
         global_generators(seeds / "global"),

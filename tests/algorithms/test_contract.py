@@ -39,7 +39,7 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.errors import SkillweaveError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors

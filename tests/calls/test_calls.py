@@ -16,11 +16,11 @@ from calls.users import GAMMA, SEED, USERS, Got, Played
 from hypothesis import HealthCheck, given, settings
 from reference_calls import T, scripted, seeds_of
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import SMOOTHED
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.player import Player
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.types import Array

@@ -17,13 +17,13 @@ from reference_calls import seeds_of
 
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.joint import JointCollector
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.export import states
 from skillweave.export.graphs import Graph
@@ -222,8 +222,8 @@ def joint(case: Case) -> Played:
     guide, selector = _first(case)
     skills = skills_of(case.level, "")
 
-    def make() -> WovenCollector:
-        return WovenCollector(engine_of(case), selector, skills, learners, margins, guide)
+    def make() -> JointCollector:
+        return JointCollector(engine_of(case), selector, skills, learners, margins, guide)
 
     return _collect(case, make, "selector", learners)
 

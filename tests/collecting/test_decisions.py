@@ -20,9 +20,9 @@ from toy_acting import Again, Choices, Given, requests
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -187,7 +187,7 @@ def test_where_no_skill_may_start_the_error_names_them_all():
 
 
 def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.decisions.LONGEST_EPISODE", 20)
+    monkeypatch.setattr("skillweave.collecting.decision_collector.LONGEST_EPISODE", 20)
 
     class Eternal(Left):
         max_steps = None

@@ -8,10 +8,10 @@ from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, boun
 from toy_acting import Choices, requests
 
 from skillweave.collecting.acting import Acted
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import joined_collected
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import SMOOTHED, ActiveGuide, as_logits
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
 from skillweave.selectors import Automaton

@@ -19,7 +19,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.judge import JudgedBy
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, TrainingError
 from skillweave.experience import Batch

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reference_calls import POSITION, T, Walk, one_step, scripted, seeds_of
-from test_woven import Learner, Values
+from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.joint import JointCollector
 from skillweave.collecting.levels import UntrainedHierarchy
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -95,7 +95,7 @@ def collector_of(node, outer_steps, inner_steps, chooser=Selector, env=Walk):
         "up": Learner(N), f"{name}/down": Learner(N), f"{name}/selector": chooser(N, 2),
         f"{name}/skill_critic": Values(N), "skill_critic": Values(N),
     }  # fmt: skip
-    collector = WovenCollector(engine, Choices(N, 2), whole, learners)
+    collector = JointCollector(engine, Choices(N, 2), whole, learners)
     collector.start(Seeds(7))
     return collector
 

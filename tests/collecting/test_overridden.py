@@ -7,12 +7,12 @@ import itertools
 import numpy as np
 import pytest
 from reference_calls import POSITION, Walk
-from test_woven import Choices, Down, Learner, N, Stay, Up, Values, asked
+from test_joint import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.schedule import stages_of
 from skillweave.seeding import Seeds
@@ -58,7 +58,7 @@ def test_rows_of_skills_that_learn_under_a_selector():
     skills = SkillSet((Up(), Down(), Stay()), (None, None, Stay.policy), (BACK,), 3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     learners = {"up": Learner(N), "down": Learner(N), "skill_critic": Values(N)}
-    collector = WovenCollector(engine, Choices(N, 3), skills, learners)
+    collector = JointCollector(engine, Choices(N, 3), skills, learners)
     collector.start(Seeds(7))
     seen = 0
     for request in itertools.islice(asked(40), 3):
@@ -82,5 +82,5 @@ def test_reflexes_are_in_force_while_skills_learn():
 
     hierarchy = declare(reflexes=[BACK])
     (stage,) = stages_of(hierarchy)
-    skills = stage.scene(hierarchy.ready_policies()).skills
+    skills = stage.learning_task(hierarchy.ready_policies()).skills
     assert skills.reflexes == (BACK,)

@@ -18,12 +18,12 @@ from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
 
 from skillweave.collecting import processes, worker_process
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
+from skillweave.collecting.placement import make_collectors
 from skillweave.collecting.processes import ProcessCollectors
-from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.where import make_collectors
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds

@@ -14,10 +14,10 @@ from toys import ASKS, SHOWS
 from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collected, joined_collected, joined_from, parted
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience import Batch

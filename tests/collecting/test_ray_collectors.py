@@ -25,11 +25,11 @@ from skillweave import (
     Agent,
     TrainDefaults,
 )
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.cluster import Ray
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.runs.files import read_tensors
@@ -39,7 +39,7 @@ ray = pytest.importorskip("ray")
 cluster_utils = pytest.importorskip("ray.cluster_utils")
 
 from skillweave.collecting import actors  # noqa: E402
-from skillweave.collecting.stationed import COMPUTING, Stationed  # noqa: E402
+from skillweave.collecting.actor_host import COMPUTING, ActorHost  # noqa: E402
 
 NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
 
@@ -206,7 +206,7 @@ class Failing(Again):
 
 
 def test_what_goes_wrong_in_an_actor_is_an_answer():
-    stationed = Stationed()
+    stationed = ActorHost()
     assert stationed.make(actors.packed(stepping(Failing), "it"), 3, 1) == (None, None)
     assert stationed.answer("start", Seeds(0)) == (None, None)
     error, answer = stationed.answer("collect", next(requests(5)))

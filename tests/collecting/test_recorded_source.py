@@ -14,7 +14,7 @@ from toy_acting import Choices, requests
 
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.source import Recorded
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import RunError

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.restored import check_numbers, opened
 
 SPACE = gym.spaces.Discrete(5, start=1)

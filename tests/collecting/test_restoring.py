@@ -8,9 +8,9 @@ import pytest
 from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
 from toy_acting import Again, Choices, Counts, Given, requests, step
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds

@@ -10,7 +10,7 @@ from toy_acting import Again, Choices, Counts, Given, requests, step
 from toys import Ledger, actions, cartpole
 
 from skillweave.collecting import skill_rows
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds

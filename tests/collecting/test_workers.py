@@ -13,7 +13,7 @@ import pytest
 from toy_acting import Given, requests
 
 from skillweave.collecting.processes import ProcessCollectors
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds

@@ -8,9 +8,9 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import checksums
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.make import EnvSpec, make_engine

@@ -23,7 +23,7 @@ from skillweave import (
 )
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.skill_rows import SkillCollector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds

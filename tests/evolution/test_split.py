@@ -28,13 +28,13 @@ from skillweave import (
     Ray,
     SkillweaveError,
 )
-from skillweave.collecting.where import Where, make_collectors
-from skillweave.collecting.workers import Station, Workers
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.collecting.placement import Placement, make_collectors
+from skillweave.collecting.workers import WorkerHost, Workers
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.seeding import Seeds
-from skillweave.training.scene import skill_scene
+from skillweave.training.learning_task import skill_task
 
 SMALL = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network((8, 6)))
 EVERYTHING = Mutations(0.1, 0.3, 0.2, 0.3, 0.1, units=(4, 16), layers=(1, 3), layer_share=0.5)
@@ -80,7 +80,7 @@ class HereWorker:
         self.make, self.number = make, number
 
     def begin(self) -> None:
-        self.station, self.answers = Station(self.make, 1, self.number), list[Any]([None])
+        self.station, self.answers = WorkerHost(self.make, 1, self.number), list[Any]([None])
 
     def send(self, what: str, task: Any) -> None:
         self.answers.append(self.station.answer(what, task))
@@ -98,7 +98,7 @@ def workers_here(make: Any, count: int, name: str) -> Workers:
 
 @pytest.fixture
 def in_this_thread(monkeypatch):
-    here = Where(make_collectors, workers_here)
+    here = Placement(make_collectors, workers_here)
     monkeypatch.setattr("skillweave.api.running.HERE", here)
 
 
@@ -152,19 +152,22 @@ def test_a_split_population_goes_on_from_its_last_generation(whole, tmp_path, mo
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("network", [Network((8, 6)), Network((8,), rnn=RNN("gru", 4))])
 def test_one_part_is_the_population_itself(network):
-    config, scene = replace(SMALL, network=network), skill_scene(EnvSpec(Walk, engine="sync"))
+    config, learning_task = (
+        replace(SMALL, network=network),
+        skill_task(EnvSpec(Walk, engine="sync")),
+    )
     evolution, seeds = replace(EVOLVE, start="random"), Seeds(3)
-    parts = Parts(workers_here, scene, config, seeds, 5, 1, 2)
-    split = Population.fresh(config, evolution, scene, seeds, parts)
-    plain = Population.fresh(config, evolution, scene, seeds)
-    arena = FitnessArena(scene, 2, 2)
+    parts = Parts(workers_here, learning_task, config, seeds, 5, 1, 2)
+    split = Population.fresh(config, evolution, learning_task, seeds, parts)
+    plain = Population.fresh(config, evolution, learning_task, seeds)
+    eval_envs = FitnessEnvs(learning_task, 2, 2)
     for generation in range(3):
         told: tuple[list[Any], list[Any]] = [], []
         found = []
         for population, ticks in zip((split, plain), told, strict=True):
             until = population.steps // 5 + 40
             population.train(until, 200, seeds / generation, partial(_add, ticks))
-            found.append(population.fitness(arena, seeds / "fitness" / generation))
+            found.append(population.fitness(eval_envs, seeds / "fitness" / generation))
             population.state()
             population.evolve(found[-1], seeds / "evolve" / generation)
         np.testing.assert_array_equal(*found)
@@ -175,8 +178,8 @@ def test_one_part_is_the_population_itself(network):
             )  # fmt: skip
             for name, value in vars(theirs.state).items():
                 assert torch.equal(getattr(ours.state, name), value)
-    assert parts.steps_elsewhere == arena.steps_made == 3 * 5 * 2 * 7
-    arena.close()
+    assert parts.steps_elsewhere == eval_envs.steps_made == 3 * 5 * 2 * 7
+    eval_envs.close()
     split.close()
     plain.close()
 

@@ -34,13 +34,13 @@ from skillweave import (
     train_agent,
 )
 from skillweave.evolution import stage as evolving
-from skillweave.evolution.fitness import FitnessArena
+from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import has_diverged
 from skillweave.evolution.population import Population
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
-from skillweave.training.scene import skill_scene
+from skillweave.training.learning_task import skill_task
 
 SMALL = Network((8, 6), "relu")
 REPLAY: dict[str, Any] = {
@@ -154,7 +154,7 @@ def test_the_best_so_far_must_hold_its_own_on_the_same_episodes(tmp_path, monkey
     told = iter([np.array([1.0, 3.0]), np.array([9.0, 4.0]), np.array([5.0, 6.0])])
     old = iter([9.5, 6.0])  # what the old best gets in the second and third generation
     monkeypatch.setattr(Population, "fitness", lambda *_: next(told))
-    monkeypatch.setattr(FitnessArena, "score", lambda *_: next(old))
+    monkeypatch.setattr(FitnessEnvs, "score", lambda *_: next(old))
     by = Evolution(2, 3, 2, selection=Tournament(2), mutations=EVERYTHING)
     run = train("ppo", tmp_path / "run", by)
     flagged = [(x["generation"], x["member"]) for x in lineage(run.path) if x["best"]]
@@ -302,13 +302,13 @@ def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeyp
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
     config = replace(CONFIGS[name], max_grad_norm=1e30)
-    scene = skill_scene(spec(name))
-    population = Population.fresh(config, Evolution(3, 1, 2), scene, Seeds(0))
+    learning_task = skill_task(spec(name))
+    population = Population.fresh(config, Evolution(3, 1, 2), learning_task, Seeds(0))
     sick = population.members[1]
     sick.state.params.fill_(float("nan"))
     population.train(256, 256, Seeds(1), lambda steps, metrics: None)
     assert [has_diverged(m) for m in population.members] == [False, True, False]
-    fitness = population.fitness(FitnessArena(scene, 2, 2), Seeds(2))
+    fitness = population.fitness(FitnessEnvs(learning_task, 2, 2), Seeds(2))
     assert np.isfinite(fitness).tolist() == [True, False, True]
 
 
@@ -374,7 +374,7 @@ class Patient(Skill):
 def test_members_go_on_with_the_open_episodes_of_their_places(name):
     # Generations of 3 steps of each environment, episodes of 10.
     evolution = Evolution(3, 4, 1, mutations=EVERYTHING)
-    population = Population.fresh(CONFIGS[name], evolution, skill_scene(spec(name)), Seeds(0))
+    population = Population.fresh(CONFIGS[name], evolution, skill_task(spec(name)), Seeds(0))
     ages = []
     for generation in range(4):
         until = population.steps // 3 + 6
@@ -388,9 +388,9 @@ def test_members_go_on_with_the_open_episodes_of_their_places(name):
 
 @pytest.mark.parametrize("name", ["ppo", "dqn"])
 def test_the_steps_of_members_are_those_that_their_environments_made(name):
-    scene = skill_scene(spec(name), Patient())
+    learning_task = skill_task(spec(name), Patient())
     evolution = Evolution(3, 3, 1, mutations=EVERYTHING)
-    population, told = Population.fresh(CONFIGS[name], evolution, scene, Seeds(0)), []
+    population, told = Population.fresh(CONFIGS[name], evolution, learning_task, Seeds(0)), []
     for generation in range(3):
         before = [place.engine.steps_made for place in population.part.places]
         were, until = population.steps, population.steps // 3 + 50

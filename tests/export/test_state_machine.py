@@ -17,7 +17,7 @@ from test_networks import agent
 from skillweave import PPO, RNN, Automaton, Network, Reflex, SkillweaveError, tree
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.export import states
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner

@@ -23,8 +23,8 @@ from toys import cartpole
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.player import Player
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv

@@ -24,7 +24,7 @@ from reference_calls import (
 )
 
 from skillweave.api import Hierarchy, Run
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.selectors import ready_selector

@@ -9,7 +9,7 @@ import pytest
 from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
 
 from skillweave import Automaton, SkillweaveError
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.types import Step
 

@@ -10,7 +10,7 @@ import pytest
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
 from skillweave import SkillweaveError, tree
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.selectors.ready import ready_selector
 from skillweave.selectors.tree_policy import TreeSelector

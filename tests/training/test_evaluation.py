@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Discrete
 
 from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, envpool, evaluate
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs import checks
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds

@@ -37,9 +37,9 @@ from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Stack
+from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
-from skillweave.training.scene import skill_scene
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,
@@ -347,11 +347,11 @@ SMALL = {
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", SMALL)
 def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_die(name):
-    config, scene = SMALL[name], skill_scene(EnvSpec("CartPole-v1", engine="sync"))
-    algorithm = make_algorithm(config, scene.observation_space, scene.action_space)
+    config, learning_task = SMALL[name], skill_task(EnvSpec("CartPole-v1", engine="sync"))
+    algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
 
     def collector(num_envs: int, first: int):
-        return scene.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
+        return learning_task.collector(num_envs, Acting([(algorithm, 1)], num_envs), first)
 
     def weights(collectors: Collectors, kill: bool = False) -> torch.Tensor:
         learner = learner_of(Stack(algorithm, algorithm.init([Seeds(0)])), 4, Seeds(0))

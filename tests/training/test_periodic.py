@@ -27,7 +27,7 @@ from skillweave.envs import checks
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.training.arena import episodes_of
+from skillweave.training.eval_envs import episodes_of
 from skillweave.training.periodic import PeriodicEvaluation
 
 SMALL = Network((8,), "relu")
@@ -90,20 +90,20 @@ def test_equal_seeds_give_equal_starts_and_others_other_ones():
 
 
 def test_an_evaluation_is_made_once_in_every_so_many_steps():
-    scene: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
+    learning_task: Any = SimpleNamespace(collector=lambda n, acting: Countdown(n).collector(acting))
     policy = fresh(Countdown(1))
 
-    def play(arena: Any, seeds: Seeds) -> Any:
-        return episodes_of(policy, arena, seeds)
+    def play(eval_envs: Any, seeds: Seeds) -> Any:
+        return episodes_of(policy, eval_envs, seeds)
 
-    evaluation = PeriodicEvaluation(scene, Seeds(0), 100, 3, 8)
+    evaluation = PeriodicEvaluation(learning_task, Seeds(0), 100, 3, 8)
     ticks = (250, 260, 299, 300, 350, 520, 599, 601)
     pairs = itertools.pairwise(ticks)
     assert [t for since, t in pairs if evaluation.due(since, t, play)] == [300, 520, 601]
     assert evaluation.spent() == 3 * 3 * 5
     assert evaluation.due(601, 700, play) == {"eval_return": 5.0, "eval_return_min": 5.0}
     assert (evaluation.spent(), evaluation.spent()) == (15, 0)
-    never = PeriodicEvaluation(scene, Seeds(0), None, 3, 8)
+    never = PeriodicEvaluation(learning_task, Seeds(0), None, 3, 8)
     assert never.due(0, 10**6, play) == {}
 
 

@@ -23,7 +23,7 @@ from reference_calls import (
 )
 
 from skillweave import EnvSpec, Skill, evaluate
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED

@@ -13,7 +13,7 @@ from skillweave.errors import MissingExtra
 from skillweave.reporting.report.film import Film
 from skillweave.runs.files import write_bytes
 
-HERE = Path(__file__).parent / "templates"
+LOCAL = Path(__file__).parent / "templates"
 
 
 def write_page(
@@ -35,7 +35,7 @@ def write_page(
     """
     jinja2 = need("jinja2")
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(HERE),
+        loader=jinja2.FileSystemLoader(LOCAL),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -43,8 +43,8 @@ def write_page(
     )
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     parts = {
-        "style": (HERE / "style.css").read_text("utf-8"),
-        "script": (HERE / "page.js").read_text("utf-8"),
+        "style": (LOCAL / "style.css").read_text("utf-8"),
+        "script": (LOCAL / "page.js").read_text("utf-8"),
         "library": library(),
         "data": data,
         "film": None if film is None else base64.b64encode(film.data).decode(),

@@ -18,26 +18,30 @@ from skillweave.types import Array
 
 
 def episodes_of(
-    policy: AgentPolicy, arena: Collector, seeds: Seeds, first: int = 0, count: int | None = None
+    policy: AgentPolicy,
+    eval_envs: Collector,
+    seeds: Seeds,
+    first: int = 0,
+    count: int | None = None,
 ) -> Array:
     """Play one greedy episode in each environment; return rows like ``Collected.episodes``.
 
     Args:
         first: the number of the first episode. An episode's start depends on its number alone, so
             several rounds in few environments have the same starts as one round in many.
-        count: the number of environments, the first of the arena; None: all.
+        count: the number of environments, the first of ``eval_envs``; None: all.
 
     Returns:
         (n, 4), n at least 1; environments in which a skill could never start are left out.
     """
-    algorithm, engine = policy.algorithm, arena.engine
-    if first or count not in (None, arena.num_envs):
-        engine = cast(Engine, _Round(engine, first, count or arena.num_envs))
+    algorithm, engine = policy.algorithm, eval_envs.engine
+    if first or count not in (None, eval_envs.num_envs):
+        engine = cast(Engine, _Round(engine, first, count or eval_envs.num_envs))
     # Each round has its own random streams.
     acting_seeds, global_seeds = (
         seeds / k / first if first else seeds / k for k in ("act", "global")
     )
-    player = arena.like(engine, Acting([(algorithm, 1)], engine.num_envs))
+    player = eval_envs.like(engine, Acting([(algorithm, 1)], engine.num_envs))
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, acting_seeds, greedy=True)

@@ -17,8 +17,8 @@ from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algor
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.where import MakeCollectors, make_collectors
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import make_engine
@@ -29,24 +29,24 @@ from skillweave.ops.threads import torch_threads
 from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds, global_generators
+from skillweave.training.joint_learner import JointLearner
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
+from skillweave.training.learning_task import JointTask
 from skillweave.training.replay_learner import ReplayLearner, store_of
-from skillweave.training.scene import WovenScene
 from skillweave.training.stage import CRITIC, SELECTOR, Together, decides
 from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.stage_run import StageRun, begin_as
 from skillweave.training.trainer import OneAgent
-from skillweave.training.woven_learner import WovenLearner
 from skillweave.types import Array, prefixed, unprefixed
 
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:
     """Return the learner of a stage without a population."""
-    kind = WovenAgents if "together" in stage.entry else OneAgent
+    kind = JointAgents if "together" in stage.entry else OneAgent
     return kind(stage, make_collectors)
 
 
-class WovenAgents(OneAgent):
+class JointAgents(OneAgent):
     """A stage's learners where a selector and its skills learn together."""
 
     stage: Any
@@ -54,7 +54,7 @@ class WovenAgents(OneAgent):
     def make_agents(self) -> None:
         """Make the learning algorithms; checkpoints hold their states under ``extra``."""
         entry = self.stage.entry
-        scene = self.scene
+        learning_task = self.learning_task
         self.together = Together(**entry["together"])
         self.first: str = entry["decides"]
         self.node = self.first.removesuffix(SELECTOR)
@@ -65,9 +65,9 @@ class WovenAgents(OneAgent):
         self.algorithms: dict[str, Algorithm] = {}
         for name, config in configs.items():
             grown = self._as_grown(name, config)
-            actions = scene.chooses_from(self._path_in_scene(name))
+            actions = learning_task.chooses_from(self._path_in_scene(name))
             self.algorithms[name] = self._equal_algorithm(grown, actions) or make_algorithm(
-                grown, scene.observation_space, actions
+                grown, learning_task.observation_space, actions
             )
 
     def _equal_algorithm(self, config: Any, action_space: Any) -> Algorithm | None:
@@ -94,14 +94,14 @@ class WovenAgents(OneAgent):
         return replace(config, **grown)
 
     @property
-    def scene(self) -> WovenScene:
-        """The scene of the stage."""
-        scene: WovenScene = self.stage.scene
-        return scene
+    def learning_task(self) -> JointTask:
+        """The learning task of the stage."""
+        learning_task: JointTask = self.stage.learning_task
+        return learning_task
 
     def maker(self) -> MakeCollector:
         """Return a function that makes collectors; it may be sent to other machines."""
-        return partial(_collector, self.scene, self._acting(), self._margins())
+        return partial(_collector, self.learning_task, self._acting(), self._margins())
 
     def _acting(self) -> dict[str, Algorithm]:
         """Return the acting algorithms, by their paths in the stage's hierarchy."""
@@ -110,14 +110,14 @@ class WovenAgents(OneAgent):
     def _margins(self) -> dict[str, float]:
         """Return the margins of interruption, by the paths of critics."""
         margin = {CRITIC: self.together.margin} if self.together.interrupt else {}
-        return margin | dict(self.scene.margins)
+        return margin | dict(self.learning_task.margins)
 
     def _guide_kl(self, name: str) -> float | None:
         """Return the KL within which a learner stays of its guide; None: without limit."""
         if name == self.first:
             kl: float | None = self.stage.entry.get("guide_kl")
             return kl
-        return self.scene.guide_kl.get(self._path_in_scene(name))
+        return self.learning_task.guide_kl.get(self._path_in_scene(name))
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """Return all learners: from a checkpoint, from earlier stages, or fresh."""
@@ -144,7 +144,7 @@ class WovenAgents(OneAgent):
             keep_to_guide(learner, self._guide_kl(name))
             learners[name] = learner
         weights = self.stage.entry["task_weights"]
-        joint = WovenLearner(learners, self.node, self.together.task_weight, weights)
+        joint = JointLearner(learners, self.node, self.together.task_weight, weights)
         if extra:
             shape = (len(learners), 2)
             counts = checked_tensor(extra, "counts", shape, torch.int64, str(log.run.path))
@@ -215,7 +215,7 @@ class WovenAgents(OneAgent):
         num_envs = self.stage.config.num_envs
         seeds = self.stage.seeds / name
         config = stack.algorithm.config
-        row_steps = self.scene.steps_of_row(self._path_in_scene(name))
+        row_steps = self.learning_task.steps_of_row(self._path_in_scene(name))
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
             learns_all_rows = self._path_in_scene(name) in (SELECTOR, CRITIC)
@@ -245,7 +245,7 @@ class WovenAgents(OneAgent):
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the stage is over, and report skills that learnt nothing."""
         policies = super().train(log)
-        assert isinstance(self.learner, WovenLearner)
+        assert isinstance(self.learner, JointLearner)
         for name, (rows, updates) in self.learner.counts.items():
             if decides(name):
                 continue
@@ -265,7 +265,7 @@ class WovenAgents(OneAgent):
 
     def tell_early(self, steps: int, log: StageLog) -> None:
         """Report skills that were not called so far."""
-        assert isinstance(self.learner, WovenLearner)
+        assert isinstance(self.learner, JointLearner)
         for name, (rows, _) in self.learner.counts.items():
             if not rows and not decides(name):
                 log.tell(
@@ -283,16 +283,18 @@ class WovenAgents(OneAgent):
         stacks = zip(self.algorithms, self.learner.stacks, strict=True)
         return {name: state_to(stack.state, "cpu") for name, stack in stacks}
 
-    def play(self, arena: Collector, seeds: Seeds) -> Array:
-        """Play an episode of the hierarchy in each environment of an arena, (N, 4)."""
-        player = _joint_collector(self.scene, self._acting(), self._margins(), arena.engine)
+    def play(self, eval_envs: Collector, seeds: Seeds) -> Array:
+        """Play an episode of the hierarchy in each evaluation environment, (N, 4)."""
+        player = _joint_collector(
+            self.learning_task, self._acting(), self._margins(), eval_envs.engine
+        )
         requests = {
             name: Request(
                 0,
                 (s.algorithm.acting_params(s.state),),
                 s.state.gamma.cpu().numpy(),
                 seeds / name,
-                greedy=self.scene.is_greedy(self._path_in_scene(name)),
+                greedy=self.learning_task.is_greedy(self._path_in_scene(name)),
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
         }
@@ -301,12 +303,12 @@ class WovenAgents(OneAgent):
         of_skills = {self._path_in_scene(k): r for k, r in requests.items()}
         request = replace(of_selector, below=of_skills)
         with torch_threads(1), global_generators(seeds / "global"):
-            limit = longest_evaluation(arena.engine.time_limit)
+            limit = longest_evaluation(eval_envs.engine.time_limit)
             return player.play(request, seeds / "start", limit)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""
-        assert isinstance(self.learner, WovenLearner)
+        assert isinstance(self.learner, JointLearner)
         states = {"counts": torch.tensor(list(self.learner.counts.values()), **INT)}
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
@@ -314,25 +316,25 @@ class WovenAgents(OneAgent):
 
 
 def _collector(
-    scene: WovenScene,
+    learning_task: JointTask,
     algorithms: Mapping[str, Algorithm],
     margins: Mapping[str, float],
     num_envs: int,
     first: int,
 ) -> Collector:
-    engine = make_engine(scene.spec, num_envs, first=first)
-    collector = _joint_collector(scene, algorithms, margins, engine)
-    collector.log_info = scene.log_info
+    engine = make_engine(learning_task.spec, num_envs, first=first)
+    collector = _joint_collector(learning_task, algorithms, margins, engine)
+    collector.log_info = learning_task.log_info
     return collector
 
 
 def _joint_collector(
-    scene: WovenScene,
+    learning_task: JointTask,
     algorithms: Mapping[str, Algorithm],
     margins: Mapping[str, float],
     engine: Engine,
-) -> WovenCollector:
+) -> JointCollector:
     """Return a collector in which the selector and all skills act."""
     acting = {k: Acting([(a, 1)], engine.num_envs) for k, a in algorithms.items()}
     selector = acting.pop(SELECTOR, None)
-    return scene.woven(engine, selector, acting, margins)
+    return learning_task.joint_collector(engine, selector, acting, margins)

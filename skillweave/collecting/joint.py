@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.decisions import DecisionCollector
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, raw_columns, seen_by, terminated_in_call
 from skillweave.collecting.levels import CRITIC, SELECTOR, Level, NestedLevel, with_learners
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import DeclarationError
@@ -23,7 +23,7 @@ from skillweave.spaces import action_codec
 from skillweave.types import Array, Step
 
 
-class WovenCollector(DecisionCollector):
+class JointCollector(DecisionCollector):
     """N environments in which a selector calls skills, and all learn from the same steps.
 
     A row is the skill's that acted in it, judged by its own reward and its own end. A trajectory of
@@ -217,7 +217,7 @@ class WovenCollector(DecisionCollector):
 class _Rows:
     """Rows of leaves that learn, and of critics of skills, from the same steps."""
 
-    def __init__(self, collector: WovenCollector, rows: int) -> None:
+    def __init__(self, collector: JointCollector, rows: int) -> None:
         n, levels = collector.num_envs, list(collector.root.all())
         self.shared = BatchWriter(rows, n)
         """Of all leaves that learn: in each step exactly one acts."""

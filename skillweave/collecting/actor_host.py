@@ -13,7 +13,7 @@ import numpy as np
 import ray
 
 from skillweave.collecting.shipping import unpacked
-from skillweave.collecting.workers import SentError, Station, error_to_send
+from skillweave.collecting.workers import SentError, WorkerHost, error_to_send
 
 COMPUTING = "torch", "numpy", "gymnasium", "envpool", "mujoco"
 """Packages of which another version may compute other numbers."""
@@ -42,10 +42,10 @@ def actor_class() -> type:
         def make(self, code: bytes, each: int, number: int) -> Any:
             """Make the collector: (error, None)."""
             try:
-                from skillweave.collecting.stationed import Stationed
+                from skillweave.collecting.actor_host import ActorHost
             except ImportError as error:
                 return ("TrainingError", str(error)), None
-            self.stationed = Stationed()
+            self.stationed = ActorHost()
             return self.stationed.make(code, each, number)
 
         def answer(self, what: str, task: Any) -> Any:
@@ -60,10 +60,10 @@ def actor_class() -> type:
     return CollectorActor
 
 
-class Stationed:
+class ActorHost:
     """A station whose errors are answers."""
 
-    station: Station | None = None
+    station: WorkerHost | None = None
 
     def make(self, code: bytes, each: int, number: int) -> tuple[SentError | None, None]:
         """Make the collector."""
@@ -72,7 +72,7 @@ class Stationed:
         torch.set_num_threads(1)
 
         def made() -> None:
-            self.station = Station(unpacked(code), each, number)
+            self.station = WorkerHost(unpacked(code), each, number)
 
         return _tried(made)
 

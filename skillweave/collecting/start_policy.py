@@ -8,11 +8,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.judge import seen_by
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.types import Array, Memory, Step, prefixed
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.processes import ProcessCollectors, process_workers
 from skillweave.collecting.start_methods import runs_again, why_no_processes
-from skillweave.collecting.workers import LocalWorker, MakeStanding, Workers
+from skillweave.collecting.workers import LocalWorker, WorkerFactory, Workers
 from skillweave.notices import notice
 
 MakeCollectors = Callable[[MakeCollector, int, int, int, str], Collectors]
@@ -38,25 +38,25 @@ def make_collectors(
     return ProcessCollectors(make, each, workers, members, name)
 
 
-MakeWorkers = Callable[[MakeStanding, int, str], Workers]
+MakeWorkers = Callable[[WorkerFactory, int, str], Workers]
 """Given what makes the thing that stands at a worker (of 1 and its number), how many workers, and
 what messages call the environment."""
 
 
 @dataclass(frozen=True)
-class Where:
+class Placement:
     """Makes collectors, and workers that do other things than collecting."""
 
     collectors: MakeCollectors
     workers: MakeWorkers
 
 
-def _processes(make: MakeStanding, count: int, name: str) -> Workers:
+def _processes(make: WorkerFactory, count: int, name: str) -> Workers:
     if why := why_no_processes() or runs_again():
         notice(f"{name}: its {count} parts work in this process, one after another, as {why}")
         return Workers([LocalWorker(make, 1, i) for i in range(count)], name)
     return process_workers(make, count, name)
 
 
-HERE = Where(make_collectors, _processes)
+LOCAL = Placement(make_collectors, _processes)
 """On this machine."""

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.judge import judge, raw_columns, seen_by
-from skillweave.collecting.starters import StartPolicy
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.start_policy import StartPolicy
 from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import TrainingError

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from skillweave.collecting.ends import Interruption
+from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import SkillError
 from skillweave.messages import observed

@@ -11,10 +11,10 @@ from reference_calls import EPISODE, POSITION, Walk
 from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.ends import CallEnd
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.joint import JointCollector
 from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -82,7 +82,7 @@ def collector_of(call_steps, margin=None, n=N):
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
     learners = {"up": Learner(n), "down": Learner(n), "skill_critic": Values(n)}
     margins = {} if margin is None else {"skill_critic": margin}
-    collector = WovenCollector(engine, Choices(n, found.choices), found, learners, margins)
+    collector = JointCollector(engine, Choices(n, found.choices), found, learners, margins)
     collector.start(Seeds(7))
     return collector
 
@@ -183,7 +183,7 @@ def test_a_learner_of_the_library_acts_and_its_head_is_kept():
     state = algorithm.init([Seeds(0)])
     skills = SkillSet((Down(), Stay()), (None, Stay.policy), call_steps=3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
-    collector = WovenCollector(engine, Choices(n, 2), skills, {"down": Acting([(algorithm, 1)], n)})
+    collector = JointCollector(engine, Choices(n, 2), skills, {"down": Acting([(algorithm, 1)], n)})
     collector.start(Seeds(1))
     request = next(requests(30))
     own = replace(request, params=(algorithm.acting_params(state),))

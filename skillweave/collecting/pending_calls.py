@@ -14,7 +14,7 @@ from skillweave.experience import Batch, padded_last_axis
 from skillweave.types import Array, Memory
 
 
-class OpenCalls:
+class PendingCalls:
     """The calls that one selector has begun in N environments, each since its decision.
 
     All that it keeps stands in the collector's ``kept`` and ``open``, so checkpoints hold it.
@@ -159,7 +159,7 @@ class Decisions:
         self._found.append((self._count[ids], ids, values))
         self._count[ids] += 1
 
-    def batch(self, calls: OpenCalls, obs: Array) -> Batch:
+    def batch(self, calls: PendingCalls, obs: Array) -> Batch:
         """All decisions, (D, N), as far as each column goes.
 
         Args:
@@ -193,7 +193,7 @@ class Decisions:
         return whole
 
     @staticmethod
-    def _nothing(calls: OpenCalls, obs: Array) -> Batch:
+    def _nothing(calls: PendingCalls, obs: Array) -> Batch:
         """One empty row: no call has ended."""
         n = len(obs)
         lead, no = (1, n), np.zeros((1, n), bool)

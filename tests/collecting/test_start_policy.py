@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from toy_acting import Choices, requests
 
-from skillweave.collecting.calls import SkillSet
-from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.starters import StartPolicy
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.start_policy import StartPolicy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -217,7 +217,7 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
         drawn.append((n, None if mask is None else mask.tolist()))
         return np.full(n, 4)
 
-    monkeypatch.setattr("skillweave.collecting.starters.random_actions", watched)
+    monkeypatch.setattr("skillweave.collecting.start_policy.random_actions", watched)
     skills = Forward(), OnlyFar()
     policies = tuple(skill.policy for skill in skills)
     space = Corridor.action_space

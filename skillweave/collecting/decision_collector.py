@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.calls import SkillSet
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.ends import CallEnd
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, seen_by
-from skillweave.collecting.open_calls import Decisions, OpenCalls
+from skillweave.collecting.pending_calls import Decisions, PendingCalls
 from skillweave.collecting.player import LearnerActor, Player, Turn
 from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import SkillError
@@ -61,9 +61,9 @@ class DecisionCollector(Collector):
         """The player's, (N, …) each; changed in place."""
         self.kept |= prefixed("player", self.memory)
         self.ranges |= prefixed("player", ranges_of(self.player))
-        self._open: OpenCalls | None = None  # None: a guide decides, and no selector learns
+        self._open: PendingCalls | None = None  # None: a guide decides, and no selector learns
         if guide is None or not guide.decides or acting is not None:
-            self._open = OpenCalls(self, self.player, self.selector, self.memory, keep_rewards)
+            self._open = PendingCalls(self, self.player, self.selector, self.memory, keep_rewards)
 
     def like(self, engine: Engine, acting: Acting) -> DecisionCollector:
         """Return a collector of the same kind over other environments."""
@@ -148,7 +148,7 @@ class DecisionCollector(Collector):
         truncated &= ~terminated
         return RawStep(step.next_obs, outcome.reward, terminated, truncated, dict(step.info))
 
-    def _row(self, calls: OpenCalls, ids: Array, raw: RawStep) -> dict[str, Array]:
+    def _row(self, calls: PendingCalls, ids: Array, raw: RawStep) -> dict[str, Array]:
         """Return the decisions of environments ``ids`` (k,), whose calls are over."""
         return calls.row(ids, raw.terminated[ids], raw.truncated[ids], raw.next_obs[ids])
 

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 import gymnasium as gym
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.calls import SkillSet
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.decisions import DecisionCollector
+from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.joint import JointCollector
 from skillweave.collecting.levels import CRITIC, SELECTOR
-from skillweave.collecting.skill_rows import SkillCollector
-from skillweave.collecting.woven import WovenCollector
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
@@ -25,7 +25,7 @@ CALL = 16
 
 
 class MakeCollector(Protocol):
-    """A function that makes a collector of a scene."""
+    """A function that makes a collector of a learning task."""
 
     def __call__(
         self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
@@ -41,7 +41,7 @@ class MakeCollector(Protocol):
 
 
 @dataclass(frozen=True)
-class Scene:
+class LearningTask:
     """Environments, with the learner's spaces and collectors."""
 
     name: str
@@ -64,7 +64,7 @@ class Scene:
         return collector
 
 
-def skill_scene(
+def skill_task(
     spec: EnvSpec,
     skill: Skill | None = None,
     reflexes: Sequence[Reflex] = (),
@@ -72,8 +72,8 @@ def skill_scene(
     start_calls: int = 0,
     search_steps: int | None = None,
     episode_calls: int = 1,
-) -> Scene:
-    """Return the scene of a skill's stage; ``skill`` None: of the task itself.
+) -> LearningTask:
+    """Return the learning task of a skill's stage; ``skill`` None: of the task itself.
 
     Args:
         starters: skills that can act already; they bring the environment to where the skill may
@@ -90,13 +90,13 @@ def skill_scene(
         engine = make_engine(spec, num_envs, first=first)
         return SkillCollector(engine, acting, skill, tuple(reflexes), starters, *search)
 
-    return Scene(spec.name, *spec.spaces, collector)
+    return LearningTask(spec.name, *spec.spaces, collector)
 
 
-def selector_scene(
+def selector_task(
     spec: EnvSpec, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
-) -> Scene:
-    """Return the scene of a selector that calls ready skills.
+) -> LearningTask:
+    """Return the learning task of a selector that calls ready skills.
 
     Args:
         guide: a ready selector that guides its decisions.
@@ -111,11 +111,13 @@ def selector_scene(
 
     observation_space = spec.spaces.observation
     choices = gym.spaces.Discrete(skills.choices)
-    return Scene(spec.name, observation_space, choices, collector, skills.usual_steps or CALL)
+    return LearningTask(
+        spec.name, observation_space, choices, collector, skills.usual_steps or CALL
+    )
 
 
 @dataclass(frozen=True)
-class WovenScene(Scene):
+class JointTask(LearningTask):
     """Environments in which a selector calls skills, of which some learn, too."""
 
     skills: SkillSet = field(kw_only=True)
@@ -160,35 +162,35 @@ class WovenScene(Scene):
             skills = inner.skills
         return skills
 
-    def woven(
+    def joint_collector(
         self,
         engine: Engine,
         acting: Acting | None,
         learners: Mapping[str, Acting],
         margins: Mapping[str, float],
-    ) -> WovenCollector:
+    ) -> JointCollector:
         """Return a collector of environments in ``engine``.
 
         Args:
             acting: the selector; None: the guide decides.
-            learners, margins: see ``WovenCollector``.
+            learners, margins: see ``JointCollector``.
         """
-        return WovenCollector(
+        return JointCollector(
             engine, acting, self.skills, learners, margins, self.guide, self.as_skill
         )
 
 
-def woven_scene(
+def joint_task(
     spec: EnvSpec,
     skills: SkillSet,
     guide: ActiveGuide | None = None,
     as_skill: Skill | None = None,
     margins: Mapping[str, float] | None = None,
     guide_kl: Mapping[str, float] | None = None,
-) -> WovenScene:
-    """Return the scene of a selector that calls skills, of which some learn, too."""
-    plain = skill_scene(spec)
-    return WovenScene(
+) -> JointTask:
+    """Return the learning task of a selector that calls skills, of which some learn, too."""
+    plain = skill_task(spec)
+    return JointTask(
         spec.name,
         plain.observation_space,
         gym.spaces.Discrete(skills.choices),

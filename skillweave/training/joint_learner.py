@@ -18,7 +18,7 @@ from skillweave.training.stage import CRITIC, SELECTOR, decides
 from skillweave.types import Array, prefixed, unprefixed
 
 
-class WovenLearner:
+class JointLearner:
     """A selector and skills, each with its own learner, which gets only its own rows.
 
     Args:
