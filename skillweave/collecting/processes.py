@@ -83,8 +83,8 @@ class ProcessWorker:
         except OSError as error:
             raise TrainingError(
                 f"{self._who} could not be started: {error_text(error)}. The system limits "
-                "descriptors (ulimit -n), processes (ulimit -u) and memory: raise the limit, or have "
-                "fewer processes, EnvSpec(workers=...)"
+                "descriptors (ulimit -n), processes (ulimit -u) and memory: raise the limit, or "
+                "have fewer processes, EnvSpec(workers=...)"
             ) from error
         self._answered = False
         self._expect("making its environments")

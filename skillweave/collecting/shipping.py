@@ -55,7 +55,8 @@ def packed(thing: Any, who: str) -> bytes:
         except Exception as error:
             raise DeclarationError(
                 f"{who} cannot be sent to another process: {error_text(error)}. Make what cannot "
-                "be sent where it is used: in the function that makes the environment, or in a method"
+                "be sent where it is used: in the function that makes the environment, or in a "
+                "method"
             ) from error
     return found
 
