@@ -250,8 +250,8 @@ def _put(thing: Any) -> Any:
 def _full(error: Exception) -> TrainingError:
     return TrainingError(
         f"the object store of the Ray cluster is full ({error_text(error)}). Batches "
-        "go through it: give it more memory (ray start --object-store-memory=BYTES), or ask for less at once "
-        "(num_envs, n_steps)"
+        "go through it: give it more memory (ray start --object-store-memory=BYTES), or ask for "
+        "less at once (num_envs, n_steps)"
     )
 
 

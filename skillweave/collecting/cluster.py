@@ -140,8 +140,8 @@ class Ray:
             raise TrainingError(
                 f"a program listens at {short(address)}, but Ray could not connect "
                 f"({error_text(error)}). Perhaps it is no Ray cluster, or one that needs a token, "
-                "as those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see Ray's "
-                "page on token authentication)"
+                "as those of `ray start` do: then RAY_AUTH_MODE=token is needed here, too (see "
+                "Ray's page on token authentication)"
             ) from error
         except (RuntimeError, ValueError) as error:  # another version of Ray or Python
             raise TrainingError(
