@@ -193,7 +193,7 @@ def violations(source: str, module: str, package: bool = False) -> list[str]:
         ("envs.make", "import skillweave.runs.files as files"),
         ("envs.make", "def f():\n    from skillweave.algorithms.ppo import State"),
         ("envs.make", "if TYPE_CHECKING:\n    from skillweave.api import Run"),
-        ("envs.make", "from ..collecting import calls"),
+        ("envs.make", "from ..collecting import skill_set"),
         ("collecting.skill_set", "from skillweave.training.learner import Learner"),
         ("collecting.skill_set", "from skillweave.hierarchy.options import OptionsEnv"),
         ("buffers.replay", "from skillweave.collecting.collector import Collected"),

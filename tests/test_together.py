@@ -44,7 +44,7 @@ from skillweave.api.adoption import describe_differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING
-from skillweave.training import woven
+from skillweave.training import joint
 from skillweave.training.stage_log import START, StageLog, success_rate
 
 
@@ -153,7 +153,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
         made.append(config)
         return make_algorithm(config, *spaces)
 
-    monkeypatch.setattr(woven, "make_algorithm", noted)
+    monkeypatch.setattr(joint, "make_algorithm", noted)
     slow = replace(ON, learning_rate=1e-4)
 
     class Slow(Left):
@@ -167,7 +167,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
 
     rates = [ON.learning_rate, slow.learning_rate]
     assert sorted(train("shared")) == sorted([*rates, ON.learning_rate]), "the selector's is apart"
-    monkeypatch.setattr(woven.JointAgents, "_made", lambda *told: None)
+    monkeypatch.setattr(joint.JointAgents, "_made", lambda *told: None)
     assert len(train("apart")) == 4
     assert_same(tmp_path / "shared", tmp_path / "apart")
 

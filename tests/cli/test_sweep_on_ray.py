@@ -11,7 +11,7 @@ from skillweave.cli import main, sweep
 
 ray = pytest.importorskip("ray")
 
-from skillweave.collecting import stationed  # noqa: E402
+from skillweave.collecting import actor_host  # noqa: E402
 
 pytestmark = [
     pytest.mark.slow,
@@ -51,7 +51,7 @@ def let_nodes_have(monkeypatch, skillweave, python):
 
         return Other
 
-    monkeypatch.setattr(stationed, "actor_class", actor_class)
+    monkeypatch.setattr(actor_host, "actor_class", actor_class)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from scalar_skill import ScalarSkill
 from toy_acting import Again, Choices, Counts, Given, requests, step
 from toys import Ledger, actions, cartpole
 
-from skillweave.collecting import skill_rows
+from skillweave.collecting import skill_collector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -373,7 +373,7 @@ class Nowhere(Skill):
 
 
 def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
-    monkeypatch.setattr(skill_rows, "PATIENCE", 50)
+    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
     env = collector(skill=Nowhere(), num_envs=2)
     for _ in range(49):  # many episodes: it counts on from one to the next
         step(env, np.zeros(2, np.int64))
@@ -384,7 +384,7 @@ def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
 def test_an_environment_in_which_an_episode_cannot_begin_is_given_up_when_one_is_played(
     collector, monkeypatch
 ):
-    monkeypatch.setattr(skill_rows, "PATIENCE", 50)
+    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
 
     class Here(Nowhere):
         """May start in the first environment, and lasts 3 steps."""
@@ -404,7 +404,7 @@ def test_an_environment_in_which_an_episode_cannot_begin_is_given_up_when_one_is
 def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_too(
     collector, monkeypatch
 ):
-    monkeypatch.setattr(skill_rows, "PATIENCE", 50)
+    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
 
     def fresh():
         return collector(env=Again, skill=Once(), num_envs=2)

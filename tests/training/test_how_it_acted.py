@@ -61,6 +61,6 @@ def test_a_task_that_says_little_moves_skills_little(least: float, deviation: fl
     given = torch.tensor([[[0.5, -0.5]] * 3])
     algorithm.advantage = lambda *_: given  # type: ignore[method-assign]
     learner = RolloutLearner(Stack(algorithm, state), Seeds(0))
-    woven = JointLearner({"skill_critic": learner}, "", Together(task_weight=0.0))
-    found = woven._task_advantage(rows())
+    joint = JointLearner({"skill_critic": learner}, "", Together(task_weight=0.0))
+    found = joint._task_advantage(rows())
     assert found.std() == pytest.approx(deviation, rel=0.01)
