@@ -174,7 +174,7 @@ class Algorithm:
     # Methods that an algorithm defines
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> Any:
-        """Create the state of fresh members, one per seed, on the CPU; see ``fresh_fields``."""
+        """Create the state of fresh members, one per node of ``seeds``; see ``fresh_fields``."""
         self._missing("fresh_state")
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -223,7 +223,7 @@ class Algorithm:
     # Methods that all algorithms share
 
     def init(self, seeds: Sequence[Seeds]) -> Any:
-        """Create fresh members on the CPU, one per seed; none depends on its neighbours."""
+        """Create fresh members on the CPU, one per node of ``seeds``, each independent."""
         with torch_threads(1):  # the last bits of a QR decomposition depend on the thread count
             return self.fresh_state(seeds)
 
@@ -267,7 +267,7 @@ class Algorithm:
         return ActingParams(self.layout.views(state.params), *self.scaling(state))
 
     def scaling(self, state: Any) -> tuple[Tensor | None, Tensor | None]:
-        """Return shift and scale of observations, each (P, 1, O); None: not normalised."""
+        """Return a ``state``'s shift and scale of observations, (P, 1, O); None: not normalised."""
         if not self.normalize_obs:
             return None, None
         return _scaling(state.obs_mean, state.obs_var)
@@ -286,7 +286,7 @@ class Algorithm:
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
-        """Copy one member's policy to the CPU: parameters (*shape), scaling (O,)."""
+        """Copy the policy of a ``member`` of a ``state``: parameters (*shape), scaling (O,)."""
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
             named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
@@ -342,14 +342,14 @@ class Algorithm:
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
 
     def update_return_stats(self, state: Any, returns: Tensor, valid: Tensor | None = None) -> None:
-        """Update the moments of returns with ``returns`` (P, B) where ``valid`` (P, B)."""
+        """Update the moments in ``state`` with ``returns`` (P, B) where ``valid`` (P, B)."""
         moments = state.return_mean, state.return_var, state.return_count
         state.return_mean, state.return_var, state.return_count = merge_moments(
             *moments, returns[..., None], valid
         )
 
     def to_env(self, action: Array) -> Array:
-        """Convert actions (n, …) from policy units to the environment's."""
+        """Convert an ``action`` (n, …) from policy units to the environment's."""
         return self.codec.to_env(action)
 
     def _missing(self, method: str) -> NoReturn:

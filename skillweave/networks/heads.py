@@ -223,7 +223,7 @@ class ActionHead:
         return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
-        """Convert actions (n, …) from policy units to the environment's."""
+        """Convert an ``action`` (n, …) from policy units to the environment's."""
         return self.codec.to_env(torch.from_numpy(action).tanh().numpy() if self.squash else action)
 
     def _parts(self, logits: Tensor) -> Tensor:

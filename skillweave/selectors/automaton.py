@@ -115,7 +115,7 @@ class Automaton(ReadySelector):
         return {"state": np.full(n, self.state_names.index(self.start_state))}
 
     def allowed(self, memory: Memory) -> Array:
-        """Return the skills of each environment's state, (n, S) bool."""
+        """Return the skills of each environment's state in ``memory``, (n, S) bool."""
         allowed: Array = self.ranks[memory["state"]] > 0
         return allowed
 
@@ -145,7 +145,7 @@ class Automaton(ReadySelector):
         return share, memory
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Take the transitions whose events have happened in a ``step``; return the new memory.
+        """Take the transitions whose events happened in a ``step``; return the new ``memory``.
 
         ``last`` has the ends of the last calls.
         """

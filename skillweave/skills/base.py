@@ -236,6 +236,8 @@ class Reflex:
     def apply(self, obs: Array, action: Array, space: Space[Any]) -> tuple[Array, Array]:
         """Return actions (N, ...) of ``space`` with this reflex; (N,) bool: where it acted.
 
+        ``obs`` (N, *obs_shape) is the observation, ``action`` (N, ...) what a skill does there.
+
         Raises:
             SkillError: its condition or action has a wrong result; the message names it.
         """

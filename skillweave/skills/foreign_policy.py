@@ -35,7 +35,10 @@ class Foreign(Memoryless):
         self._open = observation_space is None, action_space is None
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
-        """Return a copy with these spaces where its own are unknown; ``who`` begins messages."""
+        """Return a copy that has ``observation_space`` and ``action_space`` where it has none.
+
+        ``who`` begins messages.
+        """
         bound = copy.copy(self)
         bound._who = f"{who}: {self.name}"
         if self._open[0]:

@@ -99,7 +99,7 @@ def workers_here(make: Any, count: int, name: str) -> Workers:
 @pytest.fixture
 def in_this_thread(monkeypatch):
     here = Placement(make_collectors, workers_here)
-    monkeypatch.setattr("skillweave.api.running.HERE", here)
+    monkeypatch.setattr("skillweave.api.running.LOCAL", here)
 
 
 def agent(workers: int | None = 2, fatal: Path | None = None, config: Any = SMALL) -> Agent:
