@@ -145,7 +145,9 @@ def test_a_skill_that_acted_too_seldom_to_learn_is_told(tmp_path):
 def test_every_state_of_an_automaton_needs_a_skill_and_every_event_a_state():
     with pytest.raises(SkillweaveError, match="state 'b' has no skill"):
         Automaton({"a": "x", "b": []}, {})
-    with pytest.raises(SkillweaveError, match=r"\('a', 'c'\) names the state 'c', which does not exist"):
+    with pytest.raises(
+        SkillweaveError, match=r"\('a', 'c'\) names the state 'c', which does not exist"
+    ):
         Automaton({"a": "x", "b": "y"}, {("a", "c"): "success"})
 
 
