@@ -47,7 +47,7 @@ def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monke
     monkeypatch.setattr(skill_collector, "PATIENCE", 60)
     hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=600)
     says = (
-        r"'beyond': initiation\(\) held nowhere in 60 steps of calling 'get_key', so .*"
+        r"'beyond': initiation\(\) was never true in 60 steps of calling 'get_key', so .*"
         r"observation was \[.*before it in skills"
     )
     with pytest.raises(SkillweaveError, match=says):

@@ -247,7 +247,7 @@ class SkillCollector(Collector):
         self.kept["searched"][waiting] += 1
         if self.kept["searched"].max() > PATIENCE and not self.kept["found"].any():
             raise TrainingError(
-                f"skill {self.skill.name!r}: initiation() held nowhere in {PATIENCE:,} steps "
+                f"skill {self.skill.name!r}: initiation() was never true in {PATIENCE:,} steps "
                 f"{self._sought()}, so there is nothing to train on; the latest observation was "
                 f"{observed(self.obs[waiting[0]])}. Widen it; or put the skills that lead to where "
                 "it holds before it in skills, as skills are trained in that order; or give an "

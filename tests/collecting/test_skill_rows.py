@@ -377,7 +377,9 @@ def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
     env = collector(skill=Nowhere(), num_envs=2)
     for _ in range(49):  # many episodes: it counts on from one to the next
         step(env, np.zeros(2, np.int64))
-    with pytest.raises(SkillweaveError, match=r"'nowhere': initiation\(\) held nowhere in 50 ste"):
+    with pytest.raises(
+        SkillweaveError, match=r"'nowhere': initiation\(\) was never true in 50 ste"
+    ):
         step(env, np.zeros(2, np.int64))
 
 

@@ -245,7 +245,9 @@ def test_a_run_goes_on_on_ray_and_ends_the_same_though_an_actor_is_killed(
         "local", num_cpus=2, include_dashboard=False, logging_level="ERROR", log_to_driver=False
     )
     try:
-        with pytest.raises(SkillweaveError, match="begun with 2 collectors, and goes on with as"):
+        with pytest.raises(
+            SkillweaveError, match="started with 2 collectors, and continues with as"
+        ):
             agent().resume(tmp_path / "run", quiet=True, cluster=Ray(collectors=3))
         agent(None, fatal).resume(tmp_path / "run", cluster=Ray(patience=60.0))
         assert "died; it is made again" in capsys.readouterr().err
