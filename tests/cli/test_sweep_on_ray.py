@@ -85,7 +85,7 @@ def test_a_run_whose_process_is_lost_is_named_and_the_others_are_trained(
     code, found = answer(capsys, [w.replace("0:1", "0:2") for w in words])
     assert (code, [run["seed"] for run in found["runs"]]) == (1, [1])
     assert found["failed"][0]["run"].endswith("s0")
-    assert "lost again and again: WorkerCrashedError" in found["failed"][0]["error"]
+    assert "lost repeatedly: WorkerCrashedError" in found["failed"][0]["error"]
 
 
 def test_other_errors_of_ray_are_told_as_they_are(monkeypatch, capsys, words):
