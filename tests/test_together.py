@@ -131,14 +131,14 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
 @pytest.mark.slow
 def test_two_workers_are_as_two_collectors_in_this_thread(tmp_path, monkeypatch):
     declare(workers=2).train(tmp_path / "processes", seed=3, quiet=True)
-    from skillweave.collecting import group, where
+    from skillweave.collecting import group, placement
 
     def here(make, num_envs, workers, members, name):
         each = num_envs // workers
         return group.Collectors([make(each, i * each) for i in range(workers)], members)
 
-    places = where.Placement(here, where.LOCAL.workers)
-    monkeypatch.setattr("skillweave.api.running.HERE", places)
+    places = placement.Placement(here, placement.LOCAL.workers)
+    monkeypatch.setattr("skillweave.api.running.LOCAL", places)
     declare(workers=2).train(tmp_path / "here", seed=3, quiet=True)
     assert_same(tmp_path / "processes", tmp_path / "here")
 
@@ -167,7 +167,7 @@ def test_learners_with_the_same_settings_share_an_algorithm_and_learn_as_if_they
 
     rates = [ON.learning_rate, slow.learning_rate]
     assert sorted(train("shared")) == sorted([*rates, ON.learning_rate]), "the selector's is apart"
-    monkeypatch.setattr(joint.JointAgents, "_made", lambda *told: None)
+    monkeypatch.setattr(joint.JointAgents, "_equal_algorithm", lambda *settings: None)
     assert len(train("apart")) == 4
     assert_same(tmp_path / "shared", tmp_path / "apart")
 

@@ -65,7 +65,7 @@ class JointAgents(OneAgent):
         self.algorithms: dict[str, Algorithm] = {}
         for name, config in configs.items():
             grown = self._as_grown(name, config)
-            actions = learning_task.chooses_from(self._path_in_scene(name))
+            actions = learning_task.chooses_from(self._path_in_stage(name))
             self.algorithms[name] = self._equal_algorithm(grown, actions) or make_algorithm(
                 grown, learning_task.observation_space, actions
             )
@@ -80,7 +80,7 @@ class JointAgents(OneAgent):
                 return other
         return None
 
-    def _path_in_scene(self, path: str) -> str:
+    def _path_in_stage(self, path: str) -> str:
         """Return a path relative to the stage's hierarchy."""
         return path.removeprefix(self.node)
 
@@ -105,7 +105,7 @@ class JointAgents(OneAgent):
 
     def _acting(self) -> dict[str, Algorithm]:
         """Return the acting algorithms, by their paths in the stage's hierarchy."""
-        return {self._path_in_scene(k): a for k, a in self.algorithms.items()}
+        return {self._path_in_stage(k): a for k, a in self.algorithms.items()}
 
     def _margins(self) -> dict[str, float]:
         """Return the margins of interruption, by the paths of critics."""
@@ -117,7 +117,7 @@ class JointAgents(OneAgent):
         if name == self.first:
             kl: float | None = self.stage.entry.get("guide_kl")
             return kl
-        return self.learning_task.guide_kl.get(self._path_in_scene(name))
+        return self.learning_task.guide_kl.get(self._path_in_stage(name))
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """Return all learners: from a checkpoint, from earlier stages, or fresh."""
@@ -215,10 +215,10 @@ class JointAgents(OneAgent):
         num_envs = self.stage.config.num_envs
         seeds = self.stage.seeds / name
         config = stack.algorithm.config
-        row_steps = self.learning_task.steps_of_row(self._path_in_scene(name))
+        row_steps = self.learning_task.steps_of_row(self._path_in_stage(name))
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
-            learns_all_rows = self._path_in_scene(name) in (SELECTOR, CRITIC)
+            learns_all_rows = self._path_in_stage(name) in (SELECTOR, CRITIC)
             quota = 0 if learns_all_rows else max(1, round(rows * self.together.quota / row_steps))
             return RolloutLearner(stack, seeds, quota)
         store = store_of(stack.algorithm, num_envs)
@@ -294,13 +294,13 @@ class JointAgents(OneAgent):
                 (s.algorithm.acting_params(s.state),),
                 s.state.gamma.cpu().numpy(),
                 seeds / name,
-                greedy=self.learning_task.is_greedy(self._path_in_scene(name)),
+                greedy=self.learning_task.is_greedy(self._path_in_stage(name)),
             )
             for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
         }
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
         of_selector = requests.pop(self.first, ready)
-        of_skills = {self._path_in_scene(k): r for k, r in requests.items()}
+        of_skills = {self._path_in_stage(k): r for k, r in requests.items()}
         request = replace(of_selector, below=of_skills)
         with torch_threads(1), global_generators(seeds / "global"):
             limit = longest_evaluation(eval_envs.engine.time_limit)
