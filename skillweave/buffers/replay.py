@@ -213,36 +213,27 @@ class ReplayStore:
         factor = gamma.float().cpu().numpy()[:, None]
         start = index % columns.slots
         slots, follows = self._chain(start)
-        outcome = (
-            None if self._relabel is None else self._judge_again(self._relabel, slots, follows)
-        )
+        outcome = None if self._relabel is None else self._judge_again(self._relabel, slots)
         slot = start
-        goes_on = np.ones(start.shape, bool)
-        reward = np.zeros(1, np.float32)
-        discount = np.ones(1, np.float32)
+        goes_on = follows[0]
+        reward = columns.reward(factor, start) if outcome is None else outcome["reward"][..., 0]
+        discount = columns.power(factor, start)
+        terminated: Any = None if outcome is None else outcome["terminated"][..., 0]
         between: list[tuple[Array, Array]] = []
-        for k in range(self._n_step):
-            if k:
-                goes_on = goes_on & follows[..., k]
-                if outcome is not None:
-                    goes_on &= ~outcome.ended[..., k - 1]
-                slot = np.where(goes_on, slots[..., k], slot)
-                between.append((slot, np.where(goes_on, discount, np.float32(0))))
-            row_reward = (
-                columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
-            )
-            power = columns.power(factor, slot)
-            if k:
-                reward += np.where(goes_on, discount * row_reward, np.float32(0))
-                discount = np.where(goes_on, discount * power, discount)
-            else:
-                reward = row_reward
-                discount = power
+        for k in range(1, self._n_step):
+            goes_on = goes_on & follows[k]
+            if outcome is not None:
+                goes_on &= ~outcome.ended[..., k - 1]
+            slot = np.where(goes_on, slots[k], slot)
+            between.append((slot, np.where(goes_on, discount, np.float32(0))))
+            paid = columns.reward(factor, slot) if outcome is None else outcome["reward"][..., k]
+            reward = reward + np.where(goes_on, discount * paid, np.float32(0))
+            discount = np.where(goes_on, discount * columns.power(factor, slot), discount)
+            if outcome is not None:
+                terminated = np.where(goes_on, outcome["terminated"][..., k], terminated)
         after = columns.after(slot)
-        terminated = data["kind"].take(slot) == TERMINATED
-        if outcome is not None:
-            last = (slots == slot[..., None]).argmax(-1)[..., None]
-            terminated = np.take_along_axis(outcome["terminated"], last, -1)[..., 0]
+        if terminated is None:
+            terminated = data["kind"].take(slot) == TERMINATED
         action = data["action"].take(start, axis=0)
         env_reward = data.get("env_reward")
         return Sample(
@@ -260,10 +251,10 @@ class ReplayStore:
             **self._between_fields(between),
         )
 
-    def _chain(self, start: Array) -> tuple[Array, Array]:
-        """Return the slots of n rows from ``start`` (P, B) on, and a mask of those that follow it.
+    def _chain(self, start: Array) -> tuple[list[Array], list[Array]]:
+        """Return the slots (P, B) of n rows from ``start`` on, and where each follows the last.
 
-        Both are (P, B, n). A row that does not follow has the slot of the last one that does.
+        A row that does not follow has the slot of the last one that does.
         """
         slots = [start]
         follows = [np.ones(start.shape, bool)]
@@ -271,14 +262,15 @@ class ReplayStore:
             after = self._columns.after(slots[-1])
             follows.append(self._columns.data["kind"].take(after) != NOTHING)
             slots.append(np.where(follows[-1], after, slots[-1]))
-        return np.stack(slots, -1), np.stack(follows, -1)
+        return slots, follows
 
-    def _judge_again(self, relabel: Relabel, slots: Array, follows: Array) -> Batch:
-        """Return the rows of ``slots`` (P, B, n) with the outcome that ``relabel`` gives them."""
+    def _judge_again(self, relabel: Relabel, slots: Sequence[Array]) -> Batch:
+        """Return the outcome that ``relabel`` gives the n rows of ``slots`` (P, B), (P, B, n)."""
         columns, data = self._columns, self._columns.data
         if "steps" in data:
             raise TrainingError("transitions of several steps cannot be judged again")
-        flat = slots.reshape(-1, slots.shape[-1])
+        lead = (*slots[0].shape, len(slots))
+        flat = np.stack(slots, -1).reshape(-1, len(slots))
         stored = {k: data[k].take(flat, axis=0) for k in ("obs", "action", "reward", *columns.raw)}
         never = np.zeros(flat.shape, bool)
         rows = Batch(
@@ -288,8 +280,7 @@ class ReplayStore:
             truncated=never,
         )
         judged = relabel(rows)
-        outcome = {k: judged[k].reshape(slots.shape) for k in ("reward", "terminated", "truncated")}
-        return Batch(**outcome)
+        return Batch(**{k: judged[k].reshape(lead) for k in ("reward", "terminated", "truncated")})
 
     def update_priorities(self, index: Array, priority: Tensor, first: int = 0) -> None:
         """Set the priorities (P, B), above 0, of the samples of members from ``first`` on."""

@@ -67,6 +67,12 @@ class Late(Stops):
         return (obs[:, TAG] % 2 == 0) | (obs[:, T] > 1)
 
 
+class TaskPaid(Skill):
+    """The environment's own reward, until a limit."""
+
+    max_steps = 4
+
+
 class Opposite(Stops):
     """Judges the same steps otherwise: ends elsewhere, and pays the other way round."""
 
@@ -94,7 +100,7 @@ def store_of(n_step: int, judge: JudgedBy | None, raw: tuple[str, ...] = ()) -> 
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-@pytest.mark.parametrize("kind", [Forever, Limited, Stops, Late])
+@pytest.mark.parametrize("kind", [Forever, Limited, Stops, Late, TaskPaid])
 def test_rows_judged_when_drawn_are_as_they_were_judged_when_collected(
     kind: Any, n_step: int
 ) -> None:
