@@ -102,10 +102,7 @@ class DecisionCollector(Collector):
             self._open.begin()
         raw = self.engine.step(action)
         self.kept["age"] += 1
-        step = Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            np.zeros(self.num_envs, bool), self.kept["age"].copy(), raw.info,
-        )  # fmt: skip
+        step = raw.seen(obs, action, self.kept["age"].copy())
         end = self.player.observe(self.memory, self._all, step)
         counts = raw if self.as_skill is None else self._judged(self.as_skill, step, end)
         self.kept["sums"][:, 0] += counts.reward
@@ -121,7 +118,8 @@ class DecisionCollector(Collector):
         if not len(ids):
             return
         if out is not None and self._open is not None:
-            out.put(ids, self._row(self._open, ids, counts))
+            ends = counts.terminated[ids], counts.truncated[ids]
+            out.put(ids, self._open.row(ids, *ends, counts.next_obs[ids]))
         if self._open is not None:
             self._open.kept["first"][ids] = False
         ids = np.flatnonzero(ended)
@@ -147,10 +145,6 @@ class DecisionCollector(Collector):
             truncated[waits] |= ~self.skills.startable(step.next_obs[waits]).any(axis=1)
         truncated &= ~terminated
         return RawStep(step.next_obs, outcome.reward, terminated, truncated, dict(step.info))
-
-    def _row(self, calls: PendingCalls, ids: Array, raw: RawStep) -> dict[str, Array]:
-        """Return the decisions of environments ``ids`` (k,), whose calls are over."""
-        return calls.row(ids, raw.terminated[ids], raw.truncated[ids], raw.next_obs[ids])
 
     def _record(self, step: Step, raw: RawStep, mask: Array | None, end: Array) -> None:
         """Keep the step for skills that learn; here they do not."""

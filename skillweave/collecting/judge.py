@@ -131,6 +131,8 @@ def raw_columns(step: Step, elapsed: Array, wanted: Sequence[str]) -> dict[str, 
     Raises:
         EnvError: no environment gives a key of ``info`` that is wanted.
     """
+    if not wanted:
+        return {}
     known = {
         "env_action": step.action,
         "env_reward": step.reward,

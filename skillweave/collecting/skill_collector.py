@@ -145,10 +145,7 @@ class SkillCollector(Collector):
         self.kept["elapsed"] += 1
         if playing is not None:
             self.kept["elapsed"][searching] = 0
-        step = Step(
-            obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
-            self._never, self.kept["age"].copy(), raw.info,
-        )  # fmt: skip
+        step = raw.seen(obs, action, self.kept["age"].copy())
         judged = self._judge(step, playing)
         ended = judged.terminated | judged.truncated
         if out is not None:

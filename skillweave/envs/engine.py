@@ -28,7 +28,7 @@ from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.notices import are_collected, notice
 from skillweave.seeding import GlobalDraws
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
-from skillweave.types import Array
+from skillweave.types import Array, Step
 
 LOOKS = 12
 """Resets and steps in which draws from global generators are detected."""
@@ -43,6 +43,23 @@ class RawStep:
     terminated: Array  # (n,) bool
     truncated: Array  # (n,) bool
     info: dict[str, Any]
+
+    def seen(self, obs: Array, action: Array, elapsed: Array) -> Step:
+        """Return the step as policies see it: from ``obs`` by ``action``, (n, …) each.
+
+        ``elapsed`` (n,) counts the steps of the episode or call, this one included.
+        """
+        return Step(
+            obs=obs,
+            action=action,
+            next_obs=self.next_obs,
+            reward=self.reward,
+            terminated=self.terminated,
+            truncated=self.truncated,
+            timed_out=np.zeros(len(self.reward), bool),
+            elapsed=elapsed,
+            info=self.info,
+        )
 
 
 class Engine(Protocol):

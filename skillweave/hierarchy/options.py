@@ -13,12 +13,12 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.checks import LONGEST_EPISODE
-from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
 from skillweave.spaces import unpack
-from skillweave.types import Array, Step
+from skillweave.types import Array
 
 
 class OptionsEnv(VectorEnv[Any, Any, Any]):
@@ -123,7 +123,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             discount[rows] *= self._gamma
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
-            over = self._observe(rows, rows_obs, action, raw, steps[rows])
+            step = raw.seen(rows_obs, action, steps[rows])
+            over = self._player.observe(self._memory, rows, step) != CallEnd.RUNNING
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()
@@ -134,7 +135,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 truncated[rows] = raw.truncated
                 obs[rows[ended]] = self.engine.reset_some(rows[ended])
                 self._player.restart(self._memory, rows[ended])
-                over = over | ended
             if over.any():
                 rows = rows[~over]
         self._obs = obs
@@ -150,24 +150,6 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         }
         unpacked = unpack(self.single_observation_space, obs)
         return unpacked, reward.astype(np.float32), terminated, truncated, info
-
-    def _observe(
-        self, rows: Array, obs: Array, action: Array, raw: RawStep, elapsed: Array
-    ) -> Array:
-        """Pass a step of environments ``rows`` (k,) to their skills; return ends of calls, (k,)."""
-        step = Step(
-            obs,
-            action,
-            raw.next_obs,
-            raw.reward,
-            raw.terminated,
-            raw.truncated,
-            np.zeros(len(rows), bool),
-            elapsed,
-            raw.info,
-        )
-        over: Array = self._player.observe(self._memory, rows, step) != CallEnd.RUNNING
-        return over
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the engine; ``kwargs`` are not used."""

@@ -147,17 +147,7 @@ class SeededEpisodes:
         self._elapsed[rows] += 1
         self.obs[rows] = raw.next_obs
         elapsed = self._elapsed[rows]
-        step = Step(
-            obs,
-            action,
-            raw.next_obs,
-            raw.reward,
-            raw.terminated,
-            raw.truncated,
-            np.zeros(len(rows), bool),
-            elapsed,
-            raw.info,
-        )
+        step = raw.seen(obs, action, elapsed)
         cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
         one = np.ones(len(rows), np.int64)
         return Played(rows, self._episode[rows], step, raw.reward, one, cut)
