@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -119,22 +119,37 @@ def zigzag(obs: Array) -> Array:
     return (obs[:, T].astype(np.int64) + obs[:, TAG].astype(np.int64)) % 3
 
 
-def of_real(env: str, acts: Any) -> ScriptedPolicy:
-    return ScriptedPolicy(lambda obs: acts(obs).astype(np.int64), *spaces(env))
+@dataclass(frozen=True)
+class OfReal:
+    """A scripted policy for one of Gymnasium's environments, which is made when it is needed."""
+
+    env: str
+    acts: Any
+
+    @cached_property
+    def policy(self) -> ScriptedPolicy:
+        return ScriptedPolicy(lambda obs: self.acts(obs).astype(np.int64), *spaces(self.env))
 
 
-POLICIES: dict[str, Any] = {
+_POLICIES: dict[str, Any] = {
     "left": scripted(0),
     "right": scripted(2),
     "zigzag": scripted(zigzag),
     "net": Net(),
     "counts": Net(size=1),
     "paid": Counting(),  # remembers what it observes
-    "balance": of_real("CartPole", lambda obs: obs[:, 2] + obs[:, 3] > 0),
-    "push": of_real("CartPole", lambda obs: np.zeros(len(obs))),
-    "hover": of_real("LunarLander", lambda obs: np.where(obs[:, 3] < -0.1, 2, 0)),
-    "turn": of_real("LunarLander", lambda obs: np.where(obs[:, 4] > 0, 3, 1)),
+    "balance": OfReal("CartPole", lambda obs: obs[:, 2] + obs[:, 3] > 0),
+    "push": OfReal("CartPole", lambda obs: np.zeros(len(obs))),
+    "hover": OfReal("LunarLander", lambda obs: np.where(obs[:, 3] < -0.1, 2, 0)),
+    "turn": OfReal("LunarLander", lambda obs: np.where(obs[:, 4] > 0, 3, 1)),
 }
+
+
+def policy_of(name: str) -> AgentPolicy:
+    found = _POLICIES[name]
+    return found.policy if isinstance(found, OfReal) else found
+
+
 WALKS = ("left", "right", "zigzag", "net", "counts", "paid")
 WHERE: dict[str, Any] = {
     "even": lambda obs: obs[:, POSITION] % 2 == 0,

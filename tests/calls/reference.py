@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from calls.cases import (
     EVENTS,
-    POLICIES,
     REFLEXES,
     STARTS,
     STOPS,
@@ -25,6 +24,7 @@ from calls.cases import (
     Worth,
     chosen_by_function,
     machine,
+    policy_of,
     recorded,
 )
 
@@ -145,7 +145,7 @@ class Life:
             self.overridden = self.part.overridden
         else:
             allowed = None if mask is None else mask[None]
-            found, self.part = POLICIES[case.policy].act(
+            found, self.part = policy_of(case.policy).act(
                 self.part, obs[None], allowed, deterministic=self.level.greedy
             )
             action = int(found[0])
@@ -182,7 +182,9 @@ class Life:
         skill, length = divmod(choice, len(self.lengths))
         if skill != self.skill:
             policy = self.level.skills[skill].policy
-            self.part = Life(policy) if isinstance(policy, LevelCase) else POLICIES[policy].start(1)
+            self.part = (
+                Life(policy) if isinstance(policy, LevelCase) else policy_of(policy).start(1)
+            )
         self.skill, self.elapsed, self.end = skill, 0, RUNNING
         self.limit = self.lengths[length]
 
@@ -205,7 +207,7 @@ class Life:
             if ended and not any(self.startable(case.policy, step.next_obs[0])):
                 self.end = LIMIT  # nothing below could follow
         else:
-            self.part = POLICIES[case.policy].observe(self.part, own)
+            self.part = policy_of(case.policy).observe(self.part, own)
         if case.stops == "recorded":
             recorded(own)
         elif case.stops is not None and STOPS[case.stops](own)[0]:

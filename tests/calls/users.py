@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from calls.cases import POLICIES, Case, LevelCase, Worth, guide_of, ready, selector_of, skill_set
+from calls.cases import Case, LevelCase, Worth, guide_of, policy_of, ready, selector_of, skill_set
 from reference_calls import seeds_of
 
 from skillweave.api.player import Player as Deployed
@@ -136,7 +136,7 @@ def engine_of(case: Case, n: int = N) -> Any:
 
 def policies_of(level: LevelCase) -> tuple[Any, ...]:
     return tuple(
-        hierarchy(s.policy) if isinstance(s.policy, LevelCase) else POLICIES[s.policy]
+        hierarchy(s.policy) if isinstance(s.policy, LevelCase) else policy_of(s.policy)
         for s in level.skills
     )
 
@@ -210,10 +210,10 @@ def joint(case: Case) -> Played:
                 inner = skills_of(below, f"{name}/")
                 policies.append(UntrainedHierarchy(inner, chooser, guide_of(below)))
             elif skill.policy in ("net", "counts"):
-                learners[name] = Learner(POLICIES[skill.policy], level.greedy)
+                learners[name] = Learner(policy_of(skill.policy), level.greedy)
                 policies.append(None)
             else:
-                policies.append(POLICIES[skill.policy])
+                policies.append(policy_of(skill.policy))
         if level.margin is not None:
             learners[f"{path}skill_critic"] = Critic(len(level.skills))
             margins[f"{path}skill_critic"] = level.margin
