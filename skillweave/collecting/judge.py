@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from functools import cached_property
 
 import numpy as np
 
 from skillweave.collecting.call_end import CallEnd
-from skillweave.envs.infos import info_rows, told_success
+from skillweave.envs.infos import info_rows, random_actions, told_success
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError
 from skillweave.experience import INFO, Batch
+from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked
-from skillweave.skills.info_words import missing_key
+from skillweave.skills.info_read import info_keys_read
+from skillweave.skills.info_words import StoredInfo, missing_key
 from skillweave.types import Array, Step
 
 
@@ -83,6 +87,25 @@ def terminated_in_call(skill: Skill, step: Step, end: Array, ids: Array) -> Arra
     return terminated
 
 
+def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
+    """Return a ``Relabel`` that judges by a skill, with the keys of ``info`` that it reads.
+
+    Raises:
+        DeclarationError: it cannot be found out which keys it reads.
+    """
+    return JudgedBy(skill, info_keys_read(skill, sample_step(spec)))
+
+
+@global_generators(Seeds(0) / "sample")
+def sample_step(spec: EnvSpec) -> Step:
+    """Return the first step of one environment, by a random action."""
+    with closing(make_engine(spec, 1)) as engine:
+        obs = engine.reset(0)
+        rng = np.random.default_rng(0)
+        action = random_actions(engine.action_space, 1, rng, engine.mask())
+        return engine.step(action).seen(obs, action, np.ones(1, np.int64))
+
+
 RAW = ("env_action", "env_reward", "env_terminated", "env_truncated", "call_elapsed")
 """The raw columns that rows are judged by again."""
 
@@ -92,11 +115,12 @@ class JudgedBy:
 
     Args:
         skill: whose reward and ends count; it must answer the same when asked twice.
-        info: keys of ``info`` that its methods read.
+        info: keys of ``info`` that its methods read, as ``info_keys_read`` finds them.
     """
 
     def __init__(self, skill: Skill, info: Sequence[str] = ()) -> None:
-        self._skill, self._info = skill, tuple(info)
+        self._skill = skill
+        self._info = tuple(info)
         self.raw = (*RAW, *(INFO + key for key in info))
 
     def __call__(self, rows: Batch) -> Batch:
@@ -112,7 +136,7 @@ class JudgedBy:
             truncated=flat["env_truncated"],
             timed_out=np.zeros(len(flat["reward"]), bool),
             elapsed=flat["call_elapsed"],
-            info={key: flat[INFO + key] for key in self._info},
+            info=StoredInfo({key: flat[INFO + key] for key in self._info}),
         )
         outcome = judge(self._skill, seen_by(self._skill, step, step.elapsed))
         return rows.replace(

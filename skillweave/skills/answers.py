@@ -37,7 +37,7 @@ def answer(
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
         raise SkillError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
-    probe(function, about, n, f"{who}: {method}()")
+    probe(function, about, n, f"{who}: {method}()", answered=array)
     return array
 
 

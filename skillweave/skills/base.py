@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar
 
@@ -60,6 +60,8 @@ class Skill:
             ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
             environment has an action mask, networks that return logits respect it; actions of
             others go to the environment unchanged.
+        needs_info: keys of ``info`` that its methods read; None: found by calling them once. Needed
+            only where steps are recorded to be judged later, and a key is read in some steps alone.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 
@@ -72,6 +74,7 @@ class Skill:
     target_return: float | None = None
     target_success: Share | None = None
     policy: Any = None
+    needs_info: Sequence[str] | None = None
     color: tuple[int, int, int] | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
@@ -151,6 +154,16 @@ class Skill:
             raise DeclarationError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
                 "0 to 255: color = (230, 80, 60)"
+            )
+        keys = self.needs_info
+        if keys is not None and (
+            isinstance(keys, str)
+            or not isinstance(keys, Sequence)
+            or not all(isinstance(key, str) for key in keys)
+        ):
+            raise DeclarationError(
+                f"{where}: needs_info is {short(keys)}; it must be a tuple of keys of info: "
+                "needs_info = ('key',)"
             )
         known = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
         for name, meant in misspelt(self, Skill, known):

@@ -1,9 +1,11 @@
-"""A test of each user's function with other numbers of environments, at its first call.
+"""Tests of each user's function at its first call.
 
 A function that ignores the axis of the environments may return the right shape by chance:
 ``step.next_obs[0]`` has four numbers for four environments of CartPole. So the function is also
-called with rows of its first call, repeated or cut to 3 and to more environments. Afterwards, the
-random streams of Python, NumPy, torch and the method's object are restored.
+called with rows of its first call, repeated or cut to 3 and to more environments. Methods of skills
+are also called with the same rows again: where they keep a state of their own, they answer
+otherwise. Afterwards, the random streams of Python, NumPy, torch and the method's object are
+restored.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import random
 import sys
 import types
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -76,6 +78,7 @@ def probe(
     who: str,
     shape: tuple[int, ...] = (),
     kind: type[SkillweaveError] = SkillError,
+    answered: Array | None = None,
 ) -> None:
     """Call a function for other numbers of environments than n, at its first call.
 
@@ -86,9 +89,11 @@ def probe(
         who: the function's name in messages.
         shape: the shape of its result for one environment.
         kind: the type of the error: PolicyError if the function is a policy.
+        answered: (n,) what it has returned, and must return again; None: it may change.
 
     Raises:
-        SkillError: its result does not have a row for each environment; the message names it.
+        SkillError: its result does not have a row for each environment, or is another one when it
+            is called again; the message names it.
     """
     owner = getattr(function, "__self__", function)
     if not n or not _seen.first_time(owner, getattr(function, "__name__", "")):
@@ -96,8 +101,10 @@ def probe(
     arguments = given if isinstance(given, tuple) else (given,)
     sizes = _other_sizes(n, set(itertools.chain.from_iterable(_sizes(a, n) for a in arguments)))
     certain = all(_has_rows(a, n) for a in arguments)
-    with _randomness_kept():
+    with randomness_kept():
         function = _on_copy(function)
+        if answered is not None:
+            _check_again(function, arguments, answered, who)
         for m in sizes:
             rows = np.arange(m) % n
             try:
@@ -115,6 +122,50 @@ def probe(
                     f"{who} returned shape {actual} for {m} environments, but {wanted} was "
                     f"expected; for {n} its shape was right by chance: {AXIS}"
                 )
+
+
+def _check_again(
+    function: Callable[..., Any], arguments: tuple[Any, ...], answered: Array, who: str
+) -> None:
+    """Raise a SkillError where a function keeps a state that its answers depend on.
+
+    A function may draw random numbers: then its answers are compared from the same ones.
+    """
+    n = len(answered)
+    with randomness_kept(_generators_of(function)):
+        first = _answer(function, arguments, n)
+    again = _answer(function, arguments, n)
+    otherwise = _answer(function, arguments, n)  # from other random numbers
+    if first is None or again is None or otherwise is None:
+        return  # called with the same rows, it fails now and then: this is said elsewhere
+    if _alike(first, again) and (_alike(first, answered) or not _alike(first, otherwise)):
+        return
+    before, after = (first, again) if _alike(answered, first) else (answered, first)
+    row = int(np.flatnonzero(~_close(before, after))[0])
+    raise SkillError(
+        f"{who} answers {before[row]:g}, and {after[row]:g} when it is asked about the same again, "
+        "so it keeps a state of its own. Steps are judged in any order and number, and later than "
+        "they were made: compute the answer from the argument alone, and let the environment, or a "
+        "wrapper, put what must be remembered into the observation or info"
+    )
+
+
+def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], n: int) -> Array | None:
+    """Return the answer (n,) of a function as float64; None where it fails."""
+    try:
+        return np.asarray(function(*arguments)).astype(np.float64).reshape(n)
+    except (Exception, SystemExit):
+        return None
+
+
+def _alike(one: Array, other: Array) -> bool:
+    return bool(_close(one, other).all())
+
+
+def _close(one: Array, other: Array) -> Array:
+    """Return where two answers are equal but for rounding, (n,) bool."""
+    close: Array = np.isclose(one, other, rtol=1e-4, atol=1e-6, equal_nan=True)
+    return close
 
 
 def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
@@ -188,9 +239,19 @@ def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
     return types.MethodType(function.__func__, twin)
 
 
+def _generators_of(function: Callable[..., Any]) -> list[Any]:
+    """Return the random generators of a method's object."""
+    found = vars(getattr(function, "__self__", None) or types.SimpleNamespace()).values()
+    return [x for x in found if isinstance(x, (np.random.Generator, random.Random))]
+
+
 @contextmanager
-def _randomness_kept() -> Iterator[None]:
-    """Restore the global random streams after the block."""
+def randomness_kept(generators: Sequence[Any] = ()) -> Iterator[None]:
+    """Restore the global random streams, and these generators, after the block."""
+    states = [
+        g.bit_generator.state if isinstance(g, np.random.Generator) else g.getstate()
+        for g in generators
+    ]
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
     torch = sys.modules.get("torch")
     state = None if torch is None else torch.get_rng_state()
@@ -201,3 +262,8 @@ def _randomness_kept() -> Iterator[None]:
         np.random.set_state(numpy)  # noqa: NPY002
         if torch is not None:
             torch.set_rng_state(state)
+        for generator, of_generator in zip(generators, states, strict=True):
+            if isinstance(generator, np.random.Generator):
+                generator.bit_generator.state = of_generator
+            else:
+                generator.setstate(of_generator)

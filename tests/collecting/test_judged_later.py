@@ -18,7 +18,7 @@ from skillweave.algorithms.dqn import DQNAlgorithm
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.buffers.rollout import RolloutStore
-from skillweave.collecting.judge import JudgedBy
+from skillweave.collecting.judge import JudgedBy, judged_by
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, TrainingError
@@ -29,6 +29,7 @@ from skillweave.training.learner import Stack
 from skillweave.training.replay_learner import learner_of
 
 N = 5
+SPEC = EnvSpec(Walk, engine="sync")
 GAMMA = torch.tensor([0.9])
 
 
@@ -86,7 +87,7 @@ class Opposite(Stops):
 
 
 def rows_of(skill: Skill | None, judge: JudgedBy, rows: int) -> list[Batch]:
-    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+    engine = make_engine(SPEC, N)
     collector = SkillCollector(engine, Choices(N, 3), skill)  # type: ignore[arg-type]
     collector.start(Seeds(3))
     asked = (replace(request, record=judge.raw) for request in requests(rows))
@@ -104,7 +105,7 @@ def store_of(n_step: int, judge: JudgedBy | None, raw: tuple[str, ...] = ()) -> 
 def test_rows_judged_when_drawn_are_as_they_were_judged_when_collected(
     kind: Any, n_step: int
 ) -> None:
-    judge = JudgedBy(kind(), ("t",))
+    judge = judged_by(kind(), SPEC)
     stored, later = store_of(n_step, None), store_of(n_step, judge)
     for batch in rows_of(kind(), judge, 7):
         stored.add(batch)
@@ -123,7 +124,7 @@ def test_rows_judged_when_drawn_are_as_they_were_judged_when_collected(
 
 def test_rows_of_one_skill_are_judged_by_another() -> None:
     """By hand, slot by slot: the n rows end where the judge says, not where they were collected."""
-    judge = JudgedBy(Opposite(), ("t",))
+    judge = judged_by(Opposite(), SPEC)
     store, plain, n = store_of(3, judge), list[Batch](), 3
     for batch in rows_of(None, judge, 7):
         store.add(batch)
@@ -194,7 +195,7 @@ def test_replay_and_rollouts_carry_the_environments_own_reward_where_it_is_asked
         learner = learner_of(Stack(algorithm, algorithm.init([Seeds(0)])), N, Seeds(1))
         request = learner.request(0, 0, 0.0)
         assert request.record == kind.raw
-        engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+        engine = make_engine(SPEC, N)
         collector = SkillCollector(engine, Choices(N, 3), Forever())  # type: ignore[arg-type]
         collector.start(Seeds(3))
         for one in itertools.islice(requests(9), 4):

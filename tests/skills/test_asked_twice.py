@@ -1,0 +1,129 @@
+"""Methods of skills are functions of their arguments; one that keeps a state is named."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skillweave.errors import SkillError
+from skillweave.skills import Reflex, Skill, asked
+from skillweave.types import Step
+
+
+def step(n: int = 4) -> Step:
+    obs = np.arange(n, dtype=np.float32)[:, None]
+    never = np.zeros(n, bool)
+    one = np.ones(n)
+    return Step(obs, one, obs + 1, one, never, never, never, one, {})
+
+
+class Counts(Skill):
+    calls = 0
+
+    def reward(self, step: Any) -> Any:
+        self.calls += 1
+        return step.reward * self.calls
+
+
+class Progress(Skill):
+    """Pays what the best value so far grows by: nothing, when it sees the same again."""
+
+    best = -np.inf
+
+    def reward(self, step: Any) -> Any:
+        gain = np.maximum(step.next_obs[:, 0] - max(self.best, -1.0), 0.0)
+        self.best = max(self.best, float(step.next_obs.max()))
+        return gain
+
+
+class Patient(Skill):
+    """Stops at the second time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[int] = []
+
+    def termination(self, step: Any) -> Any:
+        self.seen.append(len(step.reward))
+        return np.full(len(step.reward), len(self.seen) > 1)
+
+
+class Shy(Skill):
+    waits = 3
+
+    def initiation(self, obs: Any) -> Any:
+        self.waits -= 1
+        return np.full(len(obs), self.waits < 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    [
+        (Counts, "reward"),
+        (Progress, "reward"),
+        (Patient, "termination"),
+        (Shy, "initiation"),
+    ],
+)
+def test_a_skill_that_answers_otherwise_when_asked_twice_is_named(kind: Any, method: str) -> None:
+    about = step().obs if method == "initiation" else step()
+    message = rf"skill '{kind.name}': {method}\(\) answers .* keeps a state of its own.*info"
+    with pytest.raises(SkillError, match=message):
+        asked(kind(), method, about, 4)
+
+
+class Noisy(Skill):
+    """Pays random numbers, of every kind of generator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.numbers = np.random.default_rng(0)
+        self.python = random.Random(0)
+
+    def reward(self, step: Any) -> Any:
+        n = len(step.reward)
+        return (
+            self.numbers.random(n)
+            + np.random.rand(n)  # noqa: NPY002
+            + random.random()
+            + self.python.random()
+        )
+
+
+class Remembers(Skill):
+    """Keeps what does not change its answers: how often it was called, and a result."""
+
+    calls = 0
+
+    def reward(self, step: Any) -> Any:
+        self.calls += 1
+        self.result = step.reward * 2
+        return self.result
+
+
+@pytest.mark.parametrize("kind", [Noisy, Remembers])
+def test_random_rewards_and_caches_are_no_state(kind: Any) -> None:
+    skill, twin = kind(), kind()
+    np.random.seed(1)  # noqa: NPY002
+    random.seed(1)
+    first = asked(skill, "reward", step(), 4)
+    after = np.random.rand(), random.random()  # noqa: NPY002
+    np.random.seed(1)  # noqa: NPY002
+    random.seed(1)
+    assert first.tolist() == twin.reward(step()).astype(np.float32).tolist()
+    assert after == (np.random.rand(), random.random()), "the checks draw no numbers of their own"  # noqa: NPY002
+    assert len(asked(skill, "reward", step(), 4)) == 4
+
+
+def test_a_reflex_that_keeps_a_state_is_named() -> None:
+    seen: list[int] = []
+
+    def second_time(obs: Any) -> Any:
+        seen.append(1)
+        return np.full(len(obs), len(seen) > 1)
+
+    with pytest.raises(SkillError, match=r"reflex 'second_time': condition\(\) answers 0, and 1"):
+        Reflex(second_time, 0).holds(step().obs)
