@@ -83,12 +83,20 @@ class Batch(Mapping[str, Array]):
 
     def __init__(self, **columns: Array | None) -> None:
         """Take the columns that are not None."""
-        unknown = [name for name in columns.keys() - SCHEMA.keys() if not name.startswith(INFO)]
-        assert not unknown, f"no column of SCHEMA: {unknown}"
+        if not columns.keys() <= SCHEMA.keys():
+            unknown = [k for k in columns if k not in SCHEMA and not k.startswith(INFO)]
+            assert not unknown, f"no column of SCHEMA: {unknown}"
         self._columns = {name: x for name, x in columns.items() if x is not None}
 
     def __getitem__(self, name: str) -> Array:
         return self._columns[name]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a column, or the default; many times as fast as that of ``Mapping``."""
+        return self._columns.get(name, default)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._columns)
