@@ -105,5 +105,5 @@ def forget_registered() -> Iterator[None]:
 
 @pytest.fixture
 def unprobed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Call functions for the environments alone: for tests that record calls."""
-    monkeypatch.setattr("skillweave.skills.probing._other_sizes", lambda *_: ())
+    """Call functions once, for the environments alone: for tests that record calls."""
+    monkeypatch.setattr("skillweave.skills.probing._seen.first_time", lambda *_: False)

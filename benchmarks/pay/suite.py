@@ -158,6 +158,8 @@ class Seldom(Skill):
         size: of the bonus for a first visit, in units of the task's reward.
     """
 
+    reward_changes = True
+
     def __init__(self, cells: Callable[[Array], Array], size: float) -> None:
         self._cells, self._size = cells, size
         self._counts: Counter[bytes] = Counter()

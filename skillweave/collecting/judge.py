@@ -11,10 +11,10 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.envs.infos import info_rows, random_actions, told_success
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import EnvError
+from skillweave.errors import DeclarationError, EnvError
 from skillweave.experience import INFO, Batch
 from skillweave.seeding import Seeds, global_generators
-from skillweave.skills import Skill, asked
+from skillweave.skills import Skill, asked, path_of
 from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo, missing_key
 from skillweave.types import Array, Step
@@ -91,8 +91,13 @@ def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
     """Return a ``Relabel`` that judges by a skill, with the keys of ``info`` that it reads.
 
     Raises:
-        DeclarationError: it cannot be found out which keys it reads.
+        DeclarationError: its reward changes, or it cannot be found out which keys it reads.
     """
+    if skill.reward_changes:
+        raise DeclarationError(
+            f"skill {path_of(skill)!r}: its reward changes for the same step (reward_changes), so "
+            "steps cannot be judged by it again: let its reward depend on the step alone"
+        )
     return JudgedBy(skill, info_keys_read(skill, sample_step(spec)))
 
 

@@ -24,8 +24,13 @@ def answer(
     method: str,
     elapsed: Array | int | None = None,
     ids: Array | None = None,
+    *,
+    may_change: bool = False,
 ) -> Array:
     """Call a function of the user and return its ``checked`` result.
+
+    Args:
+        may_change: its answer to the same may change from call to call.
 
     Raises:
         SkillError: the function failed, or returned a result of a wrong shape or type.
@@ -37,7 +42,7 @@ def answer(
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
         raise SkillError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
-    probe(function, about, n, f"{who}: {method}()", answered=array)
+    probe(function, about, n, f"{who}: {method}()", answered=None if may_change else array)
     return array
 
 

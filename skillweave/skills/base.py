@@ -40,7 +40,8 @@ class Skill:
 
     Every method is batched: arrays over N environments in, one array (N,) out, so the same class
     runs on one environment and on a thousand. Methods must be functions of their arguments: keep no
-    state of an environment in ``self`` (``step`` has the observation before and after).
+    state of an environment in ``self`` (``step`` has the observation before and after). At its
+    first call each is called twice, and one that answers otherwise is refused.
 
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.
@@ -62,6 +63,8 @@ class Skill:
             others go to the environment unchanged.
         needs_info: keys of ``info`` that its methods read; None: found by calling them once. Needed
             only where steps are recorded to be judged later, and a key is read in some steps alone.
+        reward_changes: True if ``reward`` is meant to change for the same step, as a bonus for what
+            was seldom seen does. It may then keep a state, and steps are never judged by it again.
         color: RGB in captions and plots; None: chosen from a palette.
     """
 
@@ -75,6 +78,7 @@ class Skill:
     target_success: Share | None = None
     policy: Any = None
     needs_info: Sequence[str] | None = None
+    reward_changes: bool = False
     color: tuple[int, int, int] | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
@@ -154,6 +158,10 @@ class Skill:
             raise DeclarationError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
                 "0 to 255: color = (230, 80, 60)"
+            )
+        if not isinstance(self.reward_changes, bool | np.bool_):
+            raise DeclarationError(
+                f"{where}: reward_changes is {short(self.reward_changes)}; it must be True or False"
             )
         keys = self.needs_info
         if keys is not None and (
@@ -321,4 +329,6 @@ def asked(
     """
     dtype = np.float32 if method == "reward" else bool
     who = f"skill {path_of(skill)!r}"
-    return answer(getattr(skill, method), about, n, dtype, who, method, elapsed, ids)
+    may_change = method == "reward" and skill.reward_changes
+    function = getattr(skill, method)
+    return answer(function, about, n, dtype, who, method, elapsed, ids, may_change=may_change)

@@ -146,7 +146,8 @@ def _check_again(
         f"{who} answers {before[row]:g}, and {after[row]:g} when it is asked about the same again, "
         "so it keeps a state of its own. Steps are judged in any order and number, and later than "
         "they were made: compute the answer from the argument alone, and let the environment, or a "
-        "wrapper, put what must be remembered into the observation or info"
+        "wrapper, put what must be remembered into the observation or info. Where a reward should "
+        "change (a bonus for what was seldom seen), say so in its class: reward_changes = True"
     )
 
 

@@ -7,8 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reference_calls import Walk
 
-from skillweave.errors import SkillError
+from skillweave.collecting.judge import judged_by
+from skillweave.envs.make import EnvSpec
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.types import Step
 
@@ -127,3 +130,17 @@ def test_a_reflex_that_keeps_a_state_is_named() -> None:
 
     with pytest.raises(SkillError, match=r"reflex 'second_time': condition\(\) answers 0, and 1"):
         Reflex(second_time, 0).holds(step().obs)
+
+
+def test_a_reward_that_is_meant_to_change_says_so() -> None:
+    class Bonus(Counts):
+        reward_changes = True
+
+    class Wrong(Counts):
+        reward_changes: Any = "yes"
+
+    assert asked(Bonus(), "reward", step(), 4).tolist() == [1] * 4
+    with pytest.raises(DeclarationError, match="reward_changes"):
+        judged_by(Bonus(), EnvSpec(Walk))
+    with pytest.raises(DeclarationError, match="reward_changes is 'yes'; it must be True or False"):
+        Wrong().validate()
