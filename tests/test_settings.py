@@ -16,8 +16,13 @@ import numpy as np
 import pytest
 
 import skillweave as sw
-from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
-from skillweave.algorithms.config_off_policy import ActorCritic, OffPolicy
+from skillweave.algorithms.config import (
+    ActorCritic,
+    OffPolicy,
+    SkillCritic,
+    config_from_json,
+    config_to_json,
+)
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.settings import described, fitted
 
