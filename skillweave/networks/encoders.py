@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -14,11 +15,20 @@ from torch.nn import functional as F
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.named import Named, known_names
-from skillweave.networks.cells import CellsEncoder
 from skillweave.networks.config import CNN, Activation
 from skillweave.networks.own import ModuleEncoder
 from skillweave.networks.stacked import ACTIVATIONS, Inputs, Views, orthogonal_
+from skillweave.ops.device import FLOAT, Constant
 from skillweave.spaces import ObsCodec
+
+CELL_KINDS = 16
+"""The most kinds of a cell, 0 to 15: larger numbers count as 15, smaller ones as 0."""
+CELL_FEATURES = 64
+"""Features of an image of cells."""
+ONE_HOT_AT_ONCE = 2**20
+"""Approximate numbers in the one-hot rows of one product, when a gradient is computed."""
+FEWEST_ONE_HOT_ROWS = 32
+"""The least one-hot rows of one product: each product reads and writes the whole gradient."""
 
 
 class Encoder(Protocol):
@@ -164,6 +174,124 @@ def _conv(views: Views, name: str, x: Tensor, stride: int = 1, padding: int = 0)
     weight, bias = views[f"{name}.weight"], views[f"{name}.bias"]
     members = weight.shape[0]
     return F.conv2d(x, weight.flatten(0, 1), bias.flatten(), stride, padding, groups=members)
+
+
+class CellsEncoder:
+    """Learnt vectors for each value of each cell; features are the ReLU of their sum.
+
+    This is a dense layer on the one-hot cells, without the zeros. Where the space limits a value
+    to 5, it has six vectors, and larger numbers count as 5. Numbers beside the images are features
+    without a change.
+    """
+
+    def __init__(self, obs: ObsCodec) -> None:
+        if not obs.images:
+            raise DeclarationError(
+                'Network(encoder="cells") reads images of whole numbers, but the observations have '
+                "none"
+            )
+        self._sizes = [math.prod(shape) for shape in obs.images]
+        kinds = [_kinds(obs.highest(i)) for i in range(len(obs.images))]
+        self._last = [Constant(counts - 1) for counts in kinds]
+        # The row of each value's first kind; its rows in a table with CELL_KINDS for each value.
+        self._first = [Constant(counts.cumsum(0) - counts) for counts in kinds]
+        self._rows = [_rows_of(counts) for counts in kinds]
+        self._vector = obs.size > 0
+        self.size = CELL_FEATURES * len(kinds) + obs.size
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        for i, rows in enumerate(self._rows):
+            self.shapes |= {
+                f"{i}.weight": (len(rows), CELL_FEATURES),
+                f"{i}.bias": (1, CELL_FEATURES),
+            }
+
+    def init_(self, views: Views, generators: list[torch.Generator]) -> None:
+        """Draw rows of an orthogonal table, gain √2; set biases to zero.
+
+        The table is drawn for all CELL_KINDS, so a vector does not depend on the number of kinds.
+        """
+        for i, (rows, cells) in enumerate(zip(self._rows, self._sizes, strict=True)):
+            views[f"{i}.bias"].zero_()
+            table = torch.empty(1, cells * CELL_KINDS, CELL_FEATURES, **FLOAT)
+            for member, generator in zip(views[f"{i}.weight"], generators, strict=True):
+                orthogonal_(table, math.sqrt(2.0), [generator])
+                member.copy_(table[0, rows])
+
+    def __call__(self, views: Views, inputs: Inputs) -> Tensor:
+        """Map images (P, B, …) of whole numbers to features (P, B, F)."""
+        features = [self._image(views, i, inputs[f"image.{i}"]) for i in range(len(self._rows))]
+        if self._vector:
+            features.append(inputs["vector"])
+        return torch.cat(features, -1)
+
+    def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
+        cell, last = image.flatten(2), self._last[i].on(image.device)
+        if cell.dtype != torch.uint8:  # may be below 0
+            cell = cell.long().clamp(min=0)
+        kind = torch.minimum(cell, last)
+        rows = kind + self._first[i].on(image.device)
+        return torch.relu(sum_of_rows(rows, views[f"{i}.weight"]) + views[f"{i}.bias"])
+
+
+def _kinds(highest: Tensor) -> Tensor:
+    """Return each value's number of kinds, for its highest numbers (C, H, W), (K,) int64."""
+    kinds = np.clip(highest.flatten().numpy(), 0, CELL_KINDS - 1)  # torch clips no uint16
+    return torch.from_numpy(kinds.astype(np.int64)) + 1
+
+
+def _rows_of(kinds: Tensor) -> Tensor:
+    """Return the rows of existing kinds in a table with K · CELL_KINDS rows, for K values."""
+    exists = torch.arange(CELL_KINDS, device="cpu") < kinds[:, None]
+    return exists.flatten().nonzero().flatten()
+
+
+def sum_of_rows(rows: Tensor, table: Tensor) -> Tensor:
+    """Return the sums of rows of a table, one table for each member.
+
+    Args:
+        rows: (P, B, K) int64, the indices of the rows to add. On a CPU the gradient is wrong where
+            one sum has the same row twice.
+        table: (P, R, W).
+
+    Returns:
+        (P, B, W).
+    """
+    if table.device.type == "cpu" and torch.is_grad_enabled():
+        apply: Any = _SumOfRows.apply
+        sums: Tensor = apply(rows, table)
+        return sums
+    return _sums(rows, table)
+
+
+def _sums(rows: Tensor, table: Tensor) -> Tensor:
+    members, size = table.shape[:2]
+    if members > 1:  # the members' tables are stacked into one
+        rows = rows + torch.arange(members, device=rows.device)[:, None, None] * size
+    total = F.embedding_bag(rows.flatten(0, 1), table.flatten(0, 1), mode="sum")
+    return total.view(members, -1, total.shape[1])
+
+
+class _SumOfRows(torch.autograd.Function):
+    """Sums of rows with a dense gradient: on a CPU faster than torch's, which sorts all rows."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, table: Tensor) -> Tensor:
+        """Return the sums."""
+        ctx.save_for_backward(rows)
+        ctx.shape = table.shape
+        return _sums(rows, table)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
+        """Return the gradient by the table: transposed one-hot rows times the sums' gradient."""
+        (rows,) = ctx.saved_tensors
+        members, size, _ = ctx.shape
+        total = grad.new_zeros(ctx.shape)
+        length = max(FEWEST_ONE_HOT_ROWS, ONE_HOT_AT_ONCE // (members * size))
+        for index, slope in zip(rows.split(length, 1), grad.split(length, 1), strict=True):
+            one_hot = grad.new_zeros(members, index.shape[1], size).scatter_(2, index, 1.0)
+            total.baddbmm_(one_hot.mT, slope)
+        return None, total
 
 
 def part(views: Views, prefix: str) -> dict[str, Tensor]:

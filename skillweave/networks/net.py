@@ -8,15 +8,19 @@ from torch import Tensor
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
-from skillweave.networks.recurrent import (
+from skillweave.networks.stacked import (
+    Views,
     cell,
+    mlp,
+    mlp_init_,
+    mlp_shapes,
+    orthogonal_,
     project,
     rnn_init_,
     rnn_memory_size,
     rnn_shapes,
     sequence,
 )
-from skillweave.networks.stacked import Views, mlp, mlp_init_, mlp_shapes, orthogonal_
 from skillweave.ops.device import INT, Constant
 from skillweave.spaces import ObsCodec
 

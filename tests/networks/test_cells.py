@@ -7,7 +7,13 @@ import torch
 
 from skillweave import PPO, Network, SkillweaveError, register_encoder
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.networks.cells import AT_ONCE, KINDS, WIDTH, CellsEncoder, sum_of_rows
+from skillweave.networks.encoders import (
+    CELL_FEATURES,
+    CELL_KINDS,
+    ONE_HOT_AT_ONCE,
+    CellsEncoder,
+    sum_of_rows,
+)
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
@@ -22,10 +28,10 @@ def test_features_are_those_of_a_dense_layer_on_one_hot_cells():
     }
     image = torch.randint(0, 20, (members, batch, 2, 3, 3), generator=rng).to(torch.uint8)
     found = encoder(views, {"image.0": image})
-    kinds = image.flatten(2).long().clamp(max=KINDS - 1)  # 16 and more are one kind
-    one_hot = torch.nn.functional.one_hot(kinds, KINDS).flatten(2).float()
+    kinds = image.flatten(2).long().clamp(max=CELL_KINDS - 1)  # 16 and more are one kind
+    one_hot = torch.nn.functional.one_hot(kinds, CELL_KINDS).flatten(2).float()
     want = torch.relu(one_hot @ views["0.weight"] + views["0.bias"])
-    assert found.shape == (members, batch, WIDTH) == (members, batch, encoder.size)
+    assert found.shape == (members, batch, CELL_FEATURES) == (members, batch, encoder.size)
     torch.testing.assert_close(found, want, rtol=1e-4, atol=1e-4)
 
 
@@ -37,7 +43,7 @@ HIGHEST = np.array([[[1, 4]], [[0, 9]], [[2, 99]]])  # more than 15 count as 15
 def test_numbers_of_any_type_have_kinds(dtype):
     most = 1 if dtype is np.bool_ else 9
     space = gym.spaces.Box(0, most, (3, 3, 2), dtype)
-    assert CellsEncoder(obs_codec(space)).shapes["0.weight"] == (18 * (most + 1), WIDTH)
+    assert CellsEncoder(obs_codec(space)).shapes["0.weight"] == (18 * (most + 1), CELL_FEATURES)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
@@ -47,8 +53,11 @@ def test_each_value_has_as_many_vectors_as_its_space_has_kinds(dtype):
     many = gym.spaces.Box(0, 99, HIGHEST.shape, dtype)
     encoders = [CellsEncoder(obs_codec(space)) for space in (few, many)]
     kinds = HIGHEST[:, 0].T.flatten().clip(max=15) + 1  # channels first
-    assert [e.shapes["0.weight"] for e in encoders] == [(kinds.sum(), WIDTH), (6 * KINDS, WIDTH)]
-    there = np.flatnonzero(np.arange(KINDS) < kinds[:, None])
+    assert [e.shapes["0.weight"] for e in encoders] == [
+        (kinds.sum(), CELL_FEATURES),
+        (6 * CELL_KINDS, CELL_FEATURES),
+    ]
+    there = np.flatnonzero(np.arange(CELL_KINDS) < kinds[:, None])
 
     fresh = [{k: torch.ones(2, *v) for k, v in encoder.shapes.items()} for encoder in encoders]
     for encoder, views in zip(encoders, fresh, strict=True):
@@ -96,15 +105,15 @@ def test_kinds_are_the_same_in_other_types_of_numbers(dtype):
     assert torch.equal(found, want)
 
 
-@pytest.mark.parametrize("at_once", [1, AT_ONCE])
+@pytest.mark.parametrize("at_once", [1, ONE_HOT_AT_ONCE])
 @pytest.mark.parametrize("members", [1, 2])
 @pytest.mark.parametrize("batch", [1, 3, 4, 5, 13])
 def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
     batch, members, at_once, monkeypatch
 ):
     # In parts of four rows, or in one.
-    monkeypatch.setattr("skillweave.networks.cells.AT_ONCE", at_once)
-    monkeypatch.setattr("skillweave.networks.cells.FEWEST_ROWS", 4)
+    monkeypatch.setattr("skillweave.networks.encoders.ONE_HOT_AT_ONCE", at_once)
+    monkeypatch.setattr("skillweave.networks.encoders.FEWEST_ONE_HOT_ROWS", 4)
     grids = gym.spaces.Tuple([GRID, gym.spaces.Box(0, 255, (5, 4, 3), np.uint8)])
     encoder, rng = CellsEncoder(obs_codec(grids)), torch.Generator().manual_seed(batch)
     images = {
@@ -117,10 +126,10 @@ def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
     }
     dense = []
     for i, image in enumerate(images.values()):
-        kinds = image.flatten(2).long().clamp(max=KINDS - 1)
-        one_hot = torch.nn.functional.one_hot(kinds, KINDS).flatten(2).float()
+        kinds = image.flatten(2).long().clamp(max=CELL_KINDS - 1)
+        one_hot = torch.nn.functional.one_hot(kinds, CELL_KINDS).flatten(2).float()
         dense.append(torch.relu(one_hot @ views[f"{i}.weight"] + views[f"{i}.bias"]))
-    grad = torch.randn(members, batch, 2 * WIDTH, generator=rng)
+    grad = torch.randn(members, batch, 2 * CELL_FEATURES, generator=rng)
     found, want = (
         torch.autograd.grad(features, list(views.values()), grad)
         for features in (encoder(views, images), torch.cat(dense, -1))
@@ -130,7 +139,7 @@ def test_gradients_are_those_of_a_dense_layer_on_one_hot_cells(
 
 
 def test_a_table_that_learns_on_a_cpu_has_the_fast_gradient():
-    table = torch.zeros(1, 8, WIDTH, requires_grad=True)
+    table = torch.zeros(1, 8, CELL_FEATURES, requires_grad=True)
     total = sum_of_rows(torch.tensor([[[1, 6]]]), table)
     assert type(total.grad_fn).__name__ == "_SumOfRowsBackward"
 
@@ -140,7 +149,7 @@ def test_on_another_device_nothing_stays_behind():
     views = {k: torch.zeros(1, *v, device="meta") for k, v in encoder.shapes.items()}
     image = torch.zeros(1, 5, 2, 3, 3, dtype=torch.uint8, device="meta")
     found = encoder(views, {"image.0": image})
-    assert (found.device.type, found.shape) == ("meta", (1, 5, WIDTH))
+    assert (found.device.type, found.shape) == ("meta", (1, 5, CELL_FEATURES))
 
 
 def test_numbers_beside_the_grid_are_features_too():
@@ -148,7 +157,7 @@ def test_numbers_beside_the_grid_are_features_too():
     algorithm = make_algorithm(
         PPO(network=Network(hidden=(8,), encoder="cells")), space, gym.spaces.Discrete(3)
     )
-    assert algorithm.actor_net.encoders["actor.encoder"].size == WIDTH + 4
+    assert algorithm.actor_net.encoders["actor.encoder"].size == CELL_FEATURES + 4
     assert algorithm.init([Seeds(0), Seeds(1)]).params.isfinite().all()
 
 

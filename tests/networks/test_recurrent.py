@@ -3,7 +3,8 @@ import torch
 from torch import nn
 
 from skillweave.networks.config import RNN
-from skillweave.networks.recurrent import (
+from skillweave.networks.stacked import (
+    Layout,
     cell,
     project,
     rnn_init_,
@@ -11,7 +12,6 @@ from skillweave.networks.recurrent import (
     rnn_shapes,
     sequence,
 )
-from skillweave.networks.stacked import Layout
 
 P, T, B, IN, H = 3, 6, 4, 5, 7
 
