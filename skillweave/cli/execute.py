@@ -1,4 +1,7 @@
-"""Carry out each command of the command line: apart from parsing, as it imports torch."""
+"""Carry out each command of the command line.
+
+Stands alone because it imports torch, which parsing and ``--help`` do not need.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from skillweave import recipes
+from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.hub import pull_run, push_run
+from skillweave.api.loading import ASK, declared_in, load_from
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
-from skillweave.cli.targets import free, load_run, target
 from skillweave.cli.telling import run_words, save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
+from skillweave.hierarchy.weights import open_weights
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -190,6 +195,17 @@ def _list(command: commands.List) -> None:
     tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 
+def _run_line(path: Path) -> dict[str, Any]:
+    try:
+        run = RunDirectory.open(path)
+    except RunError as error:
+        return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
+    status = "finished" if run.finished else "unfinished"
+    return {"path": str(path), "status": status} | {
+        k: run.manifest[k] for k in ("kind", "env", "seed")
+    }
+
+
 def _info(command: commands.Info) -> None:
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
@@ -203,49 +219,6 @@ def _info(command: commands.Info) -> None:
     scores = {} if saved is None else {"evaluation": saved.to_json()}
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
     tell(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
-
-
-def _weights(command: commands.Weights) -> None:
-    trained = load_run(command.run, command.recipe)
-    path = trained.save_weights(command.out)
-    tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
-
-
-def _export(command: commands.Export) -> None:
-    if not command.onnx:
-        raise DeclarationError("choose an export format: --onnx")
-    name = Path(command.target).name.removesuffix(".safetensors")
-    export = target(command).export(command.out or Path(f"{name}-onnx"))
-    result = {"path": str(export.path), "files": list(export.files), "code": export.code}
-    tell(command, result, str(export))
-
-
-def _import_agilerl(command: commands.ImportAgilerl) -> None:
-    if not command.trust:
-        raise DeclarationError(
-            f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
-            "by an unpickler that admits only tensors, numbers and plain containers; if you trust "
-            "where it comes from nevertheless, say so: --trust"
-        )
-    out = command.out or command.file.with_suffix(".safetensors")
-    algo = convert(command.file, out)
-    text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
-    tell(command, {"path": str(out), "algorithm": algo}, text)
-
-
-def _run_line(path: Path) -> dict[str, Any]:
-    try:
-        run = RunDirectory.open(path)
-    except RunError as error:
-        return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
-    status = "finished" if run.finished else "unfinished"
-    return {"path": str(path), "status": status} | {
-        k: run.manifest[k] for k in ("kind", "env", "seed")
-    }
-
-
-def _plain(settings: dict[str, Any]) -> dict[str, Any]:
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
 
 
 def run_lines(
@@ -300,6 +273,25 @@ def run_lines(
     return lines
 
 
+def _plain(settings: dict[str, Any]) -> dict[str, Any]:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
+
+
+def _weights(command: commands.Weights) -> None:
+    trained = load_run(command.run, command.recipe)
+    path = trained.save_weights(command.out)
+    tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+
+
+def _export(command: commands.Export) -> None:
+    if not command.onnx:
+        raise DeclarationError("choose an export format: --onnx")
+    name = Path(command.target).name.removesuffix(".safetensors")
+    export = target(command).export(command.out or Path(f"{name}-onnx"))
+    result = {"path": str(export.path), "files": list(export.files), "code": export.code}
+    tell(command, result, str(export))
+
+
 def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
     """Put a run on the hub; return the result as JSON and for people."""
     _no_bars()
@@ -317,7 +309,57 @@ def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
     return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
 
 
+def free(path: Path) -> Path:
+    """Return ``path``, or the first of path-2, path-3, … that does not exist."""
+    number, candidate = 1, path
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.name}-{number}")
+    return candidate
+
+
 def _no_bars() -> None:
     """Keep the hub's library from drawing a bar for each file."""
     hub()  # a missing extra is reported
     importlib.import_module("huggingface_hub.utils").disable_progress_bars()
+
+
+def _import_agilerl(command: commands.ImportAgilerl) -> None:
+    if not command.trust:
+        raise DeclarationError(
+            f"{command.file} would be read as a pickle, and pickles can run code. This one is read "
+            "by an unpickler that admits only tensors, numbers and plain containers; if you trust "
+            "where it comes from nevertheless, say so: --trust"
+        )
+    out = command.out or command.file.with_suffix(".safetensors")
+    algo = convert(command.file, out)
+    text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
+    tell(command, {"path": str(out), "algorithm": algo}, text)
+
+
+def target(command: commands.Watched | commands.Export) -> Run:
+    """Return the trained policy that a command names.
+
+    Raises:
+        RunError: there is none, or it needs code that was not given.
+    """
+    path = Path(command.target)
+    if command.pretrained:
+        return Hierarchy.pretrained(command.target)
+    if path.is_dir():
+        return load_run(path, command.recipe)
+    if path.suffix == ".safetensors":
+        header = open_weights(path)[1]
+        if header.get("kind") == "agent" and "env" in header:
+            return Agent.from_weights(path)
+        recipe = command.recipe or header.get("recipe")
+        return declared_in(recipe, command.recipe, str(path)).load_weights(path)
+    hint = (
+        " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
+    )
+    raise RunError(f"{command.target} is neither a run nor a weights file{hint}")
+
+
+def load_run(path: Path, recipe: str | None) -> Run:
+    """Load the finished run at ``path``, with the code of a ``recipe`` if one is given."""
+    return load_from(path, recipe=recipe, ask=ASK)

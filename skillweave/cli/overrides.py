@@ -1,4 +1,4 @@
-"""``--set``: settings by dotted name, as ``selector.gamma=0.99``, ``skills.center.steps=1e6``."""
+"""Settings by dotted name: ``--set selector.gamma=0.99``, ``--evolve population=8``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from typing import Any
 
 from skillweave.algorithms.config import named_config
 from skillweave.algorithms.schedules import Linear
+from skillweave.api.running import apart_to_evolve
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
+from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.schedule import stages_of
 from skillweave.settings import annotations_of, described, options_of
 from skillweave.skills import Skill
 
@@ -32,6 +35,12 @@ GROUPS = {
 """By the first part of a name, the field that holds the group."""
 ALGORITHMS = ("algorithm", "selector", "flat")
 """First parts of the names of algorithms' settings."""
+
+
+SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
+
+
+_LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
@@ -81,6 +90,24 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
     declaration.__post_init__()
 
 
+def list_settings(declaration: Declaration) -> dict[str, Any]:
+    """Return the dotted name and the value of every setting."""
+    values: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
+    for name, field in GROUPS.items():
+        if (group := getattr(declaration, field)) is not None:
+            values |= {f"{name}.{f.name}": getattr(group, f.name) for f in fields(group)}
+    values = {k: v for k, v in values.items() if k not in ("train.flat", "guide.selector")}
+    budgets = declaration.budgets()
+    for skill in declaration.skills:
+        if skill.policy is None:
+            values[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
+            values[f"skills.{skill.name}.task_weight"] = skill.task_weight
+            config = skill.algorithm or declaration.algorithm
+            values |= _flatten(f"skills.{skill.name}.", config)
+    trained = declaration.ready_selector is None
+    return values | (_flatten("selector.", declaration.selector) if trained else {})
+
+
 def _config(declaration: Declaration, owner: tuple[str, ...]) -> Any:
     """Return the settings that names starting with ``owner`` belong to."""
     head = owner[0]
@@ -111,22 +138,71 @@ def _without_settings(name: str, owner: tuple[str, ...]) -> str:
     )
 
 
-def list_settings(declaration: Declaration) -> dict[str, Any]:
-    """Return the dotted name and the value of every setting."""
-    values: dict[str, Any] = {name: getattr(declaration, name) for name in PLAIN}
-    for name, field in GROUPS.items():
-        if (group := getattr(declaration, field)) is not None:
-            values |= {f"{name}.{f.name}": getattr(group, f.name) for f in fields(group)}
-    values = {k: v for k, v in values.items() if k not in ("train.flat", "guide.selector")}
-    budgets = declaration.budgets()
-    for skill in declaration.skills:
-        if skill.policy is None:
-            values[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
-            values[f"skills.{skill.name}.task_weight"] = skill.task_weight
-            config = skill.algorithm or declaration.algorithm
-            values |= _flatten(f"skills.{skill.name}.", config)
-    trained = declaration.ready_selector is None
-    return values | (_flatten("selector.", declaration.selector) if trained else {})
+def parse_evolve(
+    settings: Sequence[str], declaration: Declaration, flat: bool
+) -> dict[str, Evolution | None] | None:
+    """Return each stage's evolution, or None where nothing is to evolve.
+
+    A name may begin with a stage; settings without one hold for all. ``selection=truncation``
+    takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
+
+    Raises:
+        DeclarationError: no such setting (with close matches), or a value out of range.
+    """
+    if not settings:
+        return None
+    if flat:
+        stages = declaration.plain_agent().stages()
+    else:
+        stages = stages_of(apart_to_evolve(declaration)[0])
+    names = [p.name for p in stages]
+    shared = list[tuple[str, str, str]]()
+    by_stage = {name: list[tuple[str, str, str]]() for name in names}
+    for setting in settings:
+        name, sign, text = (part.strip() for part in setting.partition("="))
+        if not sign:
+            raise DeclarationError(f"--evolve {setting!r}: write name=value, such as population=8")
+        head, _, rest = name.partition(".")
+        if head in names and rest:
+            by_stage[head].append((rest, name, text))
+        else:
+            shared.append((name, name, text))
+    return {
+        name: _evolution([*shared, *by_stage[name]]) if shared or by_stage[name] else None
+        for name in names
+    }
+
+
+def _evolution(settings: list[tuple[str, str, str]]) -> Evolution:
+    """Return an evolution from dotted names, names as they were written, and values."""
+    ranges: dict[str, Range] = {}
+    changes: dict[tuple[str, ...], tuple[str, str]] = {}
+    start = Evolution()
+    for name, written, text in settings:
+        path = tuple(name.split("."))
+        if path == ("selection",):
+            if text.lower() not in SELECTIONS:
+                known = ", ".join(SELECTIONS)
+                raise DeclarationError(f"--evolve {written}={text}: expected one of {known}")
+            start = replace(start, selection=SELECTIONS[text.lower()]())
+        elif path[:-1] in (("ranges",), ("mutations", "ranges")):
+            ranges[path[-1]] = _range(written, text)
+        else:
+            changes[path] = written, text
+    evolution: Evolution = replaced(start, changes)
+    if ranges:
+        evolution = replace(evolution, mutations=replace(evolution.mutations, ranges=ranges))
+    return evolution
+
+
+def _range(written: str, text: str) -> Range:
+    try:
+        low, high, *scale = (part.strip() for part in text.split(","))
+        return Range(float(low), float(high), *scale)  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        raise DeclarationError(
+            f"--evolve {written}={text}: write low,high or low,high,scale ({error})"
+        ) from error
 
 
 def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> Any:
@@ -158,9 +234,6 @@ def replaced(config: Any, changes: dict[tuple[str, ...], tuple[str, str]]) -> An
             raise DeclarationError(f"{name}: {field} has no parts")
         values[field] = replaced(inner, inner_changes)
     return replace(config, **values)
-
-
-_LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
 def _parse(name: str, text: str, hint: Any) -> Any:

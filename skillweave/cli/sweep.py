@@ -1,7 +1,8 @@
 """``sweep``: many runs of a recipe, here in processes or on Ray, and a table of their results.
 
-Each run is an ordinary run directory. A sweep that was stopped, or one of its runs, continues when
-the same command is given again.
+Stands alone because it schedules runs; ``execute`` only prints its results. Each run is an
+ordinary run directory. A sweep that was stopped, or one of its runs, continues when the same
+command is given again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""The checksum of a sweep's code, kept in a file of the sweep's directory; a contract of its own.
+"""The checksum of a sweep's code, kept in a file of the sweep's directory.
 
-A run's identity covers settings, not code. Without this file, an edited recipe would continue the
-sweep of the recipe as it was, and one table would mix both.
+Stands alone because it reads code, and ``sweep`` trains runs. A run's identity covers settings,
+not code. Without this file, an edited recipe would continue the sweep of the recipe as it was, and
+one table would mix both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Commands that train: a recipe, its flat agent, and the end of a stopped run."""
+"""Commands that train: a recipe, its flat agent, and the end of a stopped run.
+
+Stands alone because these commands share how a run is trained, summarised and compared.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,7 @@ from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
-from skillweave.cli.evolve import parse_evolve
-from skillweave.cli.overrides import apply_overrides
+from skillweave.cli.overrides import apply_overrides, parse_evolve
 from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.errors import DeclarationError, RunError

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from skillweave import Evolution, Hierarchy, Range, Skill, SkillweaveError, Tournament, Truncation
-from skillweave.cli.evolve import parse_evolve
 from skillweave.cli.main import main
+from skillweave.cli.overrides import parse_evolve
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
