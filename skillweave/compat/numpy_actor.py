@@ -1,6 +1,7 @@
-"""Networks that act on few observations at a time: apart, as they replace torch's by NumPy's.
+"""Networks that act on few observations at a time, with NumPy in place of torch.
 
-MLPs are copied into NumPy. Every other network acts in torch, by the same interface.
+Stands alone because it repeats layers of ``networks`` in NumPy, for speed. MLPs are copied into
+NumPy. Every other network acts in torch, by the same interface.
 """
 
 from __future__ import annotations

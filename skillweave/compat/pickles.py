@@ -1,4 +1,6 @@
-"""Read checkpoints of ``torch.save`` without running code from them: apart from their meaning.
+"""Read checkpoints of ``torch.save`` without running code from them.
+
+Stands alone because it only makes reading safe; ``agilerl_files`` knows what the content means.
 
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
@@ -9,6 +11,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +21,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.compat.pickle_limits import DEEPEST, MOST_STEPS, check_program, check_sizes
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.reading import check_file, shown
+
+DEEPEST = 100
+"""Deepest nesting of a pickle's objects: hashing a deeper tuple overflows Python's stack."""
+MOST_STEPS = 500_000
+"""Operations of a pickle's program; each may take memory."""
+LARGEST_PROGRAM = 16 * 2**20
+"""Bytes of the program; tensors lie beside it."""
+LARGEST = 2**30
+"""Bytes of everything in the file."""
+_INTO = {"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"}
+"""Operations that put something into an object on the stack."""
+_MARK = -1
+
 
 _STORAGES = {
     "FloatStorage": torch.float32,
@@ -106,6 +121,56 @@ def read_torch_pickle(path: Path) -> Any:
     except Exception as error:  # a damaged pickle can fail in any way
         reason = f"{type(error).__name__}: {shortened(str(error))}"
         raise RunError(f"{path} is damaged: {reason}") from error
+
+
+def check_sizes(file: zipfile.ZipFile, size: int, program: str) -> None:
+    """Raise where reading a zip of ``size`` bytes would take far more memory than that."""
+    total = sum(member.file_size for member in file.infolist())
+    if total > LARGEST:
+        raise RunError(f"it declares {total:,} bytes; at most {LARGEST:,} are read")
+    if total > size:
+        raise RunError(
+            f"refused: it declares {total:,} bytes in a file of {size:,}; what torch.save writes "
+            "is not compressed"
+        )
+    size_of_program = file.getinfo(program).file_size
+    if size_of_program > LARGEST_PROGRAM:
+        raise RunError(
+            f"its pickle declares {size_of_program:,} bytes; at most {LARGEST_PROGRAM:,} are read"
+        )
+
+
+def check_program(program: bytes) -> None:
+    """Raise where a pickle's program is too long, or its objects are nested too deep.
+
+    It is run with the depth of every object in place of the object.
+    """
+    stack: list[int] = []
+    memo: dict[Any, int] = {}
+    for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
+        name, taken = operation.name, operation.stack_before
+        if step >= MOST_STEPS:
+            raise RunError(f"its pickle has more than {MOST_STEPS:,} operations")
+        if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            memo[len(memo) if name == "MEMOIZE" else argument] = stack[-1]
+            continue
+        if name in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(memo[argument])
+            continue
+        if name == "MARK":
+            stack.append(_MARK)
+            continue
+        inner = []
+        if pickletools.markobject in taken:
+            while (depth := stack.pop()) != _MARK:
+                inner.append(depth)
+            taken = taken[: taken.index(pickletools.markobject)]
+        inner += [stack.pop() for _ in taken]
+        outer = inner.pop() if name in _INTO else 0
+        depth = max(outer, max(inner, default=-1) + 1)
+        if depth > DEEPEST:
+            raise RunError(f"its pickle nests objects more than {DEEPEST} deep")
+        stack += [depth] * len(operation.stack_after)
 
 
 class _Plain:

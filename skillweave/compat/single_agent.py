@@ -1,4 +1,7 @@
-"""One agent for a user's training loop, part of the public API: it acts, learns and is saved."""
+"""One agent for a user's training loop: it acts, learns and is saved.
+
+Stands alone because modules of ``agilerl`` only translate names.
+"""
 
 from __future__ import annotations
 

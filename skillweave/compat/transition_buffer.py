@@ -1,4 +1,7 @@
-"""A replay buffer for a user's training loop, part of the public API."""
+"""A replay buffer for a user's training loop.
+
+Stands alone because modules of ``agilerl`` only translate names.
+"""
 
 from __future__ import annotations
 
