@@ -8,7 +8,7 @@ from the last complete generation.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -16,17 +16,17 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from skillweave.algorithms.config import config_from_json, config_to_json
+from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.collecting.placement import LOCAL, Placement
-from skillweave.evolution.config import evolution_from_json
+from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.fitness import FitnessEnvs
-from skillweave.evolution.lineage import lineage_of, settings_of
 from skillweave.evolution.part import spaces_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member, Origin
-from skillweave.runs.population_schema import Generation
+from skillweave.networks.config import Network
+from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
 from skillweave.training import interrupts
 from skillweave.training.stage_log import StageLog, resumed
@@ -316,6 +316,42 @@ def _member_from_json(entry: dict[str, Any]) -> Member:
     origin["changes"] = {k: tuple(v) for k, v in origin["changes"].items()}
     config = config_from_json(entry["config"])
     return Member(entry["number"], config, None, entry["steps"], Origin(**origin))
+
+
+def lineage_of(
+    stage: str,
+    generation: int,
+    members: Sequence[Member],
+    fitness: Array,
+    evolution: Evolution,
+    best: int | None,
+) -> list[dict[str, Any]]:
+    """Return a generation's lines; ``best``: the best member's number, if it is among them."""
+    return [
+        {
+            "stage": stage,
+            "generation": generation,
+            "member": member.number,
+            "parent": member.origin.parent,
+            "mutation": member.origin.mutation,
+            "changes": {k: list(v) for k, v in member.origin.changes.items()},
+            "fitness": float(value) if np.isfinite(value) else None,
+            "diverged": not np.isfinite(value),
+            "best": member.number == best,
+            "steps": member.steps,
+            "settings": settings_of(member.config, evolution),
+        }
+        for member, value in zip(members, fitness, strict=True)
+    ]
+
+
+def settings_of(config: AlgorithmConfig, evolution: Evolution) -> dict[str, Any]:
+    """Return the settings of a member that evolution may change, by name."""
+    ranges = evolution.mutations.ranges_of(config, start=False)
+    settings: dict[str, Any] = {name: getattr(config, name) for name in ranges}
+    network: Network = config.network
+    settings |= {"hidden": list(network.hidden), "activation": network.activation}
+    return settings
 
 
 def _short(value: Any) -> str:

@@ -52,8 +52,14 @@ from skillweave.runs.kept import to_be_judged
 from skillweave.runs.links import check_no_links
 from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
-from skillweave.runs.manifest import Checkpoint, MetricsLine, identity, read_manifest, versions
-from skillweave.runs.population_schema import LineageLine
+from skillweave.runs.manifest import (
+    Checkpoint,
+    LineageLine,
+    MetricsLine,
+    identity,
+    read_manifest,
+    versions,
+)
 from skillweave.types import unprefixed
 
 S = TypeVar("S")

@@ -1,4 +1,7 @@
-"""The lock of a run, so one process trains it at a time; the system releases it at process end."""
+"""The lock of a run, so one process trains it at a time; the system releases it at process end.
+
+Stands alone because locks differ between operating systems.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The schemas of ``run.json`` and of the headers of checkpoints.
+"""The schemas of a run's files: ``run.json``, lines of metrics and of lineages, checkpoints.
 
 To add a field, add a line; ``NotRequired`` if not every run has it.
 """
@@ -238,6 +238,63 @@ class Checkpoint(TypedDict):
     run: NotRequired[str]
     kept_best: NotRequired[BestSoFar]
     """The best evaluation so far, if the best weights are kept."""
+
+
+# Populations
+
+
+class MemberEntry(TypedDict):
+    """A member of a population, in a checkpoint's header."""
+
+    number: Count
+    steps: Count
+    config: dict[str, Any]
+    origin: Origin
+
+
+class Origin(TypedDict):
+    """The origin of a member: its parent and its mutation."""
+
+    parent: Count | None
+    mutation: str
+    changes: dict[str, tuple[Any, Any]]
+
+
+class BestEntry(TypedDict):
+    """The best member of a population so far."""
+
+    fitness: float
+    number: Count
+    generation: Count
+    policy: dict[str, Any]
+
+
+class LineageLine(TypedDict):
+    """A line of ``lineage.jsonl``: a member in a generation."""
+
+    stage: NodePath
+    generation: Count
+    member: Count
+    parent: Count | None
+    mutation: str
+    changes: dict[str, tuple[Any, Any]]
+    fitness: float | None
+    best: bool
+    settings: dict[str, Any]
+
+
+class Generation(Checkpoint):
+    """The header of a population's checkpoint."""
+
+    fitness_steps: Count
+    generation: Count
+    rounds: Count
+    next_number: Count
+    members: Annotated[list[MemberEntry], Check("at least one member", bool)]
+    best: BestEntry
+
+
+# Reading and writing ``run.json``
 
 
 def check_manifest(data: Mapping[str, Any], file: str) -> None:

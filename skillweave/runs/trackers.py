@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import importlib.util
 import os
 import struct
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.errors import DeclarationError, MissingExtra, RunError
+from skillweave.messages import error_text
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.mlflow_tracker import MLflow
+from skillweave.terminal import say
+from skillweave.types import flat
+
+MLFLOW_EXPERIMENT = "skillweave"
+"""The experiment of all runs, in MLflow."""
+MLFLOW_TAG = "skillweave.run"
+"""The tag that identifies MLflow's run of a resumed run."""
+MLFLOW_SECONDS = 1.0
+"""The longest time that metrics wait, to be sent together."""
+MLFLOW_MOST_METRICS = 500
+"""The most metrics that are sent at once; MLflow takes 1,000."""
+MLFLOW_MOST_SETTINGS = 100
+"""The most settings that are sent at once."""
+MLFLOW_LONGEST_SETTING = 500
+"""The most characters of a setting's value in MLflow."""
 
 
 class Tracker(Protocol):
@@ -142,21 +159,128 @@ class WandB:
         self._run.finish()
 
 
+class MLflow:
+    """One MLflow run, at MLFLOW_TRACKING_URI or in MLflow's default store.
+
+    A resumed run continues it, and does not send its earlier metrics again.
+
+    Raises:
+        RunError: MLflow does not answer.
+    """
+
+    def __init__(self, run: RunDirectory) -> None:
+        mlflow = importlib.import_module("mlflow")
+        self._metric = importlib.import_module("mlflow.entities").Metric
+        self._run = run
+        self._waiting = list[Any]()
+        self._sent = list[Any]()
+        self._since = time.monotonic()
+        try:
+            self._client: Any = mlflow.MlflowClient()
+            tag = identifier(run)
+            mlflow_run = self._existing(tag) or self._new(tag)
+        except Exception as error:  # of any store
+            raise RunError(
+                f"MLflow at {mlflow.get_tracking_uri()} does not answer: {error_text(error)}. Set "
+                "MLFLOW_TRACKING_URI, or train without this tracker"
+            ) from error
+        self._id: str = mlflow_run.info.run_id
+        stages = [stage["name"] for stage in run.manifest["stages"]]
+        self._sent_steps = {s: mlflow_run.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
+
+    def _existing(self, tag: str) -> Any:
+        """Return MLflow's run of an earlier part of this run; None: it has none."""
+        experiment = self._client.get_experiment_by_name(MLFLOW_EXPERIMENT)
+        if experiment is None:
+            self._client.create_experiment(MLFLOW_EXPERIMENT)
+            return None
+        query = f"tags.`{MLFLOW_TAG}` = '{tag}'"
+        runs = self._client.search_runs([experiment.experiment_id], query, max_results=1)
+        if not runs:
+            return None
+        self._client.update_run(runs[0].info.run_id, status="RUNNING")
+        return runs[0]
+
+    def _new(self, tag: str) -> Any:
+        """Create MLflow's run, with the settings."""
+        experiment = self._client.get_experiment_by_name(MLFLOW_EXPERIMENT)
+        manifest = self._run.manifest
+        created = self._client.create_run(
+            experiment.experiment_id,
+            tags={MLFLOW_TAG: tag},
+            run_name=self._run.path.resolve().name,
+        )
+        settings = {k: v for k, v in manifest.items() if not isinstance(v, dict | list)}
+        for stage in manifest["stages"]:
+            settings |= flat(stage["name"], stage.get("algorithm", {}))
+        param = importlib.import_module("mlflow.entities").Param
+        params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
+        for i in range(0, len(params), MLFLOW_MOST_SETTINGS):
+            self._client.log_batch(created.info.run_id, params=params[i : i + MLFLOW_MOST_SETTINGS])
+        return created
+
+    def stage(self, name: str, budget: int) -> None:
+        """Do nothing."""
+
+    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Store every metric, to be sent after about a second."""
+        if steps <= self._sent_steps.get(name, -1.0):
+            return
+        now = int(1000 * time.time())
+        for key, value in (metrics | {"steps": steps}).items():
+            self._waiting.append(self._metric(f"{name}/{key}", float(value), now, steps))
+        if (
+            time.monotonic() - self._since > MLFLOW_SECONDS
+            or len(self._waiting) > MLFLOW_MOST_METRICS
+        ):
+            self._send()
+
+    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
+        """Send waiting metrics."""
+        self._send()
+
+    def message(self, text: str) -> None:
+        """Do nothing: messages are not tracked."""
+
+    def film(self, path: Path, steps: int) -> None:
+        """Upload the film as an artifact."""
+        self._client.log_artifact(self._id, str(path), f"films/{steps}")
+
+    def _send(self) -> None:
+        """Send waiting metrics in a thread of MLflow's, so training does not wait for an answer."""
+        self._since = time.monotonic()
+        while self._waiting:
+            batch, self._waiting = (
+                self._waiting[:MLFLOW_MOST_METRICS],
+                self._waiting[MLFLOW_MOST_METRICS:],
+            )
+            self._sent.append(self._client.log_batch(self._id, metrics=batch, synchronous=False))
+
+    def close(self) -> None:
+        """Send the rest and the run's status; print a message if metrics were refused."""
+        status = "FINISHED" if self._run.finished else "KILLED"
+        try:
+            self._send()
+            for sent in self._sent:
+                sent.wait()
+            self._client.set_terminated(self._id, status)
+        except Exception as error:
+            say(
+                "MLflow did not take all metrics (they are in the run's files): "
+                f"{error_text(error)}"
+            )
+
+
 def identifier(run: RunDirectory) -> str:
     """Return 16 letters that identify a run, also when it is resumed."""
     parts = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
-def make_mlflow(run: RunDirectory) -> Tracker:
-    """Return a tracker that sends to MLflow."""
-    return MLflow(run, identifier(run))
-
-
 MAKE: dict[str, Callable[[RunDirectory], Tracker]] = {
     "tensorboard": TensorBoard,
     "wandb": WandB,
-    "mlflow": make_mlflow,
+    "mlflow": MLflow,
 }
 TRACKERS = tuple(MAKE)
 """Names of the trackers, of their modules and of their extras."""

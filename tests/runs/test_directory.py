@@ -24,8 +24,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.runs.manifest import versions
-from skillweave.runs.population_schema import Generation
+from skillweave.runs.manifest import Generation, versions
 from skillweave.seeding import Seeds
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
