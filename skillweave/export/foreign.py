@@ -1,4 +1,7 @@
-"""Graphs of foreign networks, like those of trained agents: apart, as they are no agents."""
+"""ONNX graphs of foreign networks, with the inputs and outputs of ``graphs``.
+
+Stands alone because each kind of foreign policy is converted in its own way.
+"""
 
 from __future__ import annotations
 

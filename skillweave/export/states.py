@@ -1,4 +1,7 @@
-"""A policy as data, apart from its folder: networks as files, and a state machine as JSON."""
+"""A policy as data: networks as files, and a state machine as JSON.
+
+Stands alone because it describes any policy; ``write`` makes one folder of the description.
+"""
 
 from __future__ import annotations
 

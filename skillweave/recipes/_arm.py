@@ -1,4 +1,7 @@
-"""The robot's arm of ``pick-and-place``, apart from its skills: its task and disturbances."""
+"""The robot's arm of ``pick-and-place``: its task and disturbances.
+
+Stands alone because it is the environment, and the recipe has only skills.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The half-cheetah of ``shuttle``, apart from its skills: its task, alone and in EnvPool."""
+"""The half-cheetah of ``shuttle``: its task, alone and in EnvPool.
+
+Stands alone because it is the environment, and the recipe has only skills.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A scripted policy, apart from learnt skills: it explores rooms until it sees a task."""
+"""A scripted policy that explores rooms until it sees a task.
+
+Stands alone because it is a policy, and the recipe has only skills.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The mazes of the recipe ``mazes``, apart from its skills: PointMaze, alone and in EnvPool."""
+"""The mazes of the recipe ``mazes``: PointMaze, alone and in EnvPool.
+
+Stands alone because it is the environment, and the recipe has only skills.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The page of a run on the hub, a text apart from its upload: a model card of the run's files."""
+"""The page of a run on the hub: a model card, written from the run's files.
+
+Stands alone because it only writes text; ``runs.hub`` uploads it.
+"""
 
 from __future__ import annotations
 

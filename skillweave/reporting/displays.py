@@ -1,4 +1,7 @@
-"""Displays of progress: bars on a terminal, a table in a notebook; apart from its content."""
+"""Displays of progress: bars on a terminal, a table in a notebook.
+
+Stands alone because it only draws; ``progress`` chooses what is shown, and when.
+"""
 
 from __future__ import annotations
 

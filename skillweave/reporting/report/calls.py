@@ -1,4 +1,7 @@
-"""The calls of a report's episodes as plain data, apart from words: timelines, choices."""
+"""The calls of a report's episodes as plain data: timelines, choices.
+
+Stands alone because it has no words; ``single`` writes the page.
+"""
 
 from __future__ import annotations
 

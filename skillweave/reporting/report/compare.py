@@ -1,4 +1,7 @@
-"""The report that compares runs: groups of seeds, with interquartile means and intervals."""
+"""The report that compares runs: groups of seeds, with interquartile means and intervals.
+
+Stands alone because it is a page of its own, beside the report of one run (``single``).
+"""
 
 from __future__ import annotations
 
