@@ -92,26 +92,9 @@ LEAVES: dict[str, set[str]] = {
         "named",
         "reading",
         "networks.config",
-        "algorithms.config_off_policy",
-        "algorithms.config_on_policy",
+        "algorithms.schedules",
     },
     "algorithms.schedules": {"errors", "types", "messages", "settings", "named"},
-    "algorithms.config_off_policy": {
-        "algorithms.schedules",
-        "errors",
-        "types",
-        "settings",
-        "named",
-        "networks.config",
-    },
-    "algorithms.config_on_policy": {
-        "algorithms.schedules",
-        "errors",
-        "types",
-        "settings",
-        "named",
-        "networks.config",
-    },
     "evolution.config": {
         "errors",
         "types",
@@ -292,6 +275,54 @@ def test_no_modules_import_one_another_also_for_types_alone() -> None:
         graph[module] = {name for name in found & NAMES if name != "skillweave"} - {module}
     del graph["skillweave"]
     assert circles(graph) == IN_A_CIRCLE
+
+
+UNEXPLAINED = {
+    "api.continuing",
+    "buffers.priorities",
+    "buffers.replay_storage",
+    "collecting.processes",
+    "collecting.skill_collector",
+    "collecting.source",
+    "collecting.start_policy",
+    "collecting.worker_process",
+    "hierarchy.budgets",
+    "hierarchy.fitting",
+    "hierarchy.select_best",
+    "training.joint_learner",
+    "training.periodic",
+    "training.reflex_tally",
+}
+"""Modules with one importer whose docstring gives no reason yet; the set may only shrink."""
+
+
+def lone_modules() -> dict[str, str]:
+    """Return the docstring of each module that exactly one other module imports.
+
+    A module that its package imports is public under the package's name. Algorithms and shipped
+    recipes are loaded by their names.
+    """
+    importers: dict[str, set[str]] = {}
+    packages = set()
+    for path in MODULES:
+        module, package = module_of(path), path.name == "__init__.py"
+        packages |= {module} if package else set()
+        for _, name in imported(path.read_text(), module, package):
+            importers.setdefault(name, set()).add(module)
+    return {
+        module: ast.get_docstring(ast.parse(path.read_text())) or ""
+        for path in MODULES
+        if (module := module_of(path)) not in packages
+        and len(importers.get(module, set()) - {module}) == 1
+        and not importers[module] <= packages
+        and not re.match(r"recipes\.[a-z]", module)
+    }
+
+
+def test_a_module_with_one_importer_says_why_it_stands_alone() -> None:
+    """Without a reason of its own, it belongs into the module that imports it."""
+    silent = {name for name, text in lone_modules().items() if "Stands alone because" not in text}
+    assert silent <= UNEXPLAINED
 
 
 def rows_of_table() -> dict[str, set[str]]:
