@@ -152,7 +152,8 @@ class Critics:
 
     def group(self) -> ParameterGroup:
         """Return the fields of a state that hold critics."""
-        weights, moments = ("critic", "critic_target"), ("critic_mu", "critic_nu")
+        weights = ("critic", "critic_target")
+        moments = ("critic_mu", "critic_nu")
         nets = (("critic", self.net),)
         return ParameterGroup(self.layout, nets, weights, moments, "critic_count")
 

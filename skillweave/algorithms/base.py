@@ -167,8 +167,10 @@ class Algorithm:
                 "does not follow schedules: give a number"
             )
         self.config = config
-        self.observation_space, self.action_space = observation_space, action_space
-        self.obs, self.codec = read_by(config, observation_space), action_codec(action_space)
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.obs = read_by(config, observation_space)
+        self.codec = action_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
     # Methods that an algorithm defines

@@ -36,7 +36,8 @@ class Compiled:
     ) -> None:
         from torch._dynamo import config as dynamo
 
-        self._function, self._sizes_vary = function, sizes_vary
+        self._function = function
+        self._sizes_vary = sizes_vary
         self._setting = f"{type(config).__name__}.compile"
         self._auto = config.compile == "auto"
         self._program: Callable[..., Any] | None = None

@@ -457,7 +457,8 @@ class Registration:
     """True if the algorithm can be chosen to act; False if it only serves others."""
 
 
-_SPACES, _HOME = gym.spaces, "skillweave.algorithms"
+_SPACES = gym.spaces
+_HOME = "skillweave.algorithms"
 _ANY = (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box)
 _REGISTERED: dict[str, Registration] = {
     "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY),

@@ -95,9 +95,11 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self, state: State, progress: float = 1.0, device: Device = "cpu"
     ) -> ActingParams:
         """Copy the part that acting needs, with ε."""
-        cfg, params = self.config, super().acting_params(state, progress, device)
+        cfg = self.config
+        params = super().acting_params(state, progress, device)
         spent = min(1.0, progress / max(cfg.exploration_fraction, 1e-9))
-        start, final = cfg.exploration_initial_eps, cfg.exploration_final_eps
+        start = cfg.exploration_initial_eps
+        final = cfg.exploration_final_eps
         eps = 0.0 if cfg.noisy else start + spent * (final - start)
         params.extra["epsilon"] = torch.full(
             (len(state.params), 1), eps, dtype=torch.float32, device=device
@@ -108,7 +110,8 @@ class DQNAlgorithm(OffPolicyAlgorithm):
         self, generators: Sequence[torch.Generator], steps: int, batch: int
     ) -> list[tuple[Tensor, Tensor | None]]:
         """Draw uniform numbers (P, batch, A + 1) and the weights' noise (P, K) for each step."""
-        shape, inner = (steps, batch, self.codec.size + 1), self.net.noise_size
+        shape = (steps, batch, self.codec.size + 1)
+        inner = self.net.noise_size
         uniform = torch.stack([torch.rand(shape, generator=g, **FLOAT) for g in generators], dim=1)
         if not inner:
             return [(u, None) for u in uniform]

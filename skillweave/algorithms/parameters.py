@@ -45,7 +45,8 @@ def epsilon_now(config: Any, progress: float, like: Tensor) -> Tensor | None:
     Args:
         like: (P,), gives the number of members and the device.
     """
-    first, last = config.epsilon, config.epsilon_final
+    first = config.epsilon
+    last = config.epsilon_final
     if max(first, last or 0.0) == 0.0:
         return None
     fallen = min(1.0, progress / max(config.epsilon_fraction, 1e-9))

@@ -27,7 +27,8 @@ class AgentPolicy(Memoryless):
     """A trained agent that acts; a copy, independent of further learning."""
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
-        self.algorithm, self.weights = algorithm, weights
+        self.algorithm = algorithm
+        self.weights = weights
         self.params = algorithm.acting_params_of(weights)
         self.observation_space = algorithm.observation_space
         self.action_space = algorithm.action_space

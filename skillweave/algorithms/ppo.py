@@ -89,7 +89,8 @@ class PPOAlgorithm(Algorithm):
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Create the state of fresh members, one for each seed."""
         params = torch.zeros(len(seeds), self.layout.size, **FLOAT)
-        views, generators = self.layout.views(params), self.member_generators(seeds)
+        views = self.layout.views(params)
+        generators = self.member_generators(seeds)
         self.actor_net.init_(views, 0.01, generators)
         # All values begin at 0. Until the first reward, a random critic's errors would be the only
         # advantages, and they could lead the policy away from that reward.
@@ -115,7 +116,8 @@ class PPOAlgorithm(Algorithm):
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return actions in policy units, their dist_params and recurrent state; see the base."""
-        inputs, views = self.inputs(params, obs), params.views
+        inputs = self.inputs(params, obs)
+        views = params.views
         if memory is None:
             dist_params = self.actor_net(views, inputs)
         else:
@@ -148,7 +150,8 @@ class PPOAlgorithm(Algorithm):
     def value(self, state: State, obs: Tensor, mask: Tensor | None = None) -> Tensor:
         """Return V in units of reward, (P, B); a recurrent state starts empty."""
         params = self.learning_params(state)
-        inputs, size = self.inputs(params, obs), self.critic_net.memory_size
+        inputs = self.inputs(params, obs)
+        size = self.critic_net.memory_size
         if not size:
             return self.in_rewards(state, self.critic_net(params.views, inputs))
         empty = state.params.new_zeros(*obs.shape[:2], size)
@@ -171,7 +174,8 @@ class PPOAlgorithm(Algorithm):
         # A compiled step makes its leaves itself; others share these.
         leaves = None if compiles else self.layout.leaves(state.params)
         learn = self._compiled if compiles else self.learn
-        active, all_learn = count > 0, not limited and samples.valid is None
+        active = count > 0
+        all_learn = not limited and samples.valid is None
         for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
             report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
             steps = steps + active
@@ -242,9 +246,12 @@ class PPOAlgorithm(Algorithm):
         raw, _ = self.run(self.critic_net, views, batch.inputs, batch.memory, batch.starts)
         if batch.memory is not None:
             batch = batch.changed(lambda x: x.flatten(1, 2))
-        log_std, valid, acted = views.get("actor.log_std"), batch.valid, batch.own
+        log_std = views.get("actor.log_std")
+        valid = batch.valid
+        acted = batch.own
         log_prob, entropy = self.head.stats(dist_params, log_std, batch.mask, batch.action)
-        old, weight = batch.log_prob, batch.importance
+        old = batch.log_prob
+        weight = batch.importance
         policy = ppo_policy_loss(log_prob, old, batch.advantage, state.clip_coef, weight, acted)
         clip = self.config.clip_value
         bound = None if clip is None else torch.full_like(state.clip_coef, clip)
@@ -302,7 +309,8 @@ class Terms:
         """Return the terms of an update from this rollout."""
         progress = rollout.progress
         rate = rate_now(config, state.learning_rate, progress)
-        ent_coef, final = state.ent_coef, config.ent_coef_final
+        ent_coef = state.ent_coef
+        final = config.ent_coef_final
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
         return cls(rate, ent_coef, rollout.reference)
@@ -313,11 +321,14 @@ def samples_of(
     agent: PPOAlgorithm, state: State, rollout: Rollout, terms: Terms
 ) -> tuple[Samples, dict[str, Tensor]]:
     """Return the samples of a rollout that ``loss`` needs, and metrics (P,)."""
-    cfg, memory, starts = agent.config, rollout.recurrent_state, rollout.episode_start
+    cfg = agent.config
+    memory = rollout.recurrent_state
+    starts = rollout.episode_start
     if not agent.memory_size:
         memory = starts = None
     cells = Cells(rollout, all_cells=memory is not None)
-    obs, valid = cells.flat(rollout.obs), cells.flat_or_none(rollout.valid)
+    obs = cells.flat(rollout.obs)
+    valid = cells.flat_or_none(rollout.valid)
     agent.update_obs_stats(state, obs, valid)
     params = agent.learning_params(state)
     inputs = agent.inputs(params, obs)
@@ -326,15 +337,19 @@ def samples_of(
     raw, after = agent.run(agent.critic_net, params.views, inputs, memory, starts)
     value = agent.in_rewards(state, raw)
     following = next_values(agent, state, params, rollout, cells.grid(value), after)
-    reward, discount, last = rollout.reward, rollout.discount, rollout.last
+    reward = rollout.reward
+    discount = rollout.discount
+    last = rollout.last
     grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
     advantage = cells.flat(grid)
     returns = advantage + value
     metrics = {"explained_variance": explained_variance(value, returns, valid)}
     if cfg.normalize_returns:
         agent.update_return_stats(state, returns, valid)
-    mean, scale = state.return_mean, state.return_scale
-    action, mask = cells.flat(rollout.action), cells.flat_or_none(rollout.mask)
+    mean = state.return_mean
+    scale = state.return_scale
+    action = cells.flat(rollout.action)
+    mask = cells.flat_or_none(rollout.mask)
     # Clipping and KL refer to the current policy, even if an older one, or one with epsilon, acted.
     # With a high epsilon, a ratio of mixtures would let the policy collapse within the clip,
     # because the policy can change only a share of 1 − epsilon of the mixture.
@@ -357,7 +372,9 @@ def samples_of(
     )
     if memory is not None:
         samples = samples.changed(cells.unflat)
-        samples.inputs, samples.memory, samples.starts = inputs, memory, starts
+        samples.inputs = inputs
+        samples.memory = memory
+        samples.starts = starts
     return samples, metrics
 
 
@@ -378,7 +395,8 @@ def _reference(agent: PPOAlgorithm, terms: Terms, rollout: Rollout, cells: Cells
         return None
     if terms.reference.params is None:
         return cells.flat_or_none(rollout.guide)
-    params, recurrent = terms.reference.params, bool(agent.memory_size)
+    params = terms.reference.params
+    recurrent = bool(agent.memory_size)
     inputs = agent.inputs(params, cells.flat(rollout.obs))
     if recurrent:
         inputs = {k: cells.unflat(v) for k, v in inputs.items()}

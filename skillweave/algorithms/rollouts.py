@@ -139,7 +139,8 @@ def minibatches(
     """
     recurrent = samples.memory is not None
     rows = samples.changed(lambda x: x.transpose(1, 2)) if recurrent else samples
-    size, device = rows.advantage.shape[1], rows.advantage.device
+    size = rows.advantage.shape[1]
+    device = rows.advantage.device
     parts = min(size, max(1, round(samples.most / batch_size)))
     for _ in range(epochs):
         order = torch.stack([torch.randperm(size, generator=g, device="cpu") for g in rng]).to(

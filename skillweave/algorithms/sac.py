@@ -65,7 +65,8 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self.head = ActionHead(self.codec, "state")
         self.net = Net("actor", self.obs, config.network, self.head.width)
         self.layout = self.acting = Layout(self.net.shapes)
-        size, discrete = self.codec.size, self.codec.discrete
+        size = self.codec.size
+        discrete = self.codec.discrete
         critic = config.critic or config.network
         self.critics = Critics(self.obs, critic, size if discrete else 1, 0 if discrete else size)
         default = 0.5 * math.log(size) if discrete else -float(size)
@@ -115,7 +116,8 @@ class SACAlgorithm(ActorCriticAlgorithm):
         For continuous actions, Q of the greedy action plus ``squashed_entropy``.
         """
         params = self.learning_params(state)
-        inputs, alpha = self.inputs(params, obs), self.alpha(state)
+        inputs = self.inputs(params, obs)
+        alpha = self.alpha(state)
         head = self.net(params.views, inputs)
         if self.codec.discrete:
             q = self.smallest(state.critic, inputs)
@@ -146,8 +148,10 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self, state: State, sample: Sample, params: ActingParams, noise: list[Tensor]
     ) -> Tensor:
         """Return ``r + discount·V̄(s′)``, V̄ the soft value of the slow critics (eq. 5), (P, B)."""
-        inputs, alpha = self.inputs(params, sample.next_obs), self.alpha(state)
-        head, slow = self.net(self.layout.views(state.params), inputs), state.critic_target
+        inputs = self.inputs(params, sample.next_obs)
+        alpha = self.alpha(state)
+        head = self.net(self.layout.views(state.params), inputs)
+        slow = state.critic_target
         if self.codec.discrete:
             log_p = masked_log_probs(head, sample.next_mask)
             value = expected_soft_value(log_p, self.smallest(slow, inputs), alpha)
@@ -185,10 +189,12 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self, state: State, sample: Sample, inputs: Inputs, rate: Tensor, noise: list[Tensor]
     ) -> None:
         """Take one gradient step of the actor and of a learnt temperature, in place."""
-        leaves, mask = self.layout.leaves(state.params), sample.mask
+        leaves = self.layout.leaves(state.params)
+        mask = sample.mask
         loss, entropy = self.policy_loss(leaves, state, mask, inputs, noise[-1:])
         self.step_(state, loss, leaves, rate)
-        state.policy_loss, state.entropy = loss.detach(), entropy
+        state.policy_loss = loss.detach()
+        state.entropy = entropy
         if self.config.learn_ent_coef:
             # d/d log α of −log α·(log π + H̄), as in the authors' code, not of −α·(…).
             slope = entropy - masked_entropy_target(self.target_entropy, mask)
@@ -199,7 +205,8 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self, views: Views, state: State, mask: Tensor | None, inputs: Inputs, noise: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return ``E[α·log π − min Q]`` (eq. 7) and the detached policy entropy, each (P,)."""
-        head, alpha = self.net(views, inputs), self.alpha(state)
+        head = self.net(views, inputs)
+        alpha = self.alpha(state)
         if self.codec.discrete:
             log_p = masked_log_probs(head, mask)
             with torch.no_grad():

@@ -63,7 +63,8 @@ def check_rate(config: Any) -> None:
 
     A function is replaced by its name, which leads to it.
     """
-    value, where = config.learning_rate, f"{type(config).__name__}.learning_rate"
+    value = config.learning_rate
+    where = f"{type(config).__name__}.learning_rate"
     if isinstance(value, str) or (callable(value) and not isinstance(value, Linear)):
         value = named(value, where)
         object.__setattr__(config, "learning_rate", value)
@@ -87,7 +88,8 @@ def scheduled(config: Any, remaining: float) -> float:
         DeclarationError: its function is not loaded, or raised, or did not return a finite number
             of at least 0.
     """
-    schedule, where = config.learning_rate, f"{type(config).__name__}.learning_rate"
+    schedule = config.learning_rate
+    where = f"{type(config).__name__}.learning_rate"
     if not callable(schedule):
         raise DeclarationError(
             f"{where} is {schedule!r}, a function of your own, and its code is not loaded: resume "

@@ -68,7 +68,8 @@ class SelfImitationAlgorithm(PPOAlgorithm):
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Create the state of fresh members, which have no kept row yet."""
-        lead, width = (len(seeds), self.config.imitation_rows), self.codec.size
+        lead = (len(seeds), self.config.imitation_rows)
+        width = self.codec.size
         action = self.codec.from_env(np.asarray(self.action_space.sample())[None])
         space: gym.Space[Any] = self.observation_space
         obs = to_tensor(np.zeros((1, *obs_shape(space)), obs_dtype(space)))[0]
@@ -106,7 +107,8 @@ class SelfImitationAlgorithm(PPOAlgorithm):
     def keep(self, state: State, rollout: Rollout) -> None:
         """Keep the rows of a rollout whose return exceeds the value, in place of the oldest."""
         cells = Cells(rollout, all_cells=False)
-        obs, mask = cells.flat(rollout.obs), cells.flat_or_none(rollout.mask)
+        obs = cells.flat(rollout.obs)
+        mask = cells.flat_or_none(rollout.mask)
         value = self.value(state, obs)
         if mask is None:
             mask = state.kept_mask.new_ones(*value.shape, self.codec.size)
@@ -118,8 +120,11 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         kept = torch.cat([good, state.kept], dim=1)
         latest = first_true(kept, state.kept.shape[1])
         rows = joined(new, state.rows).take(latest)
-        state.kept, state.kept_return = take_rows(kept, latest), rows.returns
-        state.kept_obs, state.kept_action, state.kept_mask = rows.obs, rows.action, rows.mask
+        state.kept = take_rows(kept, latest)
+        state.kept_return = rows.returns
+        state.kept_obs = rows.obs
+        state.kept_action = rows.action
+        state.kept_mask = rows.mask
 
     def imitate(
         self, state: State, rate: Tensor, rng: Sequence[torch.Generator]
@@ -131,7 +136,8 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         Args:
             rate: (P,), Adam's step size.
         """
-        cfg, leaves = self.config, self.layout.leaves(state.params)
+        cfg = self.config
+        leaves = self.layout.leaves(state.params)
         rows = state.rows
         with torch.no_grad():
             gain = (rows.returns - self.value(state, rows.obs)).clamp_min(0.0) * state.kept

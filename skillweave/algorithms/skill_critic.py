@@ -118,7 +118,8 @@ class SkillCriticAlgorithm(Algorithm):
         target = (returns - state.return_mean) / state.return_scale
         leaves = self.layout.leaves(state.params)
         inputs = self.inputs(self.learning_params(state), obs)
-        action, size = _valid(batch, batch.action), target.shape[1]
+        action = _valid(batch, batch.action)
+        size = target.shape[1]
         call_start = None
         if cfg.deciding:
             assert batch.call_start is not None
@@ -154,7 +155,8 @@ class SkillCriticAlgorithm(Algorithm):
         value = self._q(state, rollout.obs, rollout.action).view_as(rollout.reward)
 
         def at_ends(rows: Tensor) -> Tensor:
-            obs, action = rollout.next_obs.flatten(1, 2), rollout.action.flatten(1)
+            obs = rollout.next_obs.flatten(1, 2)
+            action = rollout.action.flatten(1)
             return self._q(state, take_rows(obs, rows)[:, None], take_rows(action, rows))
 
         following = values_after(value, rollout.last, at_ends)

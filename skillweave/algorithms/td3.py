@@ -60,7 +60,8 @@ class TD3Algorithm(ActorCriticAlgorithm):
         self.head = ActionHead(self.codec)
         self.net = Net("actor", self.obs, config.network, self.codec.size)
         self.layout = self.acting = Layout(self.net.shapes)
-        network, count = config.critic or config.network, 2 if config.twin else 1
+        network = config.critic or config.network
+        count = 2 if config.twin else 1
         self.critics = Critics(self.obs, network, 1, self.codec.size, count)
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
@@ -109,7 +110,8 @@ class TD3Algorithm(ActorCriticAlgorithm):
         inputs = self.inputs(params, sample.next_obs)
         action = self.net(self.layout.views(state.target), inputs).tanh()
         if noise:
-            std, bound = state.target_noise, state.target_noise_clip
+            std = state.target_noise
+            bound = state.target_noise_clip
             action = smoothed_action(action, noise[0], std[:, None, None], bound[:, None, None])
         value = self.smallest(state.critic_target, inputs, action)
         return td_target(self.rewards(state, sample), sample.discount, value)
