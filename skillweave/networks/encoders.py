@@ -101,7 +101,8 @@ class ImageEncoder:
     """A CNN that encodes one image of an observation."""
 
     def __init__(self, obs: ObsCodec, index: int, cnn: CNN | None, activation: Activation) -> None:
-        self._obs, self._index = obs, index
+        self._obs = obs
+        self._index = index
         channels, height, width = obs.images[index]
         self.cnn = cnn or _default_cnn(min(height, width))
         self._activation = ACTIVATIONS[activation]
@@ -225,7 +226,8 @@ class CellsEncoder:
         return torch.cat(features, -1)
 
     def _image(self, views: Views, i: int, image: Tensor) -> Tensor:
-        cell, last = image.flatten(2), self._last[i].on(image.device)
+        cell = image.flatten(2)
+        last = self._last[i].on(image.device)
         if cell.dtype != torch.uint8:  # may be below 0
             cell = cell.long().clamp(min=0)
         kind = torch.minimum(cell, last)

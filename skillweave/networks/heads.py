@@ -51,12 +51,14 @@ class ActionHead:
         std: Literal["parameter", "state"] = "parameter",
         squash: bool = False,
     ) -> None:
-        self.codec, self.squash = codec, squash and not codec.discrete
+        self.codec = codec
+        self.squash = squash and not codec.discrete
         self.std_in_head = std == "state" and not codec.discrete
         self.width = codec.size * (2 if self.std_in_head else 1)
         widest = max(codec.parts, default=0)
         # The columns of each part's logits (K, widest): parts of different sizes are padded.
-        rows, start = [], 0
+        rows = []
+        start = 0
         for n in codec.parts:
             rows.append([start + min(i, n - 1) for i in range(widest)])
             start += n
@@ -107,7 +109,8 @@ class ActionHead:
             mean, log_std = self.moments(head, log_std)
             return mean if noise is None else torch.addcmul(mean, log_std.exp(), noise)
         if self.codec.multi:
-            head, noise = self._parts(head), None if noise is None else self._spread(noise)
+            head = self._parts(head)
+            noise = None if noise is None else self._spread(noise)
         return head.argmax(-1) if noise is None else categorical_sample(head, noise)
 
     def stats(

@@ -39,7 +39,8 @@ class Net:
     def __init__(
         self, name: str, obs: ObsCodec, network: Network, outputs: int | None, extra: int = 0
     ) -> None:
-        self.name, self.network = name, network
+        self.name = name
+        self.network = network
         self.encoders: dict[str, Encoder] = {}
         self._vector = network.encoder is None and obs.size > 0
         if network.encoder is not None:
@@ -104,7 +105,8 @@ class Net:
         Returns:
             The output (P, B, out) and the recurrent state after it (P, B, M).
         """
-        rnn, name = self.network.rnn, f"{self.name}.rnn"
+        rnn = self.network.rnn
+        name = f"{self.name}.rnn"
         assert rnn is not None
         gates = project(views, name, self(views, inputs))
         memory = cell(views, name, rnn, gates, memory)
@@ -124,7 +126,8 @@ class Net:
         Returns:
             Outputs (P, T, B, out) and the recurrent state after each step (P, T, B, M).
         """
-        rnn, steps = self.network.rnn, starts.shape[1:]
+        rnn = self.network.rnn
+        steps = starts.shape[1:]
         assert rnn is not None
         x = self(views, {k: v.flatten(1, 2) for k, v in inputs.items()}).unflatten(1, steps)
         after = sequence(views, f"{self.name}.rnn", rnn, x, memory, starts)

@@ -92,7 +92,8 @@ class ModuleEncoder:
     def __call__(self, views: Views, inputs: Inputs) -> Tensor:
         """Map inputs to features (P, B, F), one member after another."""
         leaves = [part.read(self._obs, inputs) for part in self._parts]
-        members, device = leaves[0].shape[0], leaves[0].device
+        members = leaves[0].shape[0]
+        device = leaves[0].device
         constants = {k: value.on(device) for k, value in self._constants.items()}
         if torch.compiler.is_compiling():  # the module does not run, so it does not change
             module = self._template

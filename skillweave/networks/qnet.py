@@ -34,17 +34,21 @@ class QNet:
         dueling: bool = False,
         noisy: bool = False,
     ) -> None:
-        self.network, self._actions, self._atoms = network, actions, atoms
+        self.network = network
+        self._actions = actions
+        self._atoms = atoms
         self.streams: list[tuple[str, Network, int]] = []
         """Of a dueling network: name, hidden layers and outputs of each stream; else none."""
         if dueling:
-            trunk, last = replace(network, hidden=network.hidden[:-1]), network.hidden[-1:]
+            trunk = replace(network, hidden=network.hidden[:-1])
+            last = network.hidden[-1:]
             self.trunk = Net("q", obs, trunk, None)
             stream = replace(network, hidden=last)
             self.streams = [("value", stream, atoms), ("advantage", stream, actions * atoms)]
         else:
             self.trunk = Net("q", obs, network, actions * atoms)
-        self.shapes, self.encoders = dict(self.trunk.shapes), self.trunk.encoders
+        self.shapes = dict(self.trunk.shapes)
+        self.encoders = self.trunk.encoders
         for name, stream, outputs in self.streams:
             self.shapes |= mlp_shapes(name, self.trunk.width, stream, outputs)
         self._noisy = []
@@ -84,7 +88,8 @@ class QNet:
     def perturbed(self, views: Views, noise: Tensor) -> dict[str, Tensor]:
         """Return weights with factorised noise, from standard normal numbers (P, K)."""
         scaled = noise.sign() * noise.abs().sqrt()  # f(x) = sgn(x)·√|x|
-        weights, at = dict(views), 0
+        weights = dict(views)
+        at = 0
         for layer in self._noisy:
             n_in, n_out = self.shapes[f"{layer}.weight"]
             rows, columns = (

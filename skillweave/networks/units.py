@@ -118,7 +118,8 @@ def _encoder_units(
         onward: weights that read the features, and the features' first row in them.
     """
     cnn = encoder.cnn
-    count, last = cnn.channels[layer], layer == len(cnn.channels) - 1
+    count = cnn.channels[layer]
+    last = layer == len(cnn.channels) - 1
 
     def own(*names: str) -> tuple[Part, ...]:
         filters = tuple(Part(f"{prefix}.{n}.weight", -4) for n in names)
@@ -130,7 +131,8 @@ def _encoder_units(
     after = tuple(Part(name, -2, start, encoder.size // count) for name, start in onward)
     if cnn.kind == "plain":
         return [Units(count, own(str(layer)), after if last else read(str(layer + 1)))]
-    s, after = layer, after if last else read(f"{layer + 1}.in")
+    s = layer
+    after = after if last else read(f"{layer + 1}.in")
     return [  # the channels through the whole stage, and those within each of its blocks
         Units(count, own(f"{s}.in", f"{s}.0.1", f"{s}.1.1"), read(f"{s}.0.0", f"{s}.1.0") + after),
         Units(count, own(f"{s}.0.0"), read(f"{s}.0.1")),
