@@ -103,7 +103,8 @@ class _ClampInward(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        (x,), (low, high) = ctx.saved_tensors, ctx.bounds
+        (x,) = ctx.saved_tensors
+        (low, high) = ctx.bounds
         # A gradient step moves against the gradient.
         outward = ((x < low) & (grad > 0.0)) | ((x > high) & (grad < 0.0))
         return grad.masked_fill(outward, 0.0), None, None

@@ -79,7 +79,8 @@ def merge_moments(
     if valid is None:
         batch_var, batch_mean = torch.var_mean(batch, dim=1, unbiased=False)
     else:
-        counts, n = valid[..., None], valid.sum(1).to(count.dtype)
+        counts = valid[..., None]
+        n = valid.sum(1).to(count.dtype)
         rows = n.clamp_min(1.0)[:, None]
         batch_mean = torch.where(counts, batch, 0.0).sum(1) / rows
         away = (batch - batch_mean[:, None]).square()

@@ -66,7 +66,8 @@ def adam_(
         eps: keeps the division from 0.
         active: (P,) bool; members at False do not change.
     """
-    state, betas = (params, grad, mu, nu, count), (beta1, beta2)
+    state = (params, grad, mu, nu, count)
+    betas = (beta1, beta2)
     if _can_be_fused(state):
         _fused_(state, learning_rate, betas, eps, active)
     else:
@@ -93,7 +94,8 @@ def _fused_(
     """Take the step with torch's own operation, which reads and writes everything once."""
     *tensors, count = state
     members = list(range(len(count))) if active is None else active.nonzero()[:, 0].tolist()
-    rates, by_rate = learning_rate.expand(len(count)).tolist(), defaultdict(list)
+    rates = learning_rate.expand(len(count)).tolist()
+    by_rate = defaultdict(list)
     for i in members:
         by_rate[rates[i]].append(i)
     count.add_(1 if active is None else active)

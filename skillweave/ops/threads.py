@@ -37,7 +37,8 @@ class WorkThread:
     """
 
     def __init__(self, name: str, threads: int) -> None:
-        self._name, self._threads = name, threads
+        self._name = name
+        self._threads = threads
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
 
