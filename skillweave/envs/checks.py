@@ -93,7 +93,9 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not isinstance(env, gym.Env):
             raise EnvError(f"{name} made {short(env)}, which is no environment (no gymnasium.Env)")
         super().__init__(env)
-        self._name, self._number, self._elapsed = name, number, 0
+        self._name = name
+        self._number = number
+        self._elapsed = 0
         for kind in ("observation_space", "action_space"):
             space = getattr(env, kind, None)
             if not isinstance(space, gym.Space):
@@ -160,7 +162,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def _look_for_masks(self, info: dict[str, Any]) -> None:
         """Give a notice where a key or attribute that is not used looks like an action mask."""
-        space, actions = self.env.observation_space, self.env.action_space
+        space = self.env.observation_space
+        actions = self.env.action_space
         if not self._chooses or self._masks is not None or MASK in info:
             return
         if observes_mask(space, actions):
@@ -321,7 +324,9 @@ class Watch:
     """
 
     def __init__(self, name: str, space: gym.Space[Any], num_envs: int, first: int = 0) -> None:
-        self._name, self._num_envs, self._first = name, num_envs, first
+        self._name = name
+        self._num_envs = num_envs
+        self._first = first
         self._places = tuple(_numbers_in(space))
         self._elapsed = np.zeros(num_envs, np.int64)
         self._coarse_noticed = first != 0  # only the first of several gives notices
@@ -363,7 +368,8 @@ class Watch:
             part = obs
             for name in place:
                 part = part[name]
-            coarse, real = part.dtype.itemsize > 4, part.dtype.kind == "f"
+            coarse = part.dtype.itemsize > 4
+            real = part.dtype.kind == "f"
             if not real and self._coarse_noticed:
                 continue
             size = np.abs(part) if coarse or not real else part
@@ -447,7 +453,8 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
         )
     if not isinstance(space, gym.spaces.Box):
         return lambda obs: _holds(space, obs)
-    shape, dtype = obs_shape(space), np.dtype(space.dtype)
+    shape = obs_shape(space)
+    dtype = np.dtype(space.dtype)
 
     def fits(obs: Any) -> bool:
         if type(obs) is np.ndarray and obs.dtype == dtype:

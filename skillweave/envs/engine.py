@@ -124,7 +124,8 @@ class GymnasiumEngine:
     def __init__(self, make: Any, num_envs: int, name: str, first: int = 0) -> None:
         makers = [functools.partial(make, number=first + i) for i in range(num_envs)]
         self._envs = SyncEnvs(makers, name)
-        self.num_envs, self.steps_made = num_envs, 0
+        self.num_envs = num_envs
+        self.steps_made = 0
         self.observation_space: gym.Space[Any] = self._envs.observation_space
         self.action_space: gym.Space[Any] = self._envs.action_space
         self.time_limit = time_limit(self._envs.envs[0])
@@ -132,7 +133,8 @@ class GymnasiumEngine:
             self.action_space, num_envs, observation_space=self.observation_space
         )
         self._watch = Watch(name, self.observation_space, num_envs, first)
-        self._name, self._draws = name, GlobalDraws(LOOKS if are_collected() else 0)
+        self._name = name
+        self._draws = GlobalDraws(LOOKS if are_collected() else 0)
         empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
         self._all = np.arange(num_envs)
         self._root = 0
@@ -142,7 +144,8 @@ class GymnasiumEngine:
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
-        self._root, self._episode[:] = seed, 0
+        self._root = seed
+        self._episode[:] = 0
         return self.reset_some(self._all)
 
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
@@ -177,9 +180,11 @@ class GymnasiumEngine:
             if not ((numbers >= 0) & (numbers <= most)).all():
                 raise ValueError(f"{name} is out of its range")
         self._root = int(state["root"][0])
-        self._episode, self._seed = state["episode"].copy(), state["seed"].copy()
+        self._episode = state["episode"].copy()
+        self._seed = state["seed"].copy()
         self._history.load(state)
-        obs, early = self._begin(self._all), [np.zeros(0, np.int64)]
+        obs = self._begin(self._all)
+        early = [np.zeros(0, np.int64)]
         for _, ids, action in self._history.play():
             if len(ids):
                 raw = self._act(action, ids)
@@ -260,10 +265,8 @@ class SyncEnvs:
             raise
         self.observation_space = self.envs[0].observation_space
         self.action_space = self.envs[0].action_space
-        self._dtype, self._shape = (
-            obs_dtype(self.observation_space),
-            obs_shape(self.observation_space),
-        )
+        self._dtype = obs_dtype(self.observation_space)
+        self._shape = obs_shape(self.observation_space)
         self._parts = self._dtype.names is not None
         self._over = np.zeros(len(self.envs), bool)  # True where the episode has ended
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
@@ -295,7 +298,9 @@ class SyncEnvs:
         n = len(ids)
         obs = self._empty(n)
         infos: list[dict[str, Any]] = []
-        reward, terminated, truncated = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        reward = np.zeros(n)
+        terminated = np.zeros(n, bool)
+        truncated = np.zeros(n, bool)
         # A row without axes is a NumPy scalar, which a Box does not contain.
         each = action.tolist() if self._discrete else map(np.asarray, action)
         for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):

@@ -40,10 +40,13 @@ class EnvPoolEngine:
     def __init__(
         self, make: MakePool, name: str, num_envs: int, threads: int, spaces: gym.Env[Any, Any]
     ) -> None:
-        self._make, self._threads = make, min(threads, num_envs)
-        self.num_envs, self.steps_made = num_envs, 0
+        self._make = make
+        self._threads = min(threads, num_envs)
+        self.num_envs = num_envs
+        self.steps_made = 0
         # EnvPool may state looser bounds; Gymnasium's are the reference (see `supports`).
-        self.observation_space, self.action_space = spaces.observation_space, spaces.action_space
+        self.observation_space = spaces.observation_space
+        self.action_space = spaces.action_space
         self.time_limit = time_limit(spaces)
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
         self._all = np.arange(num_envs)
@@ -93,8 +96,10 @@ class EnvPoolEngine:
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
-        self._root, self._made = seed, 1
-        self._pools, self._seeds = [self.make_pool(seed)], [seed]
+        self._root = seed
+        self._made = 1
+        self._pools = [self.make_pool(seed)]
+        self._seeds = [seed]
         self._place[:] = 0
         self._history.forget(self._all)
         return self._begin(self._all)
@@ -150,7 +155,8 @@ class EnvPoolEngine:
         self._history.load(state)
         self._pools = [self.make_pool(seed) for seed in self._seeds]
         obs = np.array(self._begin(self._all))
-        over, early = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
+        over = np.zeros(self.num_envs, bool)
+        early = np.zeros(self.num_envs, bool)
         for begins, ids, action in self._history.play():
             if len(begins):
                 obs[begins] = self._begin(begins)
@@ -158,7 +164,8 @@ class EnvPoolEngine:
             early |= over
             if len(ids):
                 raw = self._act(action, ids)
-                obs[ids], over[ids] = raw.next_obs, raw.terminated | raw.truncated
+                obs[ids] = raw.next_obs
+                over[ids] = raw.terminated | raw.truncated
         return obs, np.flatnonzero(early | over)
 
     def mask(self) -> Array | None:

@@ -79,7 +79,8 @@ class History:
         Raises:
             ValueError: it is not a history of N environments.
         """
-        length, begins = state["length"], state["begins"]
+        length = state["length"]
+        begins = state["begins"]
         fits = length.shape == self.length.shape and length.dtype.kind == "i"
         if not fits or length.min(initial=0) < 0 or length.sum() != len(state["action"]):
             raise ValueError("lengths and actions of the history do not belong together")

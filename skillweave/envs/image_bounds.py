@@ -68,7 +68,9 @@ class ImageBounds:
     """
 
     def __init__(self, name: str, space: gym.Space[Any]) -> None:
-        self._name, self._images, self._looks = name, list(_images_in(space)), LOOKS
+        self._name = name
+        self._images = list(_images_in(space))
+        self._looks = LOOKS
 
     def see(self, obs: Array) -> bool:
         """Check a batch of observations (n, *obs_shape); return whether to check more."""
@@ -91,7 +93,8 @@ class ImageBounds:
             so = "lie far beyond 1"
         elif image.is_beyond:
             unit = _unit(least)
-            has, so = f"values of {math.ceil(least / unit) * unit:g} and less", "lie far below 0"
+            has = f"values of {math.ceil(least / unit) * unit:g} and less"
+            so = "lie far below 0"
         else:
             unit = _unit(largest - least)
             low, high = math.floor(least / unit) * unit, math.ceil(largest / unit) * unit

@@ -208,7 +208,8 @@ class ActionMasks:
         now: Array | None = None,
         observation_space: gym.Space[Any] | None = None,
     ) -> None:
-        self._space, self._num_envs = space, num_envs
+        self._space = space
+        self._num_envs = num_envs
         self._observed = observation_space is not None and observes_mask(observation_space, space)
         self._parts = action_codec(space).parts if isinstance(space, DISCRETE) else ()
         self.now = now

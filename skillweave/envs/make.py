@@ -200,7 +200,8 @@ class EnvSpec:
             if entry is not None and entry.entry_point is None and entry.vector_entry_point:
                 raise refuse_batched(env_id) from error
             others = gym.registry.keys() - {env_id}
-            why, advice = shortened(str(error)).rstrip("."), close_matches(env_id, others)
+            why = shortened(str(error)).rstrip(".")
+            advice = close_matches(env_id, others)
             if not advice and ":" not in env_id:
                 advice = (
                     " If another package registers it, install and import that package, or write "
@@ -365,7 +366,8 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:
     """Measure the seconds of a random step: the least of several means, to exclude load."""
-    space, rng = env.observation_space, np.random.default_rng(0)
+    space = env.observation_space
+    rng = np.random.default_rng(0)
     masks = ActionMasks(env.action_space, 1, observation_space=space)
     discrete = isinstance(env.action_space, gym.spaces.Discrete)
     means = []
@@ -377,12 +379,15 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
 
     see(*env.reset(seed=0))
     for _ in range(PIECES):
-        spent, steps, until = 0.0, 0, time.perf_counter() + PIECE_SECONDS
+        spent = 0.0
+        steps = 0
+        until = time.perf_counter() + PIECE_SECONDS
         while steps == 0 or (steps < STEPS and time.perf_counter() < until):
             action = random_actions(env.action_space, 1, rng, masks.now)[0]
             began = time.perf_counter()
             obs, _, terminated, truncated, info = env.step(int(action) if discrete else action)
-            spent, steps = spent + time.perf_counter() - began, steps + 1
+            spent += time.perf_counter() - began
+            steps += 1
             see(obs, info, terminated or truncated)
             if terminated or truncated:
                 see(*env.reset())
