@@ -97,7 +97,8 @@ def _channels_last(a: int, b: int, c: int) -> bool | None:
         return False
     if a == c:
         return None
-    channels, longer = min(a, c), max(a, c)
+    channels = min(a, c)
+    longer = max(a, c)
     side = min(b, longer)
     if channels > 4:
         return c < a if side >= max(_PICTURE, 2 * channels) else None
@@ -173,8 +174,10 @@ class ObsCodec:
             lead = obs.shape[: obs.ndim - len(self.item)]
             raw: Sequence[Tensor] = [leaf.read(obs) for leaf in self.leaves]
         else:
-            lead, raw = obs[0].shape[: obs[0].ndim - len(self.leaves[0].shape)], obs
-        vectors, images = [], []
+            lead = obs[0].shape[: obs[0].ndim - len(self.leaves[0].shape)]
+            raw = obs
+        vectors = []
+        images = []
         for leaf, x in zip(self.leaves, raw, strict=True):
             if leaf.image is None:
                 vectors.append(leaf.vector(x, lead))
@@ -232,7 +235,8 @@ class PixelScale:
         low, high = low.astype(np.float64), high.astype(np.float64)
         span = np.where(high > low, high - low, 1.0)
         self._same = bool((low == low.flat[0]).all() and (span == span.flat[0]).all())
-        self._low, self._span = float(low.flat[0]), float(span.flat[0])
+        self._low = float(low.flat[0])
+        self._span = float(span.flat[0])
         self._each = {
             torch.device("cpu"): tuple(
                 torch.from_numpy(np.asarray(x, np.float32)) for x in (low, span)
@@ -320,7 +324,8 @@ def _leaves(
             field, at = dtype.fields[name][:2]
             yield from _leaves(part, field.base, (offset or 0) + at, (*names, name))
         return
-    shape, place = obs_shape(space), None
+    shape = obs_shape(space)
+    place = None
     if offset is not None:
         place = slice(offset, offset + int(np.prod(shape)) * dtype.itemsize)
     choices, start = _choices(space)

@@ -105,7 +105,8 @@ def _unsupported(space: gym.Space[Any], whole: gym.Space[Any], place: tuple[str,
     if place:
         what = f"the part {'.'.join(place)} of the observation space, {shown},"
     begin = f"{what} is not supported; supported are: {OBSERVATIONS}. "
-    wrap, inner = "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.{},))", parts(whole) or {}
+    wrap = "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.{},))"
+    inner = parts(whole) or {}
     others = [name for name in inner if name != place[0] and _is_supported(inner[name])]
     if others and isinstance(whole, gym.spaces.Dict):
         return begin + f"Leave it out: {wrap.format(f'FilterObservation(env, {others})')}"

@@ -103,7 +103,8 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
             discrete = {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
             return discrete | _dtype_to_json(space)
         case gym.spaces.MultiDiscrete():
-            nvec, start = space.nvec.tolist(), np.asarray(space.start).tolist()
+            nvec = space.nvec.tolist()
+            start = np.asarray(space.start).tolist()
             return {"type": "MultiDiscrete", "nvec": nvec, "start": start} | _dtype_to_json(space)
         case gym.spaces.MultiBinary():
             n = space.n if isinstance(space.n, int) else list(space.shape)
@@ -138,7 +139,8 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
         case "Tuple":
             return gym.spaces.Tuple([space_from_json(part) for part in data["spaces"]])
         case "Box":
-            shape, dtype = tuple(data["shape"]), np.dtype(data["dtype"])
+            shape = tuple(data["shape"])
+            dtype = np.dtype(data["dtype"])
             if dtype.kind not in "biuf":
                 raise ValueError(f"numbers of type {dtype}")
             with np.errstate(over="raise"):
