@@ -188,7 +188,8 @@ class Automaton(ReadySelector):
             wanted = last.succeeded if event == "success" else ~last.succeeded
             happened: Array = (last.why != CallEnd.RUNNING) & wanted
             return happened
-        name, n = function_name(event), len(step.reward)
+        name = function_name(event)
+        n = len(step.reward)
         return answer(event, step, n, bool, self._who, name, step.elapsed)
 
     def _ends_of(self, pair: Any, event: Any) -> tuple[int, int]:

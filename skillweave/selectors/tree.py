@@ -62,7 +62,8 @@ class Condition:
             raise DeclarationError(
                 f"tree: a Condition is {short(function)}; it must be a function of observations"
             )
-        self.function, self.name = function, name or function_name(function)
+        self.function = function
+        self.name = name or function_name(function)
 
 
 @checked_names

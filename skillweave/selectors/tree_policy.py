@@ -133,8 +133,11 @@ class _Tick:
     """One evaluation of the tree for n environments, at a decision."""
 
     def __init__(self, obs: Array, mask: Array, memory: Memory, who: str) -> None:
-        self.obs, self.mask, self.who = obs, mask, who
-        self.leaf, self.succeeded = memory["leaf"].copy(), memory["succeeded"]
+        self.obs = obs
+        self.mask = mask
+        self.who = who
+        self.leaf = memory["leaf"].copy()
+        self.succeeded = memory["succeeded"]
         self.before = memory["child"].copy()
         # Zeros: nodes that this evaluation does not reach are no longer running.
         self.after = np.zeros_like(self.before)
@@ -159,7 +162,8 @@ class _Leaf:
         starts = tick.mask[rows, self.skill]
         status[fresh] = np.where(starts[fresh], Status.RUNNING, Status.FAILURE)
         begins = rows[fresh & starts]
-        tick.leaf[begins], tick.skill[begins] = self.number, self.skill
+        tick.leaf[begins] = self.number
+        tick.skill[begins] = self.skill
         return status
 
 
@@ -169,7 +173,8 @@ class _Check:
 
     def tick(self, tick: _Tick, rows: Array) -> Array:
         """Return the condition's status for the observations."""
-        function, name = self.condition.function, self.condition.name
+        function = self.condition.function
+        name = self.condition.name
         holds = answer(function, tick.obs[rows], len(rows), bool, tick.who, name)
         return np.where(holds, Status.SUCCESS, Status.FAILURE)
 
