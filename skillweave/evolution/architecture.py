@@ -90,7 +90,8 @@ def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> 
 
 def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> list[Change]:
     """Return changes of kernels by a pixel that keep the size of every layer's output."""
-    obs, found = member.algorithm(spaces).obs, []
+    obs = member.algorithm(spaces).obs
+    found = []
     low, high = mutations.kernels
     for layer, kernel in enumerate(cnn.kernels):
         for by in (1, -1):
@@ -118,7 +119,8 @@ def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
 
 def _fits(config: AlgorithmConfig, by: int, mutations: Mutations) -> bool:
     """Return whether a layer can be added or removed."""
-    network, fewest = config.network, mutations.layers[0]
+    network = config.network
+    fewest = mutations.layers[0]
     behind = len(network.hidden) - getattr(config, "dueling", False)
     if by < 0:
         return len(network.hidden) > fewest and behind > 1
@@ -161,7 +163,8 @@ def changed(network: Network, change: Change, cnn: CNN | None, dueling: bool) ->
 def rebuilt(member: Member, change: Change, spaces: Any, rng: np.random.Generator) -> Member:
     """Return the member after a change: settings, weights and moments."""
     old = member.algorithm(spaces)
-    cnn, dueling = _cnn(member, spaces), bool(getattr(old.config, "dueling", False))
+    cnn = _cnn(member, spaces)
+    dueling = bool(getattr(old.config, "dueling", False))
     networks: dict[str, Any] = {
         name: changed(network, change, cnn, dueling)
         for name, network in networks_of(old.config).items()
@@ -200,7 +203,8 @@ def _carried(
 def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
     """Return the changes of a network's parameters, one after another."""
     if change.kind == "layer":
-        joint, activation = joint_of(net), net.network.activation
+        joint = joint_of(net)
+        activation = net.network.activation
         if change.by > 0:
             return [lambda _: lambda v, m: growth.deepened(v, joint, activation, moments=m)]
         return [lambda _: lambda v, m: growth.shallower(v, joint, moments=m)] * (joint.depth > 1)

@@ -34,7 +34,8 @@ class FitnessEnvs:
 
     def score(self, policy: AgentPolicy, seeds: Seeds) -> float:
         """Return a policy's mean return of the episodes of these seeds; −inf if not finite."""
-        eval_envs, total = self._collector, self._episodes
+        eval_envs = self._collector
+        total = self._episodes
         returns = np.concatenate(
             [
                 episodes_of(

@@ -88,7 +88,8 @@ def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
             [before.expand(rows, -1), inner.flatten(1), after.expand(rows, -1)], dim=1
         )
         shape = [1] * old.ndim
-        shape[0], shape[part.axis] = rows, index.shape[1]
+        shape[0] = rows
+        shape[part.axis] = index.shape[1]
         found[part.name] = torch.take_along_dim(old, index.view(shape), dim=part.axis)
     return found
 

@@ -37,7 +37,8 @@ def mutate(
     else:
         changed = member
     if changed is member:
-        changed, kind = copy(member), "none"
+        changed = copy(member)
+        kind = "none"
     changes = difference(member.config, changed.config)
     return replace(changed, origin=Origin(member.number, kind, changes))
 
@@ -114,7 +115,8 @@ def _move_setting(member: Member, by: Mutations, rng: np.random.Generator) -> Me
     """Move one setting up or down; a whole number by at least one."""
     ranges = by.ranges_of(member.config, start=False)
     for name in rng.permutation(sorted(ranges)):
-        within, old = ranges[name], getattr(member.config, name)
+        within = ranges[name]
+        old = getattr(member.config, name)
         if old is None:
             continue
         sign = 1 if rng.random() < 0.5 else -1

@@ -58,8 +58,11 @@ class Part:
         count: int,
         first: int = 0,
     ) -> None:
-        self.spaces, self.row_steps = spaces_of(learning_task), learning_task.row_steps
-        self._seeds, self._first, each = seeds, first, config.num_envs
+        self.spaces = spaces_of(learning_task)
+        self.row_steps = learning_task.row_steps
+        self._seeds = seeds
+        self._first = first
+        each = config.num_envs
         self.replays = make_algorithm(config, *self.spaces).store == "replay"
         self.places: list[Collector] = []
         """The collectors in which members act: an heir continues its place's open episodes."""
@@ -111,7 +114,8 @@ class Part:
         first = spent = 0
         for i, group in enumerate(groups, self._first):
             stack = self._stack(group)
-            start, count = sum(m.steps for m in group), len(group)
+            start = sum(m.steps for m in group)
+            count = len(group)
             places = self.places[first : first + count]
             joined = self._together(places, [stack])
             end = train(
@@ -127,7 +131,8 @@ class Part:
             )
             parted(joined, places)
             self._unstack(stack, group)
-            spent, first = spent + end.steps - start, first + count
+            spent += end.steps - start
+            first += count
             _count(group, end.steps - start)
 
     def _train_side_by_side(
@@ -141,7 +146,8 @@ class Part:
         """Train all stacks at once from one store."""
         members = [m for group in groups for m in group]
         stacks = [self._stack(group) for group in groups]
-        start, count = sum(m.steps for m in members), len(members)
+        start = sum(m.steps for m in members)
+        count = len(members)
         self.store = self.store or self._make_store(members)
         learner = ReplayLearner(
             stacks, self.store, seeds, row_steps=self.row_steps, goes_on_at=start
@@ -183,7 +189,8 @@ class Part:
         return joined_from(places, engine, acting)
 
     def _make_store(self, members: Sequence[Member]) -> ReplayStore:
-        algorithm, count = members[0].algorithm(self.spaces), len(self.places)
+        algorithm = members[0].algorithm(self.spaces)
+        count = len(self.places)
         return store_of(algorithm, count * self.places[0].num_envs, count, shared=True)
 
     @property

@@ -43,7 +43,8 @@ class Population:
         seeds: Seeds,
         part: Part | Parts | None = None,
     ) -> None:
-        self.members, self.evolution = members, evolution
+        self.members = members
+        self.evolution = evolution
         self.spaces = spaces_of(learning_task)
         self.next_number = len(members)
         self.part = part or Part(learning_task, members[0].config, seeds, len(members))
@@ -58,7 +59,8 @@ class Population:
         part: Part | Parts | None = None,
     ) -> Population:
         """Create the first generation, each member with its own weights."""
-        members, spaces = [], spaces_of(learning_task)
+        members = []
+        spaces = spaces_of(learning_task)
         for i in range(evolution.population):
             settings = config
             if evolution.start == "random":
@@ -118,7 +120,8 @@ class Population:
             else:
                 child = replace(copy(parent), origin=Origin(parent.number, "goes on"))
             if heir.mutates or parent.number in places:
-                child.number, self.next_number = self.next_number, self.next_number + 1
+                child.number = self.next_number
+                self.next_number += 1
             places[child.number] = heir.parent
             members.append(child)
         self.members = [m for group in grouped(members, self.spaces) for m in group]

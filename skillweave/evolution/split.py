@@ -85,7 +85,8 @@ class Parts:
         self.tally = EpisodeTally()
         """The tally of logged keys of ``info``."""
         make = partial(_stationed, learning_task, _alone(config), seeds, self._bounds, episodes)
-        self._workers, self._closed = make_workers(make, parts, learning_task.name), False
+        self._workers = make_workers(make, parts, learning_task.name)
+        self._closed = False
 
     def train(
         self,
@@ -98,14 +99,16 @@ class Parts:
         """Train members until each has ``until`` steps; report ticks when all parts are done."""
         groups = self._divided(members)
         tasks = [Training(_sent(group), until, schedule_steps, seeds) for group in groups]
-        before, self.tally = 0, EpisodeTally()
+        before = 0
+        self.tally = EpisodeTally()
         for group, trained in zip(groups, self._workers.ask("train", tasks), strict=True):
             for steps, metrics in trained.ticks:
                 on_tick(before + steps, dict(metrics))
             self.tally.add(trained.tally)
             before += sum(trained.steps) - sum(m.steps for m in group)
             for member, state, steps in zip(group, trained.states, trained.steps, strict=True):
-                member.state, member.steps = type(member.state)(**_tensors(state)), steps
+                member.state = type(member.state)(**_tensors(state))
+                member.steps = steps
 
     def fitness(self, members: Sequence[Member], eval_envs: FitnessEnvs, seeds: Seeds) -> Array:
         """Return fitness as ``Part.fitness`` does, each part in its own environments."""
@@ -146,15 +149,18 @@ class StationedPart:
     """A part at its worker; arguments and results are plain data."""
 
     def __init__(self, part: Part, eval_envs: FitnessEnvs) -> None:
-        self._part, self._arena = part, eval_envs
+        self._part = part
+        self._arena = eval_envs
 
     def train(self, task: Training) -> Trained:
         """Train members."""
-        members, ticks = _received(task.members, self._part.spaces), list[Any]()
+        members = _received(task.members, self._part.spaces)
+        ticks = list[Any]()
         self._part.train(
             members, task.until, task.schedule_steps, task.seeds, lambda *tick: ticks.append(tick)
         )
-        states, steps = [_arrays(m.state) for m in members], [m.steps for m in members]
+        states = [_arrays(m.state) for m in members]
+        steps = [m.steps for m in members]
         return Trained(states, steps, ticks, self._part.tally)
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
@@ -188,7 +194,8 @@ def _stationed(
     number: int,
 ) -> StationedPart:
     seed_global_generators(seeds / "global" / number)
-    first, end = bounds[number], bounds[number + 1]
+    first = bounds[number]
+    end = bounds[number + 1]
     part = Part(learning_task, config, seeds, end - first, first)
     return StationedPart(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 

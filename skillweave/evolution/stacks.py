@@ -102,11 +102,13 @@ def join(
         name: _widest([getattr(m.config, name) for m in members])
         for name in networks_of(first.config)
     }
-    config, made = replace(key, **widest), {} if made is None else made
+    config = replace(key, **widest)
+    made = {} if made is None else made
     if config not in made:
         made[config] = make_algorithm(config, *spaces)
     algorithm = made[config]
-    wide, padded = algorithm.layouts(), []
+    wide = algorithm.layouts()
+    padded = []
     uneven = [
         f for f in algorithm.parameter_groups() if any(_count(m, f).ndim > 1 for m in members)
     ]

@@ -61,16 +61,21 @@ class EvolvingPopulation:
     schema: Any = Generation
 
     def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
-        self.stage, self.run, self.seeds = stage, stage.run, stage.seeds
+        self.stage = stage
+        self.run = stage.run
+        self.seeds = stage.seeds
         label = f"{stage.run.path}: stage {stage.name!r}"
         self.evolution = evolution_from_json(stage.entry["evolution"], label, selection)
-        self.config, self.budget, self.target = stage.config, stage.budget, stage.target
+        self.config = stage.config
+        self.budget = stage.budget
+        self.target = stage.target
         self.best: Best | None = None
         self.done = 0
         """The number of complete generations."""
         self.fitness_steps = 0
         """Environment steps of the latest measurement of fitness."""
-        self._open, self._where = ExitStack(), where
+        self._open = ExitStack()
+        self._where = where
 
     def open(self) -> None:
         """Create the environments of fitness measurements."""
@@ -99,7 +104,8 @@ class EvolvingPopulation:
 
     def _parts(self) -> Parts | None:
         """Return the parts at workers; None: members train in this process."""
-        parts, evolution = int(self.stage.entry.get("workers", 1)), self.evolution
+        parts = int(self.stage.entry.get("workers", 1))
+        evolution = self.evolution
         if parts <= 1:
             return None
         return Parts(
@@ -147,7 +153,8 @@ class EvolvingPopulation:
     @property
     def _good(self) -> bool:
         """Return whether the target is reached."""
-        target, best = self.target, self.best
+        target = self.target
+        best = self.best
         return target is not None and best is not None and best.fitness >= target.at_least
 
     def generation(self) -> None:
@@ -206,7 +213,8 @@ class EvolvingPopulation:
         The budget includes fitness measurements, which are assumed to take as many steps as the
         last one.
         """
-        left, members = self.evolution.generations - self.done, len(self.population.members)
+        left = self.evolution.generations - self.done
+        members = len(self.population.members)
         now = self.population.steps // members
         training = self.budget - spent - left * self.fitness_steps
         return now + max(1, training // (left * members)), now + max(1, training // members)
@@ -269,7 +277,8 @@ class EvolvingPopulation:
 
     def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
         """Restore the environments and their episodes from a checkpoint."""
-        population, saved = self.population, unprefixed("collector", tensors)
+        population = self.population
+        saved = unprefixed("collector", tensors)
         store = unprefixed("store", tensors)
         ids = resumed(self.log, lambda: population.resume(saved, store))
         self.log.tell_begun_anew(len(ids), population.part.num_envs)
@@ -277,7 +286,8 @@ class EvolvingPopulation:
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""
         where = str(self.run.path)
-        self.done, self.fitness_steps = at["generation"], at["fitness_steps"]
+        self.done = at["generation"]
+        self.fitness_steps = at["fitness_steps"]
         if best := at.get("best"):
             policy = AgentPolicy.from_file(unprefixed("best", tensors), best["policy"], where)
             self.best = Best(best["fitness"], best["number"], best["generation"], policy)
@@ -297,7 +307,8 @@ class EvolvingPopulation:
         """
         member = _member_from_json(entry)
         algorithm = make_algorithm(member.config, *self.spaces)
-        like, groups = algorithm.init([self.seeds]), algorithm.parameter_groups()
+        like = algorithm.init([self.seeds])
+        groups = algorithm.parameter_groups()
         member.state = state_from(tensors, like, where, groups, may_diverge=self.over)
         return member
 
