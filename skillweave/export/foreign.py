@@ -28,7 +28,8 @@ class _Module(nn.Module):
 
     def __init__(self, policy: TorchPolicy, masked: bool) -> None:
         super().__init__()
-        self.module, self.masked = policy.module, masked
+        self.module = policy.module
+        self.masked = masked
         self.spaces = policy.observation_space, policy.action_space
 
     def forward(self, *given: Tensor) -> Tensor:
@@ -100,8 +101,11 @@ def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
     weights = {w.name for w in model.graph.initializer}
     source = next(i for i in model.graph.input if i.name not in weights)
     output = next(o for o in model.graph.output if o.name == f"own.{policy.output}")
-    choices, noise = _choices(policy), _noise(policy, sampled)
-    obs, space, dtype = policy.observation_space, policy.action_space, _onnx_type
+    choices = _choices(policy)
+    noise = _noise(policy, sampled)
+    obs = policy.observation_space
+    space = policy.action_space
+    dtype = _onnx_type
     nodes = _Nodes(model.graph)
     seen = helper.make_node("Cast", ["obs"], [source.name], to=source.type.tensor_type.elem_type)
     real = output.type.tensor_type.elem_type in _REAL
@@ -134,7 +138,8 @@ class _Nodes:
     """Operations behind a file's own ones."""
 
     def __init__(self, graph: Any) -> None:
-        self.graph, self.added = graph, list[Any]()
+        self.graph = graph
+        self.added = list[Any]()
 
     def then(self, kind: str, *given: str | Array, out: str = "", **attributes: Any) -> str:
         """Add one operation on results of others and constants; return the name of its result."""
@@ -171,7 +176,8 @@ class _Nodes:
             return self.then("Greater", x, np.zeros(1, np.float32))
         if masked:
             x = self.then("Where", "mask", x, np.full((1, 1), -np.inf, np.float32))
-        best, first = [], 0
+        best = []
+        first = 0
         for n in action_codec(space).parts:
             part = self.then("Gather", x, np.arange(first, first + n), axis=1)
             best.append(self.then("ArgMax", part, axis=1, keepdims=1))

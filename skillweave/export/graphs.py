@@ -70,11 +70,14 @@ class _Acting(nn.Module):
 
     def __init__(self, policy: AgentPolicy, leaves: int, inputs: Graph) -> None:
         super().__init__()
-        self.policy, self.leaves, self.inputs = policy, leaves, inputs
+        self.policy = policy
+        self.leaves = leaves
+        self.inputs = inputs
 
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
         """Return the action in the environment's units, and the new memory if there is one."""
-        algorithm, left = self.policy.algorithm, list(given)
+        algorithm = self.policy.algorithm
+        left = list(given)
         obs: Any = [left.pop(0)[None] for _ in range(self.leaves)]
         mask = left.pop(0)[None] if self.inputs.choices else None
         memory = left.pop(0)[None] if self.inputs.memory else None
@@ -140,7 +143,8 @@ def worth_graph(critic: AgentPolicy, where: str) -> Graph:
 
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
     """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``."""
-    codec, space = algorithm.codec, algorithm.action_space
+    codec = algorithm.codec
+    space = algorithm.action_space
     shape = (1, *(space.shape or ()))
     dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
     if getattr(getattr(algorithm, "head", None), "squash", False):

@@ -35,7 +35,8 @@ class Runner:
 
     def reset(self) -> None:
         """Start a new episode."""
-        self.before, self.elapsed = dict[str, Any](), 0
+        self.before = dict[str, Any]()
+        self.elapsed = 0
         self.root.reset()
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
@@ -85,7 +86,8 @@ class _Code:  # a skill that is a function of observations; and what all parts h
     why = RUNNING  # no call of it has ended
 
     def __init__(self, runner: Runner, entry: Any) -> None:
-        self.runner, self.entry = runner, entry
+        self.runner = runner
+        self.entry = entry
 
     def reset(self) -> None: ...
     def observe(self, elapsed: int, timed_out: bool) -> None: ...
@@ -133,7 +135,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.critic = entry["critic"] and runner.made(entry["critic"])
 
     def reset(self) -> None:
-        self.skill, self.why, self.succeeded = -1, EPISODE, False
+        self.skill = -1
+        self.why = EPISODE
+        self.succeeded = False
         self.selector.reset()
         self.guide.reset()
 
@@ -145,7 +149,8 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         return may & np.array([policy.may_start().any() for policy in self.policies])
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        lengths, runner = self.entry["lengths"] or [np.inf], self.runner
+        lengths = self.entry["lengths"] or [np.inf]
+        runner = self.runner
         if self.why != RUNNING:
             may = self.guide.allowed(self.may_start()[None], self).repeat(len(lengths))
             if not may.any():
@@ -154,7 +159,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             if skill != self.skill:
                 self.policies[skill].reset()
             self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
-            self.skill, self.elapsed, self.why = skill, 0, RUNNING
+            self.skill = skill
+            self.elapsed = 0
+            self.why = RUNNING
         action = self.policies[self.skill].act(mask)
         for condition, code, fixed in self.entry["reflexes"]:
             if runner.asks(condition, runner.obs):
@@ -177,7 +184,8 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]
             self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
-        judge, self.succeeded = entry["success"], self.why == OWN
+        judge = entry["success"]
+        self.succeeded = self.why == OWN
         if judge and self.why != RUNNING:
             self.succeeded = runner.asks(judge, runner.step(*when))
         self.selector.watch(self, elapsed, timed_out)
@@ -206,7 +214,8 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
         return mask[0] & np.isin(np.arange(mask.shape[1]), self.entry["skills"][self.state])
 
     def watch(self, last: Any, *when: Any) -> None:
-        asks, step = self.runner.asks, self.runner.step
+        asks = self.runner.asks
+        step = self.runner.step
         ended = {"success": last.succeeded, "failure": not last.succeeded}
         for origin, target, event, code in self.entry["transitions"]:
             over = last.why != RUNNING and ended.get(event)

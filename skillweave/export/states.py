@@ -74,7 +74,9 @@ class States:
         return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
-        skills, cuts, selector = policy.skills, policy.skills.interruption, policy.selector
+        skills = policy.skills
+        cuts = policy.skills.interruption
+        selector = policy.selector
         samples = sampled or not skills.greedy_selector
         guide: Any = None if policy.guide is None else policy.guide.selector
         judged = any(
@@ -98,7 +100,8 @@ class States:
         return entry
 
     def _skill(self, skills: SkillSet, i: int, prefix: str, judged: bool) -> dict[str, Any]:
-        skill, name = skills.skills[i], prefix + skills.skills[i].name
+        skill = skills.skills[i]
+        name = prefix + skills.skills[i].name
 
         def method(name: str, what: str) -> str | None:
             if not skill.defines(name):
@@ -166,11 +169,14 @@ class States:
         )
 
     def _automaton(self, selector: Automaton, name: str) -> dict[str, Any]:
-        ranks, transitions = selector.ranks, []
+        ranks = selector.ranks
+        transitions = []
         for origin, target, event in selector.arrows:
-            ends, code = event, None
+            ends = event
+            code = None
             if callable(event):
-                ends, what = "", "a Step to (1,) bool"
+                ends = ""
+                what = "a Step to (1,) bool"
                 code = self._asks(f"{name}.{function_name(event)}", event, what)
             transitions.append([origin, target, ends, code])
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
