@@ -178,7 +178,8 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     else:
         whole = {e["name"] for e in run.manifest["stages"] if e["kind"] in WHOLE}
         wanted = {c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole}
-    before, parts = 0, list[tuple[int, dict[str, Curve]]]()
+    before = 0
+    parts = list[tuple[int, dict[str, Curve]]]()
     for entry in run.manifest["stages"]:
         if entry["name"] in wanted:
             parts.append((before, wanted[entry["name"]]))

@@ -98,7 +98,9 @@ class Shielded:
     """
 
     def __init__(self, display: Display) -> None:
-        self.every, self._display, self._draws = display.every, display, True
+        self.every = display.every
+        self._display = display
+        self._draws = True
 
     def put(self, row: Row) -> None:
         """Add or replace a row."""
@@ -133,7 +135,8 @@ class Bars:
     every = 0.25
 
     def __init__(self, bars: Any) -> None:
-        self._bars, self._tasks = bars, dict[tuple[str, str], Any]()
+        self._bars = bars
+        self._tasks = dict[tuple[str, str], Any]()
         bars.start()
 
     def put(self, row: Row) -> None:
@@ -166,7 +169,8 @@ class Cell:
     every = 0.5
 
     def __init__(self, transient: bool = False) -> None:
-        self._area, self._transient = Area(), transient
+        self._area = Area()
+        self._transient = transient
         self._rows: dict[tuple[str, str], Row] = {}
         self._messages: list[str] = []
 

@@ -59,7 +59,8 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
     Raises:
         RunError: the file is damaged.
     """
-    names, born = [f.name for f in fields(Born)], {}
+    names = [f.name for f in fields(Born)]
+    born = {}
     sorts: dict[str, str] = {}
     for entry in run.lineage.read():
         if entry["stage"] == stage:

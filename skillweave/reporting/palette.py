@@ -21,8 +21,12 @@ PALETTE: tuple[RGB, ...] = (
     (204, 121, 167),
     (135, 105, 255),
 )
-WHITE, BLACK = (255, 255, 255), (0, 0, 0)
-BAND, LINE = (28, 28, 32), (110, 110, 118)  # a caption's ground, and what parts it from the frame
+WHITE = (255, 255, 255)
+BLACK = (0, 0, 0)
+BAND = (28, 28, 32)
+"""The ground of a caption."""
+LINE = (110, 110, 118)
+"""The line between a frame and its caption."""
 OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
 """Colours that captions are made of."""
 

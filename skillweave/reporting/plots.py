@@ -12,7 +12,8 @@ from skillweave.reporting.palette import color_of
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.hub import must_be_own
 
-FAINT, TEXT = "#c9c9cf", "#4a4a52"
+FAINT = "#c9c9cf"
+TEXT = "#4a4a52"
 COMPLEMENT = ("gamma", "gae_lambda")
 """Settings that are drawn as their difference from one."""
 
@@ -33,11 +34,13 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtra("plotting", "plot") from error
-    folder, written = out or run.path / "plots", []
+    folder = out or run.path / "plots"
+    written = []
     must_be_own(folder)
     metrics = list(run.metrics())
     for i, stage in enumerate(run.manifest["stages"]):
-        name, color = stage["name"], _hex(i)
+        name = stage["name"]
+        color = _hex(i)
         if lineage := read_lineage(run, name):
             figure = draw_lineage(Figure, lineage, name, color)
         else:

@@ -220,7 +220,9 @@ class EpisodeProgress:
     """
 
     def __init__(self, episodes: int, *, quiet: bool = False, name: str = "evaluation") -> None:
-        self._episodes, self._quiet, self._name = episodes, quiet, name
+        self._episodes = episodes
+        self._quiet = quiet
+        self._name = name
         self._over = self._steps = 0
         self._display: Display | None = None
         self._tried = False
@@ -266,7 +268,8 @@ class EpisodeProgress:
 
     def _draw(self, now: float) -> None:
         assert self._display is not None
-        taken, share = now - self._begun, self._over / self._episodes
+        taken = now - self._begun
+        share = self._over / self._episodes
         left = f"{_clock(taken / share - taken)} left" if share else ""
         counted = f"{self._over:,} of {self._episodes:,} episodes"
         self._display.put(Row(self._name, share, counted, f"{self._steps:,} steps", left=left))

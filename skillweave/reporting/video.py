@@ -76,7 +76,8 @@ def render_policy(
         EnvError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
-    episodes, every = whole_number(episodes, "episodes", 1), whole_number(every, "every", 1)
+    episodes = whole_number(episodes, "episodes", 1)
+    every = whole_number(every, "every", 1)
     seed = whole_number(seed, "seed", 0)
     limit = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
     rng = rng or (Seeds(seed) / "render").numpy()
@@ -107,12 +108,16 @@ class _Film:
     def __init__(
         self, env: gym.Env[Any, Any], video: VideoWriter, every: int, label: Label
     ) -> None:
-        self.env, self.video, self.every, self.label = env, video, every, label
+        self.env = env
+        self.video = video
+        self.every = every
+        self.label = label
         self.episodes: list[dict[str, Any]] = []
         self._begin()
 
     def _begin(self) -> None:
-        self._elapsed, self._total = 0, 0.0
+        self._elapsed = 0
+        self._total = 0.0
         self._who = ""
         self._color = BLACK
         self._skills = Counter[str]()
@@ -210,10 +215,13 @@ def caption(
         frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
     height, width = frame.shape[:2]
     size = size or min(max(round(min(height / 22, width / 28)), 12), 40)
-    band, margin = round(1.8 * size), size // 2
+    band = round(1.8 * size)
+    margin = size // 2
     band += (height + band) % 2
     out = np.empty((height + band, width, 3), np.uint8)
-    out[:height], out[height], out[height + 1 :] = frame, LINE, BAND
+    out[:height] = frame
+    out[height] = LINE
+    out[height + 1 :] = BAND
     right = _text(text_right, size, WHITE, BAND)[:, : width - 2 * margin]
     room = width - 2 * margin - right.shape[1]
     _paste(out[height + 1 :], right, margin + room)
@@ -247,7 +255,8 @@ def _chip(text: str, color: RGB, size: int, width: int) -> Array:
     """Return a name on its colour, at most ``width`` pixels wide."""
     # Black and white contrast equally with a relative luminance of 0.18 (WCAG 2).
     luminance = (np.asarray(color) / 255) ** 2.2 @ (0.2126, 0.7152, 0.0722)
-    short, pad = text, size // 2
+    short = text
+    pad = size // 2
     while text and _font(size).getlength(short) > width - 2 * pad:
         text = text[:-1]
         short = f"{text}..." if text else ""

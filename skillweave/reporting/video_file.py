@@ -36,7 +36,8 @@ class VideoWriter:
     """
 
     def __init__(self, path: str | Path, fps: float, most_bits: int | None = None) -> None:
-        self.path, self.frames = Path(path), 0
+        self.path = Path(path)
+        self.frames = 0
         kinds: dict[str, Callable[[Path, float], _Gif | _Mp4]]
         kinds = {".gif": _Gif, ".mp4": partial(_Mp4, most_bits=most_bits)}
         kind = kinds.get(self.path.suffix.lower())
@@ -78,7 +79,9 @@ class _Mp4:
 
     def __init__(self, path: Path, fps: float, most_bits: int | None = None) -> None:
         self._ffmpeg = extra("imageio_ffmpeg").get_ffmpeg_exe()
-        self._path, self._fps, self._most_bits = path, fps, most_bits
+        self._path = path
+        self._fps = fps
+        self._most_bits = most_bits
         self._process: Any = None
 
     def add(self, frame: Array, seconds: float | None) -> None:
@@ -100,7 +103,8 @@ class _Mp4:
             self.close(complete=True)
 
     def close(self, complete: bool) -> None:
-        process, self._process = self._process, None
+        process = self._process
+        self._process = None
         complaint = process.communicate()[1] if process else b""
         if complete and process and process.returncode:
             raise RunError(f"ffmpeg could not write {self._path}: {complaint.decode()}")
@@ -112,9 +116,12 @@ class _Gif:
     CLEAR = 255  # the index that leaves a pixel as it is
 
     def __init__(self, path: Path, fps: float) -> None:
-        self._image, self._codec = extra("PIL.Image"), extra("PIL.GifImagePlugin")
-        self._file, self._fps = path.open("wb"), fps
-        self._due, self._written = 0.0, 0  # hundredths of a second
+        self._image = extra("PIL.Image")
+        self._codec = extra("PIL.GifImagePlugin")
+        self._file = path.open("wb")
+        self._fps = fps
+        self._due = 0.0  # hundredths of a second
+        self._written = 0  # hundredths of a second
         self._table: Any = None
         self._shown: Array = np.empty(0)  # (H, W) uint8
 

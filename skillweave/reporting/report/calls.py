@@ -18,7 +18,10 @@ from skillweave.types import Array
 MOST_COORDINATES = 16
 LARGEST_VECTOR = 64  # numbers of an observation; of a larger one (an image) none is a coordinate
 MOST_DECISIONS = 2_000
-MOST_CALLS, MOST_CALLS_OF_ONE = 6_000, 1_500  # on the page: of all episodes, and of each
+MOST_CALLS = 6_000
+"""The most calls on the page, of all episodes."""
+MOST_CALLS_OF_ONE = 1_500
+"""The most calls on the page, of one episode."""
 
 
 def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:

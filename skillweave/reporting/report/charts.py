@@ -102,7 +102,8 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
 def family_tree(lineage: Lineage, color: str) -> Spec:
     """Return a chart of fitness by generation, each member joined to its parent."""
     path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}
-    dots, lines = [], []
+    dots = []
+    lines = []
     for key, born in lineage.born.items():
         if born.fitness is None:
             continue

@@ -148,7 +148,8 @@ def interval(summary: OverSeeds, say: Say = number) -> str:
 
 def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) -> dict[str, Any]:
     """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
-    dots, bars = [], []
+    dots = []
+    bars = []
     for group, own in zip(groups, scores, strict=True):
         for run in group.runs:
             if (e := saved[run.path]) is not None:

@@ -107,7 +107,8 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     """Return a sentence for each unfinished stage; ``steps``: those of its last metrics."""
     found = []
     for entry in run.manifest["stages"]:
-        name, budget = entry["name"], entry["budget"]
+        name = entry["name"]
+        budget = entry["budget"]
         if entry["status"] == "waiting":
             found.append(f"The stage {name!r} has not begun.")
         elif entry["status"] == "training":

@@ -54,7 +54,10 @@ from skillweave.training.play import Played as PlayedStep
 from skillweave.training.skill_report import levels_of
 from skillweave.types import Policy
 
-EPISODES, FILMED = 20, 3
+EPISODES = 20
+"""Episodes that a report plays by default."""
+FILMED = 3
+"""Episodes that a report films by default."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ def play_episodes(
             progress.watch(played)
 
         score = evaluate(policy, spec, watch=watch, **how)
-    film, missing = None, []
+    film = None
+    missing = []
     if filmed:
         try:
             chosen = chosen_episodes(log.episodes, filmed)
@@ -154,7 +158,8 @@ def write_report(
         MissingExtra: the extra 'report' is not installed.
     """
     began = time.perf_counter()
-    episodes, seed = whole_number(episodes, "episodes", 1), whole_number(seed, "seed", 0)
+    episodes = whole_number(episodes, "episodes", 1)
+    seed = whole_number(seed, "seed", 0)
     filmed = whole_number(filmed, "films", 0)
     library()  # a missing extra is reported before anything is played
     must_be_own(path.parent)
@@ -304,7 +309,8 @@ def _how(whose: str, seed: int, deterministic: bool) -> str:
 
 def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
     """Return a section for each stage whose population evolved."""
-    sections, data["trees"] = [], []
+    sections = []
+    data["trees"] = []
     for entry in run.manifest["stages"]:
         lineage = read_lineage(run, entry["name"])
         if lineage is None:

@@ -11,8 +11,12 @@ from skillweave.training.skill_report import SkillReport, all_steps
 
 FEW = 5
 """With fewer episodes than these a mean has little meaning."""
-ALONE, SELDOM, WEAK = 0.95, 0.01, 0.5
-"""Shares: of steps of a skill that does nearly all, of one that does nearly nothing; of calls."""
+ALONE = 0.95
+"""The share of steps from which on one skill does nearly everything."""
+SELDOM = 0.01
+"""The share of steps below which a skill does nearly nothing."""
+WEAK = 0.5
+"""The share of successful calls below which a skill is weak."""
 
 
 def solved(score: Evaluation) -> int | None:
