@@ -121,7 +121,8 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
-        self.path, self.manifest = absolute(path), manifest
+        self.path = absolute(path)
+        self.manifest = manifest
         path = self.path
         self._metrics = JsonLines(path / "metrics.jsonl", MetricsLine, self._next_step)
         self.lineage = JsonLines(path / "lineage.jsonl", LineageLine, self._next_step)
@@ -411,7 +412,8 @@ class RunDirectory:
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
         """Write the policies of a finished stage; ``save`` then binds the files to the run."""
         self.check()
-        entry, sums = self.stage(stage), {}
+        entry = self.stage(stage)
+        sums = {}
         for name, policy in policies.items():
             tensors, header = policy.to_file()
             path = self.policy_path(stage, name)

@@ -144,7 +144,8 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
         RunError: it may not be written, it holds other files, or the hub does not answer.
         MissingExtra: the extra 'hub' is not installed.
     """
-    library, api = hub(), hub_api()
+    library = hub()
+    api = hub_api()
     with asking(api, name, writes=True):
         api.create_repo(name, private=private or None, exist_ok=True)
         info = api.model_info(name, timeout=SECONDS)

@@ -29,7 +29,9 @@ class JsonLines:
     def __init__(
         self, path: Path, schema: Any = None, next_step: Callable[[], str] | None = None
     ) -> None:
-        self.path, self._schema, self._next_step = path, schema, next_step
+        self.path = path
+        self._schema = schema
+        self._next_step = next_step
         self._file: Any = None
 
     @property

@@ -31,7 +31,8 @@ class Lock:
         Raises:
             RunError: another process holds it, or the directory cannot be written.
         """
-        self._directory, self._path = directory, directory / NAME
+        self._directory = directory
+        self._path = directory / NAME
         self.exclusive = False
         """True if the system excludes other processes."""
         self._open()

@@ -31,7 +31,8 @@ def make_numbered(name: str, below: Path) -> Path:
     Raises:
         RunError: it cannot be made.
     """
-    name, folder = safe_name(name), below / FOLDER
+    name = safe_name(name)
+    folder = below / FOLDER
     pattern = re.compile(rf"{re.escape(name)}-(\d+)")
     try:
         folder.mkdir(exist_ok=True)

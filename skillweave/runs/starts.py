@@ -52,7 +52,8 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
         RunError: the directory holds no run, a file is damaged, or the comparison at the end of
             learning together is still missing.
     """
-    run, learnt = RunDirectory.open(path), dict[str, Learnt]()
+    run = RunDirectory.open(path)
+    learnt = dict[str, Learnt]()
     if run.unjudged and all(entry["status"] == "done" for entry in run.manifest["stages"]):
         raise RunError(
             f"start_from: {path} was stopped during the comparison at its end; finish it first: "

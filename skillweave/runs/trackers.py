@@ -250,10 +250,8 @@ class MLflow:
         """Send waiting metrics in a thread of MLflow's, so training does not wait for an answer."""
         self._since = time.monotonic()
         while self._waiting:
-            batch, self._waiting = (
-                self._waiting[:MLFLOW_MOST_METRICS],
-                self._waiting[MLFLOW_MOST_METRICS:],
-            )
+            batch = self._waiting[:MLFLOW_MOST_METRICS]
+            self._waiting = self._waiting[MLFLOW_MOST_METRICS:]
             self._sent.append(self._client.log_batch(self._id, metrics=batch, synchronous=False))
 
     def close(self) -> None:
