@@ -171,7 +171,8 @@ def demo(command: commands.Demo) -> None:
     """
     if command.out.exists():
         raise RunError(f"{command.out} exists already: choose another folder (--out), or remove it")
-    started, shown = time.perf_counter(), Demo(command)
+    started = time.perf_counter()
+    shown = Demo(command)
     shown.lander()
     shown.mission()
     shown.say()

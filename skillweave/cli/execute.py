@@ -225,7 +225,8 @@ def run_lines(
     m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
 ) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
-    env, created = one_line(m["env"]), one_line(m["created"])
+    env = one_line(m["env"])
+    created = one_line(m["created"])
     lines = [f"{m['kind']} on {env}, seed {m['seed']}, made {created}"]
     calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
     calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
@@ -311,7 +312,8 @@ def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
 
 def free(path: Path) -> Path:
     """Return ``path``, or the first of path-2, path-3, … that does not exist."""
-    number, candidate = 1, path
+    number = 1
+    candidate = path
     while candidate.exists():
         number += 1
         candidate = path.with_name(f"{path.name}-{number}")

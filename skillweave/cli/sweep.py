@@ -114,7 +114,8 @@ def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     except OSError as error:
         raise RunError(f"could not write {out}: {error.strerror}") from error
     results: dict[Job, float | str] = {}
-    jobs, tasks = list[Job](), list[tuple[bytes, Job]]()
+    jobs = list[Job]()
+    tasks = list[tuple[bytes, Job]]()
     for settings, hierarchy in _hierarchies(command, choices):
         code = packed(hierarchy, command.recipe)
         must_be_same_code(out, command.recipe)  # each time, as the recipe was read again
@@ -160,7 +161,8 @@ def parse_seeds(text: str) -> list[int]:
 
 def parse_choices(each: Sequence[str]) -> list[tuple[str, ...]]:
     """Return all combinations of the values of ``--set-each``; without any, one empty one."""
-    names, options = set[str](), []
+    names = set[str]()
+    options = []
     for setting in each:
         name, sign, text = (part.strip() for part in setting.partition("="))
         values = [v.strip() for v in re.split(r",(?![^(\[]*[)\]])", text)]

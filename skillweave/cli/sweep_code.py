@@ -69,7 +69,8 @@ def code_files(recipe: Path) -> dict[str, Path]:
 
     Of a shipped recipe these are its parts.
     """
-    files, due = {"": recipe}, [(recipe, "")]
+    files = {"": recipe}
+    due = [(recipe, "")]
     while due:
         file, package = due.pop()
         if file.suffix != ".py":  # compiled
