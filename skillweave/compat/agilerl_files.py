@@ -112,7 +112,8 @@ class _Checkpoint(TypedDict):
 
 
 def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
-    kind, actor = _KINDS[algo], data["actor_init_dict"]
+    kind = _KINDS[algo]
+    actor = data["actor_init_dict"]
     critics = [data[k] for k in ("critic_state_dict", "critic_1_state_dict") if k in data]
     critics += [data[k] for k in ("critic_2_state_dict",) if k in data]
     names = {f.name for f in fields(kind)}

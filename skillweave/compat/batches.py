@@ -82,7 +82,8 @@ def sample_of(
 ) -> Sample:
     """Return B transitions as a sample; environment's actions, γ for all of their steps."""
     rewards = _tensor(reward, np.float32).view(1, -1)
-    size, shape = rewards.shape[1], algorithm.action_space.shape or ()
+    size = rewards.shape[1]
+    shape = algorithm.action_space.shape or ()
     units = algorithm.codec.from_env(np.asarray(action).reshape(size, *shape))
     return Sample(
         _rows(algorithm, obs)[None],

@@ -73,7 +73,8 @@ class NumpyActor:
     """
 
     def __init__(self, algorithm: Algorithm, state: Any) -> None:
-        self.algorithm, self.state = algorithm, state
+        self.algorithm = algorithm
+        self.state = state
         self._space: Any = algorithm.observation_space
         self._one_hot = not np.issubdtype(self._space.dtype, np.floating)
         family = algorithm.parameter_groups()[0]
@@ -136,7 +137,8 @@ class NumpyPPOActor(NumpyActor):
 
     def _drawn(self, head: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return actions, log-probabilities and entropies by torch, for all other action spaces."""
-        outputs, heads = torch.from_numpy(head), self.algorithm.head
+        outputs = torch.from_numpy(head)
+        heads = self.algorithm.head
         log_std = None if self._log_std is None else self._log_std[0]
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         noise = heads.noise([generator], 1, len(head))[0, 0]

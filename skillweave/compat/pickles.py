@@ -148,7 +148,8 @@ def check_program(program: bytes) -> None:
     stack: list[int] = []
     memo: dict[Any, int] = {}
     for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
-        name, taken = operation.name, operation.stack_before
+        name = operation.name
+        taken = operation.stack_before
         if step >= MOST_STEPS:
             raise RunError(f"its pickle has more than {MOST_STEPS:,} operations")
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
@@ -213,7 +214,8 @@ def _rebuilt(data: Any, inner: list[Any]) -> Any:
 class _Reader(pickle.Unpickler):
     def __init__(self, data: Any, file: zipfile.ZipFile, prefix: str) -> None:
         super().__init__(data, encoding="utf-8")
-        self._file, self._prefix = file, prefix
+        self._file = file
+        self._prefix = prefix
         self._storages: dict[tuple[str, torch.dtype], Tensor] = {}
         # Made again for each file: a pickle may set attributes of a class.
         self._inert = type("Inert", (Inert,), {})

@@ -43,7 +43,8 @@ class SingleAgent:
 
     def become(self, member: Member) -> None:
         """Continue as another member, for example a mutated one."""
-        self.member, self.learner = member, member.algorithm(self.spaces)
+        self.member = member
+        self.learner = member.algorithm(self.spaces)
         self.numpy_actor = self._make_numpy_actor()
 
     learner: Any
@@ -80,7 +81,8 @@ class SingleAgent:
             epsilon: probability that all actions are drawn uniformly instead.
             mask: (A,) or (B, A), allowed actions.
         """
-        rows, learner = self.numpy_actor.rows(obs), self.learner
+        rows = self.numpy_actor.rows(obs)
+        learner = self.learner
         allowed = None
         if mask is not None:
             allowed = torch.from_numpy(np.asarray(mask, bool).reshape(-1, learner.codec.size))

@@ -26,7 +26,9 @@ class Setting:
     """
 
     def __init__(self, field: str, inverse: bool = False, share: str | None = None) -> None:
-        self.field, self.inverse, self.share = field, inverse, share
+        self.field = field
+        self.inverse = inverse
+        self.share = share
 
     def __get__(self, agent: Agent | None, owner: type) -> Any:
         if agent is None:
@@ -51,7 +53,8 @@ class Agent:
     kind: ClassVar[type]
     getAction: Any
     get_action: Any
-    batch_size, gamma = Setting("batch_size"), Setting("gamma")
+    batch_size = Setting("batch_size")
+    gamma = Setting("gamma")
     mut: str | None
 
     def __init_subclass__(cls) -> None:
@@ -83,14 +86,16 @@ class Agent:
         self.device = given["device"]
 
     def _wrap(self, native: SingleAgent) -> None:
-        self.native, (seen, action_space) = native, native.spaces
+        self.native = native
+        (seen, action_space) = native.spaces
         self.scores: list[float] = []
         self.fitness: list[float] = []
         self.index = 0
         self.mut = None
         self.steps = [0]
         self.device = "cpu"
-        self.one_hot, self.discrete_actions = not seen.shape, not action_space.shape
+        self.one_hot = not seen.shape
+        self.discrete_actions = not action_space.shape
         self.state_dim = seen.shape or (int(seen.n),)
         self.action_dim = int(action_space.shape[0] if action_space.shape else action_space.n)
 
@@ -143,7 +148,8 @@ class Agent:
         agent.device = device
         return agent
 
-    save_checkpoint, load_checkpoint = saveCheckpoint, loadCheckpoint
+    save_checkpoint = saveCheckpoint
+    load_checkpoint = loadCheckpoint
 
 
 def random_seed() -> int:

@@ -14,10 +14,12 @@ from skillweave.types import Array
 class PPO(Agent):
     """A PPO agent."""
 
-    algo, kind = "PPO", config.PPO
+    algo = "PPO"
+    kind = config.PPO
     lr, gae_lambda, clip_coef = map(Setting, ("learning_rate", "gae_lambda", "clip_coef"))
     ent_coef, vf_coef, max_grad_norm = map(Setting, ("ent_coef", "vf_coef", "max_grad_norm"))
-    target_kl, update_epochs = Setting("target_kl"), Setting("update_epochs")
+    target_kl = Setting("target_kl")
+    update_epochs = Setting("update_epochs")
     action_std_init = Setting("action_std_init")
 
     def __init__(
@@ -72,9 +74,12 @@ class PPO(Agent):
 class DQN(Agent):
     """A DQN agent."""
 
-    algo, kind = "DQN", config.DQN
-    lr, double = Setting("learning_rate"), Setting("double")
-    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
+    algo = "DQN"
+    kind = config.DQN
+    lr = Setting("learning_rate")
+    double = Setting("double")
+    tau = Setting("tau")
+    learn_step = Setting("update_ratio", inverse=True)
 
     def __init__(
         self,
@@ -109,12 +114,17 @@ class DQN(Agent):
 class RainbowDQN(Agent):
     """A DQN agent with every extension of Rainbow."""
 
-    algo, kind, beta, prior_eps = "Rainbow DQN", config.DQN, 0.4, 1e-6
+    algo = "Rainbow DQN"
+    kind = config.DQN
+    beta = 0.4
+    prior_eps = 1e-6
     lr = Setting("learning_rate")
     num_atoms = Setting("n_atoms")
     n_step = Setting("n_step")
-    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
-    v_min, v_max = Setting("v_min"), Setting("v_max")
+    tau = Setting("tau")
+    learn_step = Setting("update_ratio", inverse=True)
+    v_min = Setting("v_min")
+    v_max = Setting("v_max")
 
     def __init__(
         self,
@@ -141,7 +151,8 @@ class RainbowDQN(Agent):
         wrap: bool = True,
     ) -> None:
         self._start(locals(), gym.spaces.Discrete(action_dim), config.DQN.rainbow)
-        self.beta, self.prior_eps = beta, prior_eps
+        self.beta = beta
+        self.prior_eps = prior_eps
 
     def getAction(self, state: Any, action_mask: Any = None, training: bool = True) -> Array:
         """Return the best actions (B,) int64; with noise in the weights while ``training``."""
@@ -153,9 +164,11 @@ class RainbowDQN(Agent):
         After the five of every sample come, with ``per``, weights and indices; with ``n_step``
         the five again, summed over n steps: only these are learnt from then.
         """
-        used, gamma = experiences[:5], self.gamma
+        used = experiences[:5]
+        gamma = self.gamma
         if n_step:
-            used, gamma = experiences[-5:], gamma**self.n_step
+            used = experiences[-5:]
+            gamma = gamma**self.n_step
         weights = experiences[5] if per else None
         metrics, errors = self.native.learn_sample(gamma, *used, weights)
         if not per:
@@ -166,10 +179,14 @@ class RainbowDQN(Agent):
 class TD3(Agent):
     """A TD3 agent."""
 
-    algo, kind, twin = "TD3", config.TD3, True
-    lr_critic, policy_freq = Setting("learning_rate"), Setting("policy_delay")
+    algo = "TD3"
+    kind = config.TD3
+    twin = True
+    lr_critic = Setting("learning_rate")
+    policy_freq = Setting("policy_delay")
     lr_actor = Setting("actor_rate", share="learning_rate")
-    tau, learn_step = Setting("tau"), Setting("update_ratio", inverse=True)
+    tau = Setting("tau")
+    learn_step = Setting("update_ratio", inverse=True)
 
     def __init__(
         self,
@@ -223,7 +240,8 @@ class TD3(Agent):
 class DDPG(TD3):
     """A DDPG agent: one critic."""
 
-    algo, twin = "DDPG", False
+    algo = "DDPG"
+    twin = False
 
     def __init__(
         self,

@@ -24,7 +24,8 @@ class MultiStepReplayBuffer:
         device: Any = None,
         **how: Any,
     ) -> None:
-        self.memory_size, self.counter = memory_size, 0
+        self.memory_size = memory_size
+        self.counter = 0
         self.native = TransitionBuffer(memory_size, random_seed(), gamma, n_step=n_step, **how)
 
     def __len__(self) -> int:

@@ -15,8 +15,10 @@ class TournamentSelection:
     def __init__(
         self, tournament_size: int, elitism: bool, population_size: int, evo_step: int
     ) -> None:
-        self.tournament_size, self.elitism = tournament_size, elitism
-        self.population_size, self.evo_step = population_size, evo_step
+        self.tournament_size = tournament_size
+        self.elitism = elitism
+        self.population_size = population_size
+        self.evo_step = evo_step
 
     def select(self, population: list[Any]) -> tuple[Any, list[Any]]:
         """Return the best agent by its last ``evo_step`` fitnesses, and the next population."""

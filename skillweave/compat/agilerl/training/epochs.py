@@ -29,7 +29,8 @@ class Epochs(SimpleNamespace):
             self.env = SyncVectorEnv([lambda: one], autoreset_mode=AutoresetMode.SAME_STEP)
         if self.env.metadata.get("autoreset_mode") != AutoresetMode.SAME_STEP:
             raise DeclarationError("env must reset in the same step: make it with makeVectEnvs")
-        name, scores = f"{self.env_name}-EvoHPO-{self.algo}", []
+        name = f"{self.env_name}-EvoHPO-{self.algo}"
+        scores = []
         settings = {**(self.INIT_HP or {}), **(self.MUT_P or {})}
         key = self.wandb_api_key
         self.tracked = start_wandb("AgileRL", name, settings, key) if self.wb else None
@@ -56,7 +57,8 @@ class Epochs(SimpleNamespace):
 
     def steps(self, act: Callable[[Any], Any]) -> Iterator[tuple[Any, ...]]:
         """Yield the steps of an episode: state, ``act``'s result, rewards, next state, ends."""
-        self.rewards, self.ended = [], []
+        self.rewards = []
+        self.ended = []
         state = swapped(self.env.reset()[0], self.swap_channels)
         for _ in range(self.max_steps):
             acted = act(state)

@@ -57,5 +57,6 @@ def initialPopulation(
     return [_KINDS[algo](**settings | {"index": i}) for i in range(population_size)]
 
 
-make_vect_envs, make_skill_vect_envs = makeVectEnvs, makeSkillVectEnvs
+make_vect_envs = makeVectEnvs
+make_skill_vect_envs = makeSkillVectEnvs
 create_population = initialPopulation
