@@ -95,7 +95,8 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], points: tuple[float, ...] = (2.0, -2.0)) -> None:
         super().__init__(env)
-        self.route, self.leg = Route(points), np.zeros(1, np.int64)
+        self.route = Route(points)
+        self.leg = np.zeros(1, np.int64)
         self.observation_space = self.route.space(env.observation_space)
 
     @property
@@ -113,7 +114,8 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         """Take a step; the route pays."""
         obs, _, terminated, truncated, info = self.env.step(action)
-        x, cost = np.array([info["x_position"]]), np.array([info["reward_ctrl"]])
+        x = np.array([info["x_position"]])
+        cost = np.array([info["reward_ctrl"]])
         self.leg, reward = self.route.walk(self.leg, x, cost)
         seen = self.route.see(obs[None], self.leg)[0]
         return seen, float(reward[0]), terminated, truncated, info

@@ -28,7 +28,8 @@ class LookAround:
     front of the agent.
     """
 
-    observation_space, action_space = SPACE, ACTIONS
+    observation_space = SPACE
+    action_space = ACTIONS
     labels: tuple[str, ...] = ()
 
     def start(self, n: int) -> Memory:
@@ -45,10 +46,13 @@ class LookAround:
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """Turn right, once around; then straight on, around what is in the way."""
-        turns, paces = memory["turns"], memory["paces"]
+        turns = memory["turns"]
+        paces = memory["paces"]
         again = (paces >= PACES) | ((paces > 0) & ~free(ahead(obs)))
-        turns, paces = np.where(again, 0, turns), np.where(again, 0, paces)
-        looks, goes = turns < TURNS, free(ahead(obs))
+        turns = np.where(again, 0, turns)
+        paces = np.where(again, 0, paces)
+        looks = turns < TURNS
+        goes = free(ahead(obs))
         only_left = free(obs[:, 2, 6]) & ~free(obs[:, 4, 6])
         around = np.where(goes, FORWARD, np.where(only_left, LEFT, RIGHT))
         after = {"turns": turns + looks, "paces": paces + (~looks & goes)}

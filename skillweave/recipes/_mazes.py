@@ -26,8 +26,10 @@ PLACE = slice(0, 2)
 SPEED = slice(2, 4)
 GOAL = slice(4, 6)
 """Places in an observation: metres east and north, metres a second, metres."""
-REACH, BALL = 0.45, 0.1
-"""Metres from the goal at which it is reached; the ball's radius."""
+REACH = 0.45
+"""Metres from the goal at which it is reached."""
+BALL = 0.1
+"""The ball's radius in metres."""
 PIXELS = 32
 """Of a metre in a picture."""
 WALL = (60, 66, 80)

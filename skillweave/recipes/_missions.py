@@ -36,8 +36,10 @@ PAD = 0.2
 """Half the width of the pad, as the lander sees it."""
 RESTED = 100.0
 """What LunarLander pays in the step in which the lander has come to rest, and in no other."""
-GUST_EVERY, GUST_STEPS = 80, 8
-"""A gust comes so often, and lasts so long."""
+GUST_EVERY = 80
+"""Steps from one gust to the next."""
+GUST_STEPS = 8
+"""Steps that a gust lasts."""
 SIZE = 8 + LEGS * len(KINDS) + 1
 
 
@@ -60,7 +62,8 @@ class Progress:
                     f"a mission has 1 to {LEGS} legs of {', '.join(KINDS)}, not {tuple(mission)}"
                 )
         rows = [[KINDS.index(leg) for leg in m] + [-1] * (LEGS - len(m)) for m in missions]
-        self._missions, self._gusts = np.array(rows), gusts
+        self._missions = np.array(rows)
+        self._gusts = gusts
         self.left = np.full((num_envs, LEGS), -1)
         """What is still to be done, (num_envs, 3): numbers of kinds in order; −1: nothing."""
         self.held = np.zeros(num_envs, np.int64)
@@ -72,7 +75,8 @@ class Progress:
     def begin(self, ids: Array, rngs: Sequence[np.random.Generator]) -> None:
         """Start missions in environments ``ids`` (k,); ``rngs`` has one generator for each."""
         which = [int(rng.integers(len(self._missions))) for rng in rngs]
-        self.left[ids], self.held[ids] = self._missions[which], 0
+        self.left[ids] = self._missions[which]
+        self.held[ids] = 0
         self.legs[ids] = (self.left[ids] >= 0).sum(axis=1)
         self._time[ids] = [int(rng.integers(2 * GUST_EVERY)) for rng in rngs]
 
@@ -93,7 +97,8 @@ class Progress:
             ended: the episode has ended, for whatever reason, (k,) bool.
         """
         self._time[ids] += 1
-        leg, place = self.left[ids, 0], obs[:, :2]
+        leg = self.left[ids, 0]
+        place = obs[:, :2]
         at = np.clip(leg, 0, LAND - 1)
         inside = (np.abs(place - POINTS[at]) <= HALF[at] + 1e-6).all(axis=1)
         hovering = inside & (KINDS.index("hover") == leg)

@@ -146,8 +146,10 @@ class Rooms(gym.Env[Any, Any]):
             warnings.filterwarnings("ignore", message=".*is out of date.*")
             self._envs = [gym.make(f"MiniGrid-{r}-v0", render_mode=render_mode) for r in rooms]
         self._now = self._envs[0]
-        self.observation_space, self.action_space = SPACE, self._now.action_space
-        self.render_mode, self.metadata = render_mode, self._now.metadata
+        self.observation_space = SPACE
+        self.action_space = self._now.action_space
+        self.render_mode = render_mode
+        self.metadata = self._now.metadata
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Draw a room, and start there."""
@@ -179,7 +181,8 @@ class RoomPool:
         rooms: MiniGrid's names, without ``MiniGrid-`` and ``-v0``.
     """
 
-    observation_space, action_space = SPACE, ACTIONS
+    observation_space = SPACE
+    action_space = ACTIONS
 
     def __init__(self, rooms: Sequence[str], num_envs: int, threads: int, seed: int) -> None:
         self._pools = [
@@ -201,7 +204,8 @@ class RoomPool:
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Act, each in its room."""
         n = len(ids)
-        found, reward = np.empty((n, *SPACE.shape), np.uint8), np.empty(n, np.float32)
+        found = np.empty((n, *SPACE.shape), np.uint8)
+        reward = np.empty(n, np.float32)
         terminated, truncated = np.empty(n, bool), np.empty(n, bool)
         asked = self._by_room(ids)
         for pool, rows in asked:

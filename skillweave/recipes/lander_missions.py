@@ -124,7 +124,8 @@ class Hover(Flight):
     """It flies there, and stays for two seconds. With calls of 50 steps a leg took several, one
     after the other, which a selector hardly ever chose at random."""
     prize = 0.0
-    point, half = POINTS[KINDS.index("hover")], HALF[KINDS.index("hover")]
+    point = POINTS[KINDS.index("hover")]
+    half = HALF[KINDS.index("hover")]
 
     def reward(self, step: Step) -> Array:
         """Return 1 less the deviation, 1 for a step in the box, −20 for an episode's end."""
@@ -137,7 +138,8 @@ class Hover(Flight):
 class GoLeft(Flight):
     """Fly to the point on the left, until it is reached."""
 
-    point, half = POINTS[KINDS.index("left")], HALF[KINDS.index("left")]
+    point = POINTS[KINDS.index("left")]
+    half = HALF[KINDS.index("left")]
 
     def initiation(self, obs: Array) -> Array:
         """Return whether it is elsewhere: at the point a call would end at once."""
@@ -151,7 +153,8 @@ class GoLeft(Flight):
 class GoRight(GoLeft):
     """Fly to the point on the right, until it is reached."""
 
-    point, half = POINTS[KINDS.index("right")], HALF[KINDS.index("right")]
+    point = POINTS[KINDS.index("right")]
+    half = HALF[KINDS.index("right")]
 
 
 class Land(Skill):
@@ -166,7 +169,8 @@ class Land(Skill):
 
         It is best near the middle of the pad, slow, upright, legs on the ground.
         """
-        distance, speed = np.hypot(obs[:, X], obs[:, Y]), np.hypot(obs[:, VX], obs[:, VY])
+        distance = np.hypot(obs[:, X], obs[:, Y])
+        speed = np.hypot(obs[:, VX], obs[:, VY])
         legs = (obs[:, LEGS] > 0).sum(axis=1)
         found: Array = -100.0 * (distance + speed + np.abs(obs[:, ANGLE])) + 10.0 * legs
         return found
@@ -252,7 +256,8 @@ def by_leg(obs: Array) -> Array:
     Where that skill may not start, as the lander is there already, it is the next leg's skill; and
     where all is done, the lander hovers.
     """
-    n, skills = len(obs), [GoLeft(), GoRight(), Hover(), Land()]
+    n = len(obs)
+    skills = [GoLeft(), GoRight(), Hover(), Land()]
     may = np.stack([skill.initiation(obs) for skill in skills], axis=1)
     legs = obs[:, TO_DO].reshape(n, -1, len(KINDS)) > 0
     found = np.full(n, KINDS.index("hover"))

@@ -37,8 +37,10 @@ from skillweave import (
 )
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
 
-SLOW, GAIN = 0.3, 0.1
-"""Metres a second, and by how many a free ball gains more than that in each step."""
+SLOW = 0.3
+"""Metres a second, below which the ball counts as slow."""
+GAIN = 0.1
+"""Metres a second that a free ball gains at least in each step."""
 TRY = 5
 """Steps for which a call tries at least, also at a wall."""
 

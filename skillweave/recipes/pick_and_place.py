@@ -33,7 +33,8 @@ from skillweave.recipes._arm import is_held as is_grasped
 GRIPPER = slice(0, 3)
 BLOCK = slice(3, 6)
 OFFSET = slice(6, 9)
-FINGERS, GOAL = slice(9, 11), slice(25, 28)
+FINGERS = slice(9, 11)
+GOAL = slice(25, 28)
 
 
 def towards(way: Array, fingers: float) -> Array:
@@ -152,7 +153,8 @@ class Anywhere(Skill):
     """One of the four functions, for selectors by hand: it may start anywhere."""
 
     def __init__(self, name: str, policy: Any) -> None:
-        self.name, self.policy = name, policy
+        self.name = name
+        self.policy = policy
 
 
 class Recover(Skill):

@@ -33,12 +33,13 @@ from skillweave.recipes._cheetah import LEG, SPEED, spec
 
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""
-ARRIVAL, HASTE = 400.0, 80.0
-"""A skill's reward for the end of a leg, and its deduction for each metre a second at which it is
-passed. A call ends there, and its value: a skill that is not paid for it learns not to
-arrive. At five metres a second, about the highest speed, the half-cheetah runs on for two metres
-more, and nothing is paid (beyond, it costs). With 300 and 40 skills hardly braked on seed 10: they
-finished seven rounds, not nine."""
+ARRIVAL = 400.0
+"""A skill's reward for the end of a leg. The call ends there, and so does its return: a skill that
+is not paid for arriving learns not to arrive."""
+HASTE = 80.0
+"""The deduction from ``ARRIVAL`` for each metre a second at the end of a leg. At five metres a
+second, about the highest speed, the half-cheetah runs on for two metres more, and nothing is paid.
+With 300 and 40 for both, skills hardly braked."""
 
 
 def moved(step: Step) -> Array:
