@@ -37,7 +37,9 @@ class Canvas:
     def copy(self) -> Canvas:
         """Return a canvas with the same picture, to draw on."""
         twin = object.__new__(Canvas)
-        twin.scale, twin._x, twin._y = self.scale, self._x, self._y
+        twin.scale = self.scale
+        twin._x = self._x
+        twin._y = self._y
         twin._picture = self._picture.copy()
         return twin
 

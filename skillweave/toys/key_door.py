@@ -14,8 +14,10 @@ SPEED = 0.05
 """The longest way in one step, along x and along y."""
 RADIUS = 0.07
 """The agent's."""
-WALL, GAP = 0.2, 0.2
-"""The wall's place (x), and half the height of the gap in it, which is around y = 0."""
+WALL = 0.2
+"""The wall's x."""
+GAP = 0.2
+"""Half the height of the gap in the wall, which is around y = 0."""
 TOUCH = 0.14
 """Distance at which the agent takes the key."""
 UNLOCK = 0.25
@@ -23,7 +25,12 @@ UNLOCK = 0.25
 EXIT_X, EXIT_Y = 0.8, 0.3
 """The exit is where x > 0.8 and |y| < 0.3."""
 
-PIXELS, EXTENT, MARGIN = 320, 1.15, 1.07
+PIXELS = 320
+"""Width and height of a picture."""
+EXTENT = 1.15
+"""The largest |x| and |y| in a picture."""
+MARGIN = 1.07
+"""The |x| and |y| at which the outer walls begin in a picture."""
 FLOOR = (247, 245, 240)
 STONE = (58, 66, 82)
 WOOD = (166, 98, 47)
@@ -62,7 +69,8 @@ class KeyDoor(gym.Env[Array, Array]):
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def __init__(self, render_mode: str | None = None, max_steps: int = 150) -> None:
-        self.render_mode, self.max_steps = render_mode, max_steps
+        self.render_mode = render_mode
+        self.max_steps = max_steps
         self._place = self._key = (0.0, 0.0)
         self._has_key = self._is_open = False
         self._steps = 0
@@ -75,10 +83,12 @@ class KeyDoor(gym.Env[Array, Array]):
         """Put the agent and the key at random places, and close the door."""
         super().reset(seed=seed)
         x, y, key_x, key_y = self.np_random.uniform((-1, -1, -0.9, -0.9), (0, 1, 0, 0.9)).tolist()
-        self._place, self._key = (x, y), (key_x, key_y)
+        self._place = (x, y)
+        self._key = (key_x, key_y)
         self._has_key = self._is_open = False
         self._steps = 0
-        self._trail, self._ground = [], None
+        self._trail = []
+        self._ground = None
         return self._observation(), {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
