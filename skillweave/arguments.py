@@ -58,9 +58,16 @@ ELSEWHERE = {
 
 
 STARTS = (
-    "options", "reset_options", "reset_kwargs", "start_state", "start_states", "initial_state",
-    "initial_states", "init_state", "start_distribution",
-)  # fmt: skip
+    "options",
+    "reset_options",
+    "reset_kwargs",
+    "start_state",
+    "start_states",
+    "initial_state",
+    "initial_states",
+    "init_state",
+    "start_distribution",
+)
 """Names under which users look for other starts of episodes."""
 STARTS_BY = (
     "episodes start where the environment's reset() puts them; to start elsewhere, give a wrapper "
@@ -122,7 +129,8 @@ def _wrong_arguments(
     owner = None
     if parameters and parameters[0].name in ("self", "cls") and args:
         owner = args[0] if isinstance(args[0], type) else type(args[0])
-        parameters, args = parameters[1:], args[1:]
+        parameters = parameters[1:]
+        args = args[1:]
     makes = function.__name__ == "__init__" and owner is not None
     name = owner.__name__ if makes and owner is not None else function.__name__
     who, what = (name, "setting") if makes and is_dataclass(owner) else (f"{name}()", "argument")

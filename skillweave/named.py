@@ -93,8 +93,10 @@ def _name_of(function: Any, where: str) -> str:
                 f"{where} is a partial with positional arguments; name them: "
                 "functools.partial(function, width=64)"
             )
-        inner, values = function.func, dict(function.keywords)
-    module, name = getattr(inner, "__module__", None), getattr(inner, "__qualname__", None)
+        inner = function.func
+        values = dict(function.keywords)
+    module = getattr(inner, "__module__", None)
+    name = getattr(inner, "__qualname__", None)
     bound = getattr(inner, "__self__", None)
     of_object = bound is not None and not inspect.isclass(bound) and not inspect.ismodule(bound)
     if not callable(inner) or of_object or not isinstance(name, str) or not isinstance(module, str):

@@ -36,7 +36,8 @@ class Notices:
 
     def take(self) -> list[str]:
         """Return the waiting notices, and remove them."""
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         return waiting
 
     def tell_by(self, tell: Callable[[str], None] | None) -> None:

@@ -88,11 +88,13 @@ def parse_json(text: str | bytes, where: Path | str) -> Any:
         raise RunError(f"{where} is damaged: it is nested too deep") from error
     except ValueError as error:
         raise RunError(f"{where} is damaged: {str(error)[:300]}") from error
-    layer, depth = [data], 0
+    layer = [data]
+    depth = 0
     while layer:
         if depth > DEEPEST:
             raise RunError(f"{where} is damaged: it is nested too deep")
-        layer, depth = [x for part in layer for x in _inside(part)], depth + 1
+        layer = [x for part in layer for x in _inside(part)]
+        depth += 1
     return data
 
 
@@ -202,7 +204,9 @@ class _FileFitting(Fitting):
         Raises:
             RunError: a field is missing or unknown, or the fields do not fit each other.
         """
-        values, hints, file = dict(value), annotations_of(kind), self.file
+        values = dict(value)
+        hints = annotations_of(kind)
+        file = self.file
         made = is_dataclass(kind)
         names = {f.name for f in fields(kind)} if made else set(hints)
         needed = {f.name for f in fields(kind) if _needed(f)} if made else names

@@ -145,7 +145,9 @@ def _set_states(states: dict[str, Any]) -> None:
 def _forget_threads() -> None:
     """Let a forked process begin without the blocks of its parent's threads."""
     global _blocks, _lock, _threads
-    _blocks, _lock, _threads = _Blocks(), threading.Lock(), 0
+    _blocks = _Blocks()
+    _lock = threading.Lock()
+    _threads = 0
 
 
 if hasattr(os, "register_at_fork"):

@@ -78,7 +78,9 @@ class Unfit(Exception):
 
     def __init__(self, path: str, value: object, text: str) -> None:
         super().__init__(f"{path} is {short(value)}; it must be {text}")
-        self.path, self.value, self.text = path, value, text
+        self.path = path
+        self.value = value
+        self.text = text
 
 
 class Fitting:
@@ -124,7 +126,8 @@ class Fitting:
         if isinstance(value, str) and get_origin(kind) is Annotated and RECORDED in get_args(kind):
             return ":" in value
         kind, _ = _parts(kind)
-        origin, inner = get_origin(kind), get_args(kind)
+        origin = get_origin(kind)
+        inner = get_args(kind)
         if origin in (Union, UnionType):
             return any(self.accepts(option, value) for option in inner)
         if kind in (None, NoneType):
@@ -184,7 +187,8 @@ class Fitting:
             return [", ".join([noun, *texts])]
         if texts:
             return [", ".join(texts)]
-        origin, inner = get_origin(kind), get_args(kind)
+        origin = get_origin(kind)
+        inner = get_args(kind)
         if origin in (Union, UnionType):
             return [word for option in inner for word in self._words(option)]
         if kind is str:
@@ -216,7 +220,8 @@ class Fitting:
 
     def _inside(self, kind: Any, value: Any, path: str) -> Any:
         """Return a value of the right kind with its entries and fields fitted."""
-        origin, inner = get_origin(kind), get_args(kind)
+        origin = get_origin(kind)
+        inner = get_args(kind)
         if origin in (Union, UnionType):
             if value is None and NoneType in inner:
                 return None
@@ -289,7 +294,8 @@ def _hint(kind: Any, value: Any) -> str:
     if isinstance(value, type) and issubclass(value, kinds):
         return f" (write {value.__name__}(), not {value.__name__})"
     if _has_names(value) and value and len(kinds) == 1:
-        group, known = kinds[0].__name__, [f.name for f in fields(kinds[0])]
+        group = kinds[0].__name__
+        known = [f.name for f in fields(kinds[0])]
         for name in value:
             if name not in known:
                 return f" ({group} has no setting {name!r}{meant(name, known, 'they are')})"
@@ -329,7 +335,8 @@ def checked_settings(kind: C) -> C:
         DeclarationError: when an object is made: ``PPO.gamma is 1.5; it must be between 0 and 1``.
     """
     cls: Any = checked_names(kind)
-    own, init = getattr(cls, "__post_init__", None), cls.__init__
+    own = getattr(cls, "__post_init__", None)
+    init = cls.__init__
 
     def checked(self: Any) -> None:
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))

@@ -72,12 +72,15 @@ class ShortTraceback(BaseException):
         """Return the lines that IPython shows; it looks for this method."""
         shell: Any = sys.modules["IPython"].get_ipython()
         error: BaseException = self
-        frames, offset = self.__traceback__, 1  # the first frame is IPython's own
+        # The first frame is IPython's own.
+        frames = self.__traceback__
+        offset = 1
         if not all_frames_wanted():
             # The same error without its causes: its message names them.
             error = type(self).__new__(type(self))
             error.args = self.args
-            frames, offset = _joined(list(_written(self))), 0
+            frames = _joined(list(_written(self)))
+            offset = 0
         show = shell.InteractiveTB.structured_traceback
         lines: list[str] = show(type(error), error, frames, tb_offset=offset)
         return lines
