@@ -329,10 +329,10 @@ class DQN(OffPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = self.v_min is not None or self.v_max is None
-        check(self, "v_min", given, f"a finite number where v_max is one ({self.v_max})")
-        given = self.v_max is not None or self.v_min is None
-        check(self, "v_max", given, f"a finite number where v_min is one ({self.v_min})")
+        fits = self.v_min is not None or self.v_max is None
+        check(self, "v_min", fits, f"a finite number where v_max is one ({self.v_max})")
+        fits = self.v_max is not None or self.v_min is None
+        check(self, "v_max", fits, f"a finite number where v_min is one ({self.v_min})")
         if self.v_min is not None and self.v_max is not None:
             check(self, "v_max", self.v_max > self.v_min, f"more than v_min ({self.v_min})")
 

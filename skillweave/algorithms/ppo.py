@@ -405,12 +405,12 @@ def _reference(agent: PPOAlgorithm, terms: Terms, rollout: Rollout, cells: Cells
 
 
 def _advantage(
-    agent: PPOAlgorithm, own: Tensor, other: Tensor | None, counts: Tensor | None
+    agent: PPOAlgorithm, advantage: Tensor, of_stage: Tensor | None, counts: Tensor | None
 ) -> Tensor:
     """Return the normalised advantage plus the stage's, in the same units, (P, N)."""
     if agent.config.normalize_advantage:
-        own = normalise(own, counts, min_std=agent.config.min_advantage_std)
-    return own if other is None else own + other
+        advantage = normalise(advantage, counts, min_std=agent.config.min_advantage_std)
+    return advantage if of_stage is None else advantage + of_stage
 
 
 def _acted(

@@ -117,10 +117,10 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         if rollout.overridden is not None:
             good &= ~cells.flat(rollout.overridden)
         new = Rows(obs, cells.flat(rollout.action), mask, returns)
-        kept = torch.cat([good, state.kept], dim=1)
-        latest = first_true(kept, state.kept.shape[1])
+        filled = torch.cat([good, state.kept], dim=1)
+        latest = first_true(filled, state.kept.shape[1])
         rows = joined(new, state.rows).take(latest)
-        state.kept = take_rows(kept, latest)
+        state.kept = take_rows(filled, latest)
         state.kept_return = rows.returns
         state.kept_obs = rows.obs
         state.kept_action = rows.action

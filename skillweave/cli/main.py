@@ -42,8 +42,8 @@ def _main(arguments: Sequence[str] | None) -> int:
 
     from skillweave.cli import commands
 
-    given = ["--no-deterministic" if word == "--stochastic" else word for word in words]
-    given = _with_addresses(given)
+    tyro_arguments = ["--no-deterministic" if word == "--stochastic" else word for word in words]
+    tyro_arguments = _with_addresses(tyro_arguments)
     if (wrong := _unknown_command(words, [commands.name_of(c) for c in commands.COMMANDS])) != "":
         say(f"error: {wrong}")
         return 2
@@ -53,7 +53,7 @@ def _main(arguments: Sequence[str] | None) -> int:
         prog="skillweave",
         description="Teach agents skills and weave them into one policy. "
         "skillweave --version prints the version.",
-        args=given,
+        args=tyro_arguments,
     )
     from skillweave.errors import SkillweaveError
     from skillweave.runs.command_words import called_by

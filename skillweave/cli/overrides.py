@@ -266,10 +266,10 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):
             return value
-    wanted = described(hint)
+    expected = described(hint)
     if typing.get_origin(options[0]) is Sequence:
-        wanted = "names with commas between them"
-    raise DeclarationError(f"{name}={text}: expected {wanted}")
+        expected = "names with commas between them"
+    raise DeclarationError(f"{name}={text}: expected {expected}")
 
 
 def _flatten(prefix: str, config: Any) -> dict[str, Any]:

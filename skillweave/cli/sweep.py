@@ -87,9 +87,9 @@ class Job:
             return str(error)
         if saved is None:
             return None
-        ours = saved.deterministic and saved.seed == EVALUATION_SEED
+        as_in_sweep = saved.deterministic and saved.seed == EVALUATION_SEED
         whole = len(saved.evaluation.returns) == self.evaluate
-        return float(saved.evaluation.mean) if ours and whole else None
+        return float(saved.evaluation.mean) if as_in_sweep and whole else None
 
     def _manifest(self, hierarchy: Hierarchy) -> dict[str, Any]:
         return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
@@ -193,8 +193,8 @@ def _hierarchies(
 
 
 def _file_name(settings: str, seed: int) -> str:
-    kept = re.sub(r"[^\w.=(),+-]", "", settings.replace(", ", "+"))
-    return f"{kept}-s{seed}" if kept else f"s{seed}"
+    letters = re.sub(r"[^\w.=(),+-]", "", settings.replace(", ", "+"))
+    return f"{letters}-s{seed}" if letters else f"s{seed}"
 
 
 Tasks = Sequence[tuple[bytes, Job]]
@@ -230,17 +230,17 @@ def _on_ray(tasks: Tasks, command: commands.Sweep) -> Iterator[tuple[Job, float 
             (ref, *_), _ = ray.wait(list(due))
             code, job = due.pop(ref)
             try:
-                there, result = ray.get(ref)
+                versions, result = ray.get(ref)
             except LOST as error:
                 yield job, f"its process was lost repeatedly: {error_text(error)}"
             except ray.exceptions.RayError as error:
                 yield job, error_text(error)
             else:
-                if there is None:
+                if versions is None:
                     yield job, result
                     continue
-                check_versions(there)  # Python's last digit may be another
-                good.append((there["Skillweave"], there["Python"]))
+                check_versions(versions)  # Python's last digit may be another
+                good.append((versions["Skillweave"], versions["Python"]))
                 waiting.append((code, job))
 
 
@@ -255,9 +255,9 @@ def _task() -> Callable[..., Any]:
     place = actor_class()()
 
     def task(job: tuple[Any, ...], code: bytes, good: Sequence[tuple[str, str]]) -> Any:
-        there = place.versions()
-        if (there["Skillweave"], there["Python"]) not in good:
-            return there, None
+        versions = place.versions()
+        if (versions["Skillweave"], versions["Python"]) not in good:
+            return versions, None
         from skillweave.cli.sweep import Job
 
         return None, Job(*job).run(code)

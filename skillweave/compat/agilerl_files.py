@@ -212,8 +212,8 @@ def _named(
     Raises:
         RunError: a weight is missing, unknown, of another shape, or not finite.
     """
-    wanted = {k: shape for k, shape in shapes.items() if k.startswith(f"{prefix}.")}
-    depth = max(int(k.split(".")[1]) for k in wanted)
+    expected = {k: shape for k, shape in shapes.items() if k.startswith(f"{prefix}.")}
+    depth = max(int(k.split(".")[1]) for k in expected)
     named: dict[str, Tensor] = {}
     for key, value in weights.items():
         where = f"{prefix}_state_dict: {key[:100]}"
@@ -223,17 +223,19 @@ def _named(
         matrix = layer == "linear_layer" and what == "weight"
         name = f"norm_{what}" if layer == "layer_norm" else what
         name = f"{prefix}.{depth if number == 'output' else int(number)}.{name}"
-        if name not in wanted or name in named:
+        if name not in expected or name in named:
             raise RunError(f"{where} belongs to no layer that is described")
         # Stored as torch has it: (out, in), where ours is (in, out).
-        asked = wanted[name][::-1] if matrix else wanted[name][-1:]
-        if tuple(value.shape) != asked:
-            raise RunError(f"{where} has the shape {tuple(value.shape)}, but {asked} is described")
+        expected_shape = expected[name][::-1] if matrix else expected[name][-1:]
+        if tuple(value.shape) != expected_shape:
+            raise RunError(
+                f"{where} has the shape {tuple(value.shape)}, but {expected_shape} is described"
+            )
         value = value.to(torch.float32) if value.is_floating_point() else value
         if value.dtype != torch.float32 or not value.isfinite().all():
             raise RunError(f"{where} holds NaN, infinity, or no real numbers")
-        named[name] = (value.t() if matrix else value).reshape(wanted[name])
-    if left := sorted(set(wanted) - set(named)):
+        named[name] = (value.t() if matrix else value).reshape(expected[name])
+    if left := sorted(set(expected) - set(named)):
         raise RunError(f"there are no weights for {', '.join(left)}")
     return named
 

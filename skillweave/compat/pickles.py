@@ -149,7 +149,7 @@ def check_program(program: bytes) -> None:
     memo: dict[Any, int] = {}
     for step, (operation, argument, _) in enumerate(pickletools.genops(program)):
         name = operation.name
-        taken = operation.stack_before
+        operands = operation.stack_before
         if step >= MOST_STEPS:
             raise RunError(f"its pickle has more than {MOST_STEPS:,} operations")
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
@@ -162,11 +162,11 @@ def check_program(program: bytes) -> None:
             stack.append(_MARK)
             continue
         inner = []
-        if pickletools.markobject in taken:
+        if pickletools.markobject in operands:
             while (depth := stack.pop()) != _MARK:
                 inner.append(depth)
-            taken = taken[: taken.index(pickletools.markobject)]
-        inner += [stack.pop() for _ in taken]
+            operands = operands[: operands.index(pickletools.markobject)]
+        inner += [stack.pop() for _ in operands]
         outer = inner.pop() if name in _INTO else 0
         depth = max(outer, max(inner, default=-1) + 1)
         if depth > DEEPEST:

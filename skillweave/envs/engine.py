@@ -324,12 +324,12 @@ class SyncEnvs:
         try:
             return make()
         except SkillweaveError as error:
-            if not (made := len(self.envs)):
+            if not (number := len(self.envs)):
                 raise
             raise reworded(
                 error,
-                f"{error}. {made} could be made: if no more can exist at once, set "
-                f"num_envs={made} in each algorithm, the selector's too",
+                f"{error}. {number} could be made: if no more can exist at once, set "
+                f"num_envs={number} in each algorithm, the selector's too",
             ) from error
 
     def _empty(self, n: int) -> Array:

@@ -214,7 +214,7 @@ class EnvPoolEngine:
             if len(part)
         ]
         return tuple(
-            _joined([(part, answer[i]) for part, answer in answers], len(ids))
+            _joined([(part, result[i]) for part, result in answers], len(ids))
             for i in range(len(answers[0][1]))
         )
 

@@ -91,7 +91,7 @@ def draw_change(member: Member, mutations: Mutations, spaces: Any, rng: Any) -> 
 def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> list[Change]:
     """Return changes of kernels by a pixel that keep the size of every layer's output."""
     obs = member.algorithm(spaces).obs
-    found = []
+    changes = []
     low, high = mutations.kernels
     for layer, kernel in enumerate(cnn.kernels):
         for by in (1, -1):
@@ -107,8 +107,8 @@ def _kernels(member: Member, cnn: CNN, mutations: Mutations, spaces: Any) -> lis
             except DeclarationError:
                 continue  # larger than the remaining image
             if all(old == new for old, new in sizes):
-                found.append(change)
-    return found
+                changes.append(change)
+    return changes
 
 
 def _steps(size: int, by: int, limits: tuple[int, int]) -> list[int]:
@@ -196,8 +196,8 @@ def _carried(
         for plan in _plans(net, change, generator):
             alter = plan(named[before.weights[0]])
             named = {k: alter(v, k not in before.weights) for k, v in named.items()}
-    found = {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
-    return found | {before.count: even_count(found[before.count].long())}
+    fields = {k: after.layout.flatten(v).reshape(*lead, -1) for k, v in named.items()}
+    return fields | {before.count: even_count(fields[before.count].long())}
 
 
 def _plans(net: Any, change: Change, generator: torch.Generator) -> list[Plan]:
@@ -224,8 +224,8 @@ def _resized(units: Units, by: int, generator: torch.Generator, online: Views) -
     if by > 0:
         new = growth.fresh(online, units, by, generator)
         return lambda v, moments: growth.widened(v, units, by, None if moments else new)
-    kept = growth.most_read(online, units, max(1, units.count + by))
-    return lambda v, moments: growth.narrowed(v, units, kept)
+    units_to_keep = growth.most_read(online, units, max(1, units.count + by))
+    return lambda v, moments: growth.narrowed(v, units, units_to_keep)
 
 
 def _resized_kernel(name: str, by: int, online: Views) -> Alter:

@@ -158,17 +158,17 @@ class Mutations:
         Raises:
             DeclarationError: a setting does not exist, or a range excludes the start value.
         """
-        own = {f.name for f in fields(config)}
+        settings = {f.name for f in fields(config)}
         learnt = {"ent_coef"} if getattr(config, "learn_ent_coef", False) else set()
         scheduled = is_schedule(getattr(config, "learning_rate", 0.0))
         if self.ranges is None:
             fixed = learnt | ({"learning_rate"} if scheduled else set())
-            usual = {k: USUAL[k] for k in _MUTATED if k in own - fixed}
+            usual = {k: USUAL[k] for k in _MUTATED if k in settings - fixed}
             return {k: r for k, r in usual.items() if r.low <= getattr(config, k) <= r.high}
-        for name, found in self.ranges.items():
+        for name, limits in self.ranges.items():
             kind = type(config).__name__
-            if name not in own or name not in USUAL:
-                can = ", ".join(k for k in USUAL if k in own - learnt)
+            if name not in settings or name not in USUAL:
+                can = ", ".join(k for k in USUAL if k in settings - learnt)
                 raise DeclarationError(
                     f"Mutations.ranges: {kind} has no setting {name!r} that can mutate; "
                     f"those that can: {can}"
@@ -184,9 +184,9 @@ class Mutations:
                     "omit it, or give a number"
                 )
             value = getattr(config, name)
-            if start and (value is None or not found.low <= value <= found.high):
+            if start and (value is None or not limits.low <= value <= limits.high):
                 raise DeclarationError(
-                    f"Mutations.ranges[{name!r}] is {found.low:g} to {found.high:g}, which "
+                    f"Mutations.ranges[{name!r}] is {limits.low:g} to {limits.high:g}, which "
                     f"excludes the start value {kind}.{name} = {value}"
                 )
         return dict(self.ranges)

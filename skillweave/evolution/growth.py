@@ -47,16 +47,16 @@ def fresh(named: Views, units: Units, extra: int, generator: torch.Generator) ->
 
 def widened(named: Views, units: Units, extra: int, new: Views | None) -> dict[str, Tensor]:
     """Add ``extra`` units with outgoing weights of zero; ``new`` None: zeros, for moments."""
-    found = dict(named)
+    grown = dict(named)
     for part in (*units.own, *units.onward):
-        old = found[part.name]
+        old = grown[part.name]
         shape = list(old.shape)
         shape[part.axis] = extra * part.block
-        own = new[part.name] if new is not None and part in units.own else old.new_zeros(shape)
+        added = new[part.name] if new is not None and part in units.own else old.new_zeros(shape)
         end = part.start + units.count * part.block
         before, after = old.tensor_split([end], dim=part.axis)
-        found[part.name] = torch.cat([before, own, after], dim=part.axis)
-    return found
+        grown[part.name] = torch.cat([before, added, after], dim=part.axis)
+    return grown
 
 
 def most_read(named: Views, units: Units, count: int) -> Tensor:
@@ -72,14 +72,18 @@ def most_read(named: Views, units: Units, count: int) -> Tensor:
     return total.topk(count, dim=1).indices.sort(dim=1).values
 
 
-def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
+def narrowed(named: Views, units: Units, units_to_keep: Tensor) -> dict[str, Tensor]:
     """Keep only the units ``kept`` (R, m)."""
-    found = dict(named)
-    rows = len(kept)
+    cropped = dict(named)
+    rows = len(units_to_keep)
     for part in (*units.own, *units.onward):
-        old = found[part.name]
+        old = cropped[part.name]
         end = part.start + units.count * part.block
-        inner = part.start + kept[..., None] * part.block + torch.arange(part.block, device="cpu")
+        inner = (
+            part.start
+            + units_to_keep[..., None] * part.block
+            + torch.arange(part.block, device="cpu")
+        )
         before, after = (
             torch.arange(*span, device="cpu")
             for span in ((0, part.start), (end, old.shape[part.axis]))
@@ -90,8 +94,8 @@ def narrowed(named: Views, units: Units, kept: Tensor) -> dict[str, Tensor]:
         shape = [1] * old.ndim
         shape[0] = rows
         shape[part.axis] = index.shape[1]
-        found[part.name] = torch.take_along_dim(old, index.view(shape), dim=part.axis)
-    return found
+        cropped[part.name] = torch.take_along_dim(old, index.view(shape), dim=part.axis)
+    return cropped
 
 
 def with_kernel(named: Views, name: str, by: int) -> dict[str, Tensor]:
@@ -107,10 +111,10 @@ def deepened(
 ) -> dict[str, Tensor]:
     """Add a hidden layer that is the identity; in moments, new entries are zeros."""
     paired = activation in PAIRED
-    found = _renamed(named, joint, 1)
+    grown = _renamed(named, joint, 1)
     readers = [tuple(_moved(n, joint, 1) for n in pair) for pair in joint.readers]
-    width = found[readers[0][0]].shape[-2]
-    rows = len(found[readers[0][0]])
+    width = grown[readers[0][0]].shape[-2]
+    rows = len(grown[readers[0][0]])
     eye = torch.eye(width, **FLOAT).expand(rows, -1, -1)
     weight = torch.cat([eye, -eye], dim=-1) if paired else eye
     bias = torch.full((rows, 1, weight.shape[-1]), float(activation == "elu"), **FLOAT)
@@ -119,17 +123,17 @@ def deepened(
         like = weight if kind.startswith("weight") else bias
         if value is None or moments:
             value = torch.zeros_like(like)
-        found[f"{joint.prefix}.{joint.depth}.{kind}"] = value
+        grown[f"{joint.prefix}.{joint.depth}.{kind}"] = value
     for name, offset in readers:
-        for sigma in ("", "_sigma") if f"{name}_sigma" in found else ("",):
-            old = found[name + sigma]
+        for sigma in ("", "_sigma") if f"{name}_sigma" in grown else ("",):
+            old = grown[name + sigma]
             if activation == "elu" and not moments and not sigma:
                 # elu(x + 1) = x + 1 for any output x of an elu; the reader subtracts the 1.
-                found[offset] = found[offset] - old.sum(-2, keepdim=True)
+                grown[offset] = grown[offset] - old.sum(-2, keepdim=True)
             if paired:
                 other = torch.zeros_like(old) if moments or sigma else -old
-                found[name + sigma] = torch.cat([old, other], dim=-2)
-    return found
+                grown[name + sigma] = torch.cat([old, other], dim=-2)
+    return grown
 
 
 def shallower(named: Views, joint: Joint, *, moments: bool) -> dict[str, Tensor]:
@@ -140,19 +144,19 @@ def shallower(named: Views, joint: Joint, *, moments: bool) -> dict[str, Tensor]
     last = f"{joint.prefix}.{joint.depth - 1}"
     weight, bias = named[f"{last}.weight"], named[f"{last}.bias"]
     gone = {f"{last}.{kind}" for kind in joint.kinds}
-    found = {k: v for k, v in named.items() if k not in gone}
+    rest = {k: v for k, v in named.items() if k not in gone}
     for name, offset in joint.readers:
         read = named[name]
-        found[name] = weight @ read
-        found[offset] = named[offset] + bias @ read
+        rest[name] = weight @ read
+        rest[offset] = named[offset] + bias @ read
         if f"{name}_sigma" in named:
             sigma = named[f"{name}_sigma"].mean((-2, -1), keepdim=True)
-            found[f"{name}_sigma"] = sigma.expand_as(found[name])
+            rest[f"{name}_sigma"] = sigma.expand_as(rest[name])
         if moments:
             for k in (name, offset, f"{name}_sigma", f"{offset}_sigma"):
-                if k in found:
-                    found[k] = torch.zeros_like(found[k])
-    return _renamed(found, joint, -1)
+                if k in rest:
+                    rest[k] = torch.zeros_like(rest[k])
+    return _renamed(rest, joint, -1)
 
 
 def _renamed(named: Views, joint: Joint, by: int) -> dict[str, Tensor]:

@@ -74,12 +74,12 @@ def make_learner(
     Raises:
         DeclarationError: ``evolve`` names a stage that is not among ``stages``.
     """
-    asked = _by_stage([s["name"] for s in stages], evolve)
+    by_stage = _by_stage([s["name"] for s in stages], evolve)
 
     def make(stage: StageRun) -> StageLearner:
         if stage.entry.get("evolution") is None:
             return agents_of(stage, where.collectors)
-        how = asked.get(stage.name)
+        how = by_stage.get(stage.name)
         return EvolvingPopulation(stage, None if how is None else how.selection, where)
 
     return make

@@ -158,28 +158,28 @@ def even_count(count: Tensor) -> Tensor:
 
 
 def _count(member: Member, family: ParameterGroup) -> Tensor:
-    found: Tensor = getattr(member.state, family.count)
-    return found
+    count: Tensor = getattr(member.state, family.count)
+    return count
 
 
-def pad(flat: Tensor, own: Layout, wide: Layout) -> Tensor:
+def pad(flat: Tensor, narrow: Layout, wide: Layout) -> Tensor:
     """Pad parameters (…, D) with zeros to a wider layout (…, D′)."""
     rows = flat.reshape(-1, flat.shape[-1])
-    found = rows.new_zeros(len(rows), wide.size)
-    into = wide.views(found)
-    for name, view in own.views(rows).items():
+    padded = rows.new_zeros(len(rows), wide.size)
+    into = wide.views(padded)
+    for name, view in narrow.views(rows).items():
         into[name][_corner(view)] = view
-    return found.view(*flat.shape[:-1], wide.size)
+    return padded.view(*flat.shape[:-1], wide.size)
 
 
-def crop(flat: Tensor, wide: Layout, own: Layout) -> Tensor:
+def crop(flat: Tensor, wide: Layout, narrow: Layout) -> Tensor:
     """Crop parameters (…, D′) to the narrower layout (…, D)."""
     rows = flat.reshape(-1, flat.shape[-1])
-    found = rows.new_zeros(len(rows), own.size)
+    cropped = rows.new_zeros(len(rows), narrow.size)
     outof = wide.views(rows)
-    for name, view in own.views(found).items():
+    for name, view in narrow.views(cropped).items():
         view.copy_(outof[name][_corner(view)])
-    return found.view(*flat.shape[:-1], own.size)
+    return cropped.view(*flat.shape[:-1], narrow.size)
 
 
 def _corner(view: Tensor) -> tuple[slice, ...]:

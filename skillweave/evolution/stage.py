@@ -192,14 +192,14 @@ class EvolvingPopulation:
     def _finish(self) -> AgentPolicy:
         """Return the final policy of the stage."""
         assert self.best is not None
-        asked = self.evolution.generations
+        generations = self.evolution.generations
         if self._good:
             self.log.reached(self.best.fitness)
         elif self.log.stop_requested:
             self.log.stopped()
-        elif self.done < asked:
+        elif self.done < generations:
             self.log.tell(
-                f"its budget of {self.budget:,} steps is spent after {self.done} of {asked} "
+                f"its budget of {self.budget:,} steps is spent after {self.done} of {generations} "
                 "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
             )
         winner = {"member": self.best.number, "fitness": self.best.fitness}

@@ -181,13 +181,13 @@ class ShortestPath:
 
 def ways_to(walls: Array, goal: tuple[int, ...]) -> dict[tuple[int, ...], str]:
     """Return by cell the direction of the shortest way to ``goal`` (breadth first)."""
-    found: dict[tuple[int, ...], str] = {goal: "approach"}
+    way_from: dict[tuple[int, ...], str] = {goal: "approach"}
     queue = deque([goal])
     while queue:
         row, column = queue.popleft()
         for name, (down, right) in WAYS.items():
             before = (row - down, column - right)
-            if not walls[before] and before not in found:
-                found[before] = name
+            if not walls[before] and before not in way_from:
+                way_from[before] = name
                 queue.append(before)
-    return found
+    return way_from

@@ -144,8 +144,8 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
     @property
     def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
         """LunarLander's, without the return at which that is solved."""
-        found = super().spec
-        return found and replace(found, reward_threshold=None)
+        spec = super().spec
+        return spec and replace(spec, reward_threshold=None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Start an episode with a new mission."""

@@ -53,21 +53,21 @@ ACTIONS = gym.spaces.Discrete(7)
 
 def ahead(obs: Array) -> Array:
     """Return the cell before the agent, (n, 3)."""
-    found: Array = obs[:, 3, 5]
-    return found
+    cell: Array = obs[:, 3, 5]
+    return cell
 
 
 def holds(obs: Array, *kinds: int) -> Array:
     """Return whether the agent holds one of these kinds, (n,) bool; no kinds: anything."""
-    found: Array = _one_of(*(kinds or (KEY, BALL, BOX)))[obs[:, 3, 6, 0]]
-    return found
+    held: Array = _one_of(*(kinds or (KEY, BALL, BOX)))[obs[:, 3, 6, 0]]
+    return held
 
 
 def seen(obs: Array, *kinds: int, state: int | None = None) -> Array:
     """Return the cells with one of these kinds, without the agent's hands, (n, 7, 7) bool."""
-    found: Array = _one_of(*kinds)[obs[..., 0]]
-    found[:, 3, 6] = False
-    return found if state is None else np.logical_and(found, obs[..., 2] == state)
+    cells: Array = _one_of(*kinds)[obs[..., 0]]
+    cells[:, 3, 6] = False
+    return cells if state is None else np.logical_and(cells, obs[..., 2] == state)
 
 
 def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
@@ -77,8 +77,8 @@ def in_view(obs: Array, *kinds: int, state: int | None = None) -> Array:
 
 def anywhere(cells: Array) -> Array:
     """Return whether a cell of (n, 7, 7) bool is marked, (n,) bool."""
-    found: Array = np.any(cells, axis=(1, 2))
-    return found
+    any_cell: Array = np.any(cells, axis=(1, 2))
+    return any_cell
 
 
 def steps_to(cells: Array) -> Array:
@@ -86,43 +86,43 @@ def steps_to(cells: Array) -> Array:
 
     ``FAR`` where none is marked.
     """
-    found: Array = np.where(cells, DISTANCE, FAR).min(axis=(1, 2))
-    return found
+    steps: Array = np.where(cells, DISTANCE, FAR).min(axis=(1, 2))
+    return steps
 
 
 def shut(cells: Array) -> Array:
     """Return whether a cell (n, 3) is a closed or locked door, (n,) bool."""
-    found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] != OPEN)
-    return found
+    closed: Array = (cells[:, 0] == DOOR) & (cells[:, 2] != OPEN)
+    return closed
 
 
 def at_open_door(obs: Array) -> Array:
     """Return whether the agent stands before an open door, (n,) bool."""
     cells = ahead(obs)
-    found: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
-    return found
+    at_door: Array = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
+    return at_door
 
 
 def free(cells: Array) -> Array:
     """Return whether an agent can enter the cells (n, 3), (n,) bool."""
     opened = (cells[:, 0] == DOOR) & (cells[:, 2] == OPEN)
-    found: Array = _one_of(EMPTY, FLOOR, GOAL)[cells[:, 0]] | opened
-    return found
+    can_enter: Array = _one_of(EMPTY, FLOOR, GOAL)[cells[:, 0]] | opened
+    return can_enter
 
 
 @cache
 def _one_of(*kinds: int) -> Array:
     """Return a table of these kinds, (256,) bool: much faster than ``np.isin``."""
-    found = np.zeros(256, bool)
-    found[list(kinds)] = True
-    found.flags.writeable = False
-    return found
+    table = np.zeros(256, bool)
+    table[list(kinds)] = True
+    table.flags.writeable = False
+    return table
 
 
 def between_walls(obs: Array) -> Array:
     """Return whether walls are on the agent's left and right, as in a doorway, (n,) bool."""
-    found: Array = (obs[:, 2, 6, 0] == WALL) & (obs[:, 4, 6, 0] == WALL)
-    return found
+    between: Array = (obs[:, 2, 6, 0] == WALL) & (obs[:, 4, 6, 0] == WALL)
+    return between
 
 
 class Rooms(gym.Env[Any, Any]):
@@ -195,26 +195,26 @@ class RoomPool:
     def reset(self, ids: Array) -> tuple[Any, dict[str, Any]]:
         """Draw rooms, and start there."""
         self._room[ids] = [self._rngs[i].integers(len(self._pools)) for i in ids]
-        found = np.empty((len(ids), *SPACE.shape), np.uint8)
+        images = np.empty((len(ids), *SPACE.shape), np.uint8)
         for pool, rows in self._by_room(ids):
             obs, _ = pool.reset(ids[rows])
-            found[rows] = obs["image"]
-        return found, {}
+            images[rows] = obs["image"]
+        return images, {}
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Act, each in its room."""
         n = len(ids)
-        found = np.empty((n, *SPACE.shape), np.uint8)
+        images = np.empty((n, *SPACE.shape), np.uint8)
         reward = np.empty(n, np.float32)
         terminated, truncated = np.empty(n, bool), np.empty(n, bool)
-        asked = self._by_room(ids)
-        for pool, rows in asked:
+        by_room = self._by_room(ids)
+        for pool, rows in by_room:
             pool.send(action[rows], ids[rows])
-        for pool, rows in asked:  # all of them step meanwhile, none waits for another
+        for pool, rows in by_room:  # all of them step meanwhile, none waits for another
             obs, *results, _ = pool.recv()
-            found[rows] = obs["image"]
+            images[rows] = obs["image"]
             reward[rows], terminated[rows], truncated[rows] = results
-        return found, (reward > 0).astype(np.float32), terminated, truncated, {}
+        return images, (reward > 0).astype(np.float32), terminated, truncated, {}
 
     def _by_room(self, ids: Array) -> list[tuple[Any, Array]]:
         """Return the rooms in use, with their rows of ``ids``."""

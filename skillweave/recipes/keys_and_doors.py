@@ -57,8 +57,8 @@ class Errand(Skill):
         Nearer to what it aims at: a skill without an aim is paid for its end alone.
         """
         before, after = steps_to(self.aim(step.obs)), steps_to(self.aim(step.next_obs))
-        found: Array = np.where(self.success(step), 1.0, 0.04 * (before - after)) - 0.02
-        return found
+        reward: Array = np.where(self.success(step), 1.0, 0.04 * (before - after)) - 0.02
+        return reward
 
     def aim(self, obs: Array) -> Array:
         """Return the cells of its target, (n, 7, 7) bool; the default is none."""
@@ -97,8 +97,8 @@ def something_to_do(obs: Array) -> Array:
 
     Not `next_room`: an agent without memory would go to and fro through the door behind it.
     """
-    found: Array = np.any([skill.initiation(obs) for skill in ERRANDS], axis=0)
-    return found
+    may_start: Array = np.any([skill.initiation(obs) for skill in ERRANDS], axis=0)
+    return may_start
 
 
 class GetKey(Errand):
@@ -135,8 +135,8 @@ class OpenBox(Errand):
     def success(self, step: Step) -> Array:
         """Return whether the box before it is gone."""
         before, after = ahead(step.obs)[:, 0], ahead(step.next_obs)[:, 0]
-        found: Array = (step.action == TOGGLE) & (before == BOX) & (after != BOX)
-        return found
+        opened: Array = (step.action == TOGGLE) & (before == BOX) & (after != BOX)
+        return opened
 
 
 class Drop(Errand):
@@ -150,8 +150,8 @@ class Drop(Errand):
 
     def success(self, step: Step) -> Array:
         """Return whether its hands are free."""
-        found: Array = (step.action == DROP) & ~holds(step.next_obs)
-        return found
+        dropped: Array = (step.action == DROP) & ~holds(step.next_obs)
+        return dropped
 
 
 class OpenDoor(Errand):
@@ -165,14 +165,14 @@ class OpenDoor(Errand):
     def reward(self, step: Step) -> Array:
         """Take 1 off where it shuts a door: else it would do so to open it again."""
         shuts = at_open_door(step.obs) & shut(ahead(step.next_obs)) & (step.action == TOGGLE)
-        found: Array = np.where(shuts, -1.02, super().reward(step))
-        return found
+        reward: Array = np.where(shuts, -1.02, super().reward(step))
+        return reward
 
     def success(self, step: Step) -> Array:
         """Return whether the door before it is open now."""
         now_open = shut(ahead(step.obs)) & at_open_door(step.next_obs)
-        found: Array = now_open & (step.action == TOGGLE)
-        return found
+        opened: Array = now_open & (step.action == TOGGLE)
+        return opened
 
 
 class NextRoom(Errand):
@@ -185,8 +185,8 @@ class NextRoom(Errand):
     def success(self, step: Step) -> Array:
         """Return whether it leaves a doorway straight on."""
         on = (step.action == FORWARD) & free(ahead(step.obs))
-        found: Array = on & between_walls(step.obs) & ~between_walls(step.next_obs)
-        return found
+        entered: Array = on & between_walls(step.obs) & ~between_walls(step.next_obs)
+        return entered
 
 
 class ReachGoal(Errand):
@@ -198,8 +198,8 @@ class ReachGoal(Errand):
 
     def success(self, step: Step) -> Array:
         """Return whether it enters the goal."""
-        found: Array = (step.action == FORWARD) & (ahead(step.obs)[:, 0] == GOAL)
-        return found
+        reached: Array = (step.action == FORWARD) & (ahead(step.obs)[:, 0] == GOAL)
+        return reached
 
 
 CELLS = Network(hidden=(64,), encoder="cells")  # a cell's numbers are kinds, not brightnesses
@@ -260,19 +260,19 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
         "algorithm": WORKER,
         "selector": SELECTOR,
     } | how
-    found = Hierarchy(spec(rooms), [s() for s in SKILLS], **settings)
+    hierarchy = Hierarchy(spec(rooms), [s() for s in SKILLS], **settings)
     for name, steps in STEPS.items():
-        found.skill(name).steps = steps
-    return found
+        hierarchy.skill(name).steps = steps
+    return hierarchy
 
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """Return the hierarchy in these rooms with skills that are there already, by name."""
-    found = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
-    for skill in found.skills:
+    hierarchy = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
+    for skill in hierarchy.skills:
         skill.policy = skills[skill.name]
         skill.steps = None  # it is not trained
-    return found
+    return hierarchy
 
 
 def going_on(rooms: str, **how: Any) -> Hierarchy:

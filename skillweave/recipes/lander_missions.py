@@ -103,8 +103,8 @@ class Flight(Skill):
     def there(self, obs: Array) -> Array:
         """Return whether it is in the box around the point, slow and upright, (n,) bool."""
         moving = np.hypot(obs[:, VX], obs[:, VY]) + np.abs(obs[:, ANGLE])
-        there: Array = self.in_box(obs) & (moving < 0.5)
-        return there
+        arrived: Array = self.in_box(obs) & (moving < 0.5)
+        return arrived
 
     def in_box(self, obs: Array) -> Array:
         """Return whether it is in the box around the point, (n,) bool."""
@@ -131,8 +131,8 @@ class Hover(Flight):
         """Return 1 less the deviation, 1 for a step in the box, −20 for an episode's end."""
         # The leg requires a place. Where only its speed was paid, a skill stayed just beside it.
         in_box = self.in_box(step.next_obs) & ~step.terminated
-        found: Array = super().reward(step) + in_box
-        return found
+        reward: Array = super().reward(step) + in_box
+        return reward
 
 
 class GoLeft(Flight):
@@ -172,8 +172,8 @@ class Land(Skill):
         distance = np.hypot(obs[:, X], obs[:, Y])
         speed = np.hypot(obs[:, VX], obs[:, VY])
         legs = (obs[:, LEGS] > 0).sum(axis=1)
-        found: Array = -100.0 * (distance + speed + np.abs(obs[:, ANGLE])) + 10.0 * legs
-        return found
+        worth: Array = -100.0 * (distance + speed + np.abs(obs[:, ANGLE])) + 10.0 * legs
+        return worth
 
     def reward(self, step: Step) -> Array:
         """Return the gain in worth, less the fuel.
@@ -233,21 +233,21 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "selector": SELECTOR,
         "train_defaults": TrainDefaults(flat=FLAT),
     } | how
-    found = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
-    found.skill("hover").steps = 300_000
-    found.skill("land").steps = 1_600_000
-    return found
+    hierarchy = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
+    hierarchy.skill("hover").steps = 300_000
+    hierarchy.skill("land").steps = 1_600_000
+    return hierarchy
 
 
 def with_skills(
     mission: str, skills: Mapping[str, Any], gusts: bool = False, **how: Any
 ) -> Hierarchy:
     """Return the hierarchy on a mission with skills that are there already, by name."""
-    found = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
-    for skill in found.skills:
+    hierarchy = declare(mission, gusts, **{"apart": Apart(selector_steps=300_000)} | how)
+    for skill in hierarchy.skills:
         skill.policy = skills[skill.name]
         skill.steps = None  # it is not trained
-    return found
+    return hierarchy
 
 
 def by_leg(obs: Array) -> Array:
@@ -260,12 +260,12 @@ def by_leg(obs: Array) -> Array:
     skills = [GoLeft(), GoRight(), Hover(), Land()]
     may = np.stack([skill.initiation(obs) for skill in skills], axis=1)
     legs = obs[:, TO_DO].reshape(n, -1, len(KINDS)) > 0
-    found = np.full(n, KINDS.index("hover"))
+    kinds = np.full(n, KINDS.index("hover"))
     for leg in reversed(range(legs.shape[1])):
         kind = legs[:, leg].argmax(axis=1)
         able = legs[:, leg].any(axis=1) & may[np.arange(n), kind]
-        found = np.where(able, kind, found)
-    named: Array = np.array([skill.name for skill in skills])[found]
+        kinds = np.where(able, kind, kinds)
+    named: Array = np.array([skill.name for skill in skills])[kinds]
     return named
 
 

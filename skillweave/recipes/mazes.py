@@ -56,8 +56,8 @@ class North(Skill):
         speed = step.next_obs[:, SPEED]
         along = speed @ self.way
         across = np.abs(speed @ self.way[::-1])
-        found: Array = along - across
-        return found
+        reward: Array = along - across
+        return reward
 
     def termination(self, step: Step) -> Array:
         """Return whether it is stuck: slow, and no faster than before."""
@@ -86,8 +86,8 @@ class West(North):
 
 def distance(obs: Array) -> Array:
     """Return metres to the goal as a bird flies, (n,)."""
-    found: Array = np.hypot(*(obs[:, GOAL] - obs[:, PLACE]).T)
-    return found
+    metres: Array = np.hypot(*(obs[:, GOAL] - obs[:, PLACE]).T)
+    return metres
 
 
 class Approach(Skill):
@@ -227,10 +227,10 @@ def declare(maze: str = "large", **how: Any) -> Hierarchy:
 def with_skills(maze: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
     """Return the hierarchy on a maze with skills that are there already, by name."""
     settings = {"selector": FURTHER_SELECTOR, "apart": Apart(selector_steps=200_000)} | how
-    found = declare(maze, **settings)
-    for skill in found.skills:
+    hierarchy = declare(maze, **settings)
+    for skill in hierarchy.skills:
         skill.policy = skills[skill.name]
-    return found
+    return hierarchy
 
 
 hierarchy = declare()

@@ -174,11 +174,11 @@ def with_skills(points: tuple[float, ...], skills: Mapping[str, Any], **how: Any
         "selector": FURTHER_SELECTOR,
         "call_steps": FURTHER_CALL_STEPS,
     } | how
-    found = declare(points, **settings)
-    found.env = spec(points)  # sixteen environments are too few to be shared out
-    for skill in found.skills:
+    hierarchy = declare(points, **settings)
+    hierarchy.env = spec(points)  # sixteen environments are too few to be shared out
+    for skill in hierarchy.skills:
         skill.policy = skills[skill.name]
-    return found
+    return hierarchy
 
 
 def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierarchy:
@@ -196,8 +196,8 @@ def by_automaton(points: tuple[float, ...], skills: Mapping[str, Any]) -> Hierar
 
 def on_leg(leg: int, step: Step) -> Array:
     """Return whether this leg is run now, (N,) bool."""
-    there: Array = step.next_obs[:, LEG][:, leg] == 1.0
-    return there
+    is_next: Array = step.next_obs[:, LEG][:, leg] == 1.0
+    return is_next
 
 
 hierarchy = declare()

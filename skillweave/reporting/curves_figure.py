@@ -117,9 +117,9 @@ def plot_curves(
     must_be_own(out.parent)
     groups = _groups(runs)
     groups = _renamed(groups, labels) if labels is not None else groups
-    everyone = [run for own in groups.values() for run in own]
+    everyone = [run for group in groups.values() for run in group]
     metric = _metric(everyone, metric, agent)
-    lines = tuple(_line(label, own, metric, agent, band) for label, own in groups.items())
+    lines = tuple(_line(label, group, metric, agent, band) for label, group in groups.items())
     binary = metric.endswith("success") or (metric in AXES and agent is None and _binary(everyone))
     paths = _draw(lines, out, metric, agent, binary, width, height)
     return CurvesFigure(paths, lines, metric, _caption(lines, band))
@@ -128,7 +128,7 @@ def plot_curves(
 def _groups(runs: Paths | Mapping[str, Paths]) -> dict[str, list[RunDirectory]]:
     """Return the runs of each line, by its name."""
     if isinstance(runs, Mapping):
-        return {str(label): open_runs(_paths(own)) for label, own in runs.items()}
+        return {str(label): open_runs(_paths(paths)) for label, paths in runs.items()}
     return {group.name: group.runs for group in grouped(open_runs(_paths(runs)))}
 
 
@@ -151,21 +151,21 @@ def _renamed(
 
 def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None) -> str:
     """Return the metric that is drawn; every run has it."""
-    known = [set(_curves_of(run, agent)) for run in runs]
-    common = set.intersection(*known)
+    metrics_of_runs = [set(_curves_of(run, agent)) for run in runs]
+    common = set.intersection(*metrics_of_runs)
     if metric is None:
         metric = next((m for m in ("eval_return", "return") if m in common), "return")
-    for run, own in zip(runs, known, strict=True):
-        if metric not in own:
+    for run, metrics in zip(runs, metrics_of_runs, strict=True):
+        if metric not in metrics:
             whose = "the whole policy" if agent is None else repr(agent)
-            if not own:
+            if not metrics:
                 agents = ", ".join(dict.fromkeys(c.agent for c in read_curves(run))) or "none yet"
                 raise DeclarationError(
                     f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
                 )
             raise DeclarationError(
                 f"{run.path} has no metric {short(metric)} of {whose}."
-                f"{close_matches(metric, own) or ' There are: ' + ', '.join(sorted(own))}"
+                f"{close_matches(metric, metrics) or ' There are: ' + ', '.join(sorted(metrics))}"
             )
     return metric
 
@@ -174,17 +174,19 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     """Return curves by metric: of an agent, or of the whole policy over all steps of the run."""
     all_curves = read_curves(run)
     if agent is not None:
-        wanted = {c.stage: c.points for c in all_curves if c.agent == agent}
+        points_of_stage = {c.stage: c.points for c in all_curves if c.agent == agent}
     else:
         whole = {e["name"] for e in run.manifest["stages"] if e["kind"] in WHOLE}
-        wanted = {c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole}
+        points_of_stage = {
+            c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole
+        }
     before = 0
     parts = list[tuple[int, dict[str, Curve]]]()
     for entry in run.manifest["stages"]:
-        if entry["name"] in wanted:
-            parts.append((before, wanted[entry["name"]]))
+        if entry["name"] in points_of_stage:
+            parts.append((before, points_of_stage[entry["name"]]))
         # An agent's steps are the steps of the stages in which it learns.
-        if agent is None or entry["name"] in wanted:
+        if agent is None or entry["name"] in points_of_stage:
             before += int(entry.get("steps", entry["budget"]))
     names = dict.fromkeys(name for _, points in parts for name in points)
     return {m: _joined([(b, points[m]) for b, points in parts if m in points]) for m in names}

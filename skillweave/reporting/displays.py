@@ -76,19 +76,19 @@ def open_display(*, transient: bool = False) -> Display | None:
     """
     if _open:
         return None
-    found: Display | None = None
+    display: Display | None = None
     try:
         if in_notebook():
-            found = Cell(transient)
+            display = Cell(transient)
         elif _may_draw():
-            found = make_bars(transient)
+            display = make_bars(transient)
     except (OSError, ValueError):
         return None
-    if found is None:
+    if display is None:
         return None
-    found = Shielded(found)
-    _open.append(found)
-    return found
+    display = Shielded(display)
+    _open.append(display)
+    return display
 
 
 class Shielded:

@@ -150,12 +150,12 @@ class _Gif:
         The captions' own colours, so that text stays crisp, a cube for whatever is to come, and
         the best for the first frame. ``CLEAR`` repeats the first, and so shows nothing of its own.
         """
-        own = np.reshape(OWN_COLORS, (-1, 3))
+        captions = np.reshape(OWN_COLORS, (-1, 3))
         cube = np.indices((5, 5, 5)).reshape(3, -1).T
-        best = first.quantize(self.CLEAR - len(own) - len(cube)).getpalette()
-        wanted = np.concatenate([own, cube * 255 // 4, np.reshape(best, (-1, 3))])
+        best = first.quantize(self.CLEAR - len(captions) - len(cube)).getpalette()
+        palette = np.concatenate([captions, cube * 255 // 4, np.reshape(best, (-1, 3))])
         colors = np.zeros((256, 3), np.uint8)
-        colors[: len(wanted)] = wanted
+        colors[: len(palette)] = palette
         self._table = self._image.new("P", (1, 1))
         self._table.putpalette(colors.tobytes())
         self._shown = np.full(first.size[::-1], self.CLEAR, np.uint8)

@@ -162,7 +162,7 @@ class RunDirectory:
         _check_file_names(manifest)
         if path.is_file():
             raise RunError(f"{path} exists and is not an empty directory; choose another")
-        made = not path.exists()
+        is_new = not path.exists()
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -187,7 +187,7 @@ class RunDirectory:
             if not (path / "run.json").exists():
                 remove(path / LOCK)
             lock.release()
-            if made:
+            if is_new:
                 with suppress(OSError):
                     path.rmdir()
             raise
@@ -542,8 +542,8 @@ def _check_ours(path: Path, run: RunDirectory | None = None) -> None:
     copies = tuple(f"{s['name'].replace('/', '.')}.*" for s in skills)
     if not (path / "run.json").is_file():
         lock = path / LOCK
-        ours = lock.is_file() and not lock.is_symlink() and lock.stat().st_size < 300
-        if any(path.iterdir()) and not (ours and LOCK_TEXT.fullmatch(lock.read_bytes())):
+        is_lock = lock.is_file() and not lock.is_symlink() and lock.stat().st_size < 300
+        if any(path.iterdir()) and not (is_lock and LOCK_TEXT.fullmatch(lock.read_bytes())):
             raise RunError(f"{path} exists and is not an empty directory; choose another")
     for foreign in _foreign(path, copies):
         raise RunError(

@@ -222,9 +222,9 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
-def check_unchanged(path: Path, found: str, written: str) -> None:
+def check_unchanged(path: Path, actual: str, recorded: str) -> None:
     """Raise a RunError where a file's checksum differs from the one that the run recorded."""
-    if found != written:
+    if actual != recorded:
         raise RunError(
             f"{path} is not the file that the run wrote there: its checksum differs. Restore the "
             "file, or train again"

@@ -339,10 +339,10 @@ def identity(manifest: Mapping[str, Any]) -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Skillweave, Python and dependencies, and the platform."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    version_of = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("skillweave", "torch", "gymnasium", "numpy", "envpool"):
         try:
-            found[name] = metadata.version(name)
+            version_of[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return version_of

@@ -185,8 +185,8 @@ class Automaton(ReadySelector):
     def _happened(self, event: Event, step: Step, last: LastCall) -> Array:
         """Return whether an event has happened in this step, (n,) bool."""
         if isinstance(event, str):
-            wanted = last.succeeded if event == "success" else ~last.succeeded
-            happened: Array = (last.why != CallEnd.RUNNING) & wanted
+            as_named = last.succeeded if event == "success" else ~last.succeeded
+            happened: Array = (last.why != CallEnd.RUNNING) & as_named
             return happened
         name = function_name(event)
         n = len(step.reward)

@@ -59,18 +59,18 @@ class FunctionSelector(ReadySelector):
         function = self.function
         if self.asks_last:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
-            value = called(lambda given: function(given, last), read_only(obs), self._who)
-            given: Any = (obs, last)
+            value = called(lambda seen: function(seen, last), read_only(obs), self._who)
+            arguments: Any = (obs, last)
         else:
             value = called(function, read_only(obs), self._who)
-            given = obs
+            arguments = obs
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
             numbers = [self._number(name, self._who, SkillError) for name in chosen.tolist()]
             chosen = np.array(numbers, int)
         choices = Discrete(len(self.skills))
         chosen = checked_actions(chosen, len(obs), choices, self._who, SkillError)
-        probe(function, given, len(obs), self._who)
+        probe(function, arguments, len(obs), self._who)
         self._check_starts(chosen, obs, mask)
         return chosen, memory
 

@@ -779,7 +779,7 @@ def test_an_error_is_one_line_and_its_traceback_is_shown_on_demand(
     assert call("evaluate", "nowhere").err == sentence
     shown = call("evaluate", "nowhere", "--traceback").err
     assert shown.startswith("Traceback (most recent call last)")
-    assert "targets.py" in shown
+    assert "execute.py" in shown
     assert shown.endswith(sentence)
     monkeypatch.setenv("SKILLWEAVE_TRACEBACK", "1")
     assert call("evaluate", "nowhere").err == shown

@@ -100,15 +100,15 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
     keys = obs.dtype.names or ()
     parts = {k: obs[k] for k in keys} if isinstance(names, Mapping) else {"": obs}
     named = names if isinstance(names, Mapping) else {"": names}
-    for key, own in named.items():
+    for key, part_names in named.items():
         where = f" of {key!r}" if key else ""
         if key not in parts:
             return f"obs_names is not used{where}: an observation has no such key."
         count = int(np.prod(parts[key].shape[1:]))
-        if len(own) != count:
+        if len(part_names) != count:
             return (
-                f"obs_names is not used{where}: it has {len(own):,} names, and an observation "
-                f"{count:,} numbers."
+                f"obs_names is not used{where}: it has {len(part_names):,} names, and an "
+                f"observation {count:,} numbers."
             )
     return None
 
@@ -165,7 +165,7 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
     else:
         parts = [("obs", obs, None if isinstance(names, Mapping) else names)]
     columns: dict[str, Array] = {}
-    for name, part, own in parts:
+    for name, part, part_names in parts:
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
         flat = np.asarray(part).reshape(len(part), -1)
@@ -173,6 +173,10 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
             alone = part.ndim == 1
             for i in range(flat.shape[1]):
                 usual = name if alone else f"{name}[{i}]"
-                label = own[i] if own is not None and len(own) == flat.shape[1] else usual
+                label = (
+                    part_names[i]
+                    if part_names is not None and len(part_names) == flat.shape[1]
+                    else usual
+                )
                 columns[usual if label in columns else label] = flat[:, i].astype(float)
     return {k: v for k, v in columns.items() if np.isfinite(v).all()}

@@ -68,9 +68,9 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
         "skills": [
-            (g.key, g.name, own, _followed(g, saved))
+            (g.key, g.name, skill_rows, _followed(g, saved))
             for g in groups
-            if (own := _skill_rows(g, saved))
+            if (skill_rows := _skill_rows(g, saved))
         ],
         "runs": [_run_row(g, run, saved[run.path], say) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
@@ -150,13 +150,13 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
     """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
     dots = []
     bars = []
-    for group, own in zip(groups, scores, strict=True):
+    for group, group_scores in zip(groups, scores, strict=True):
         for run in group.runs:
             if (e := saved[run.path]) is not None:
                 seed = run.manifest["seed"]
                 dots.append({"group": group.key, "x": e.evaluation.mean, "seed": seed})
-        if own:
-            summary = over_seeds(np.array(own))
+        if group_scores:
+            summary = over_seeds(np.array(group_scores))
             bar = {"group": group.key, "x": float(summary.mean)}
             if summary.low is not None and summary.high is not None:
                 bar |= {"low": float(summary.low), "high": float(summary.high)}

@@ -40,7 +40,7 @@ def read_curves(run: RunDirectory) -> list[Curves]:
     Raises:
         RunError: the file is damaged.
     """
-    found: dict[tuple[str, str], Curves] = {}
+    curves_of: dict[tuple[str, str], Curves] = {}
     stages = {entry["name"]: entry for entry in run.manifest["stages"]}
     for line in run.metrics():
         stage = str(line.get("stage"))
@@ -53,10 +53,12 @@ def read_curves(run: RunDirectory) -> list[Curves]:
             # A key of info may have a dot of its own.
             agent, dot, metric = ("", "", key) if key.startswith(INFO) else key.rpartition(".")
             agent = agent if dot else stage
-            curves = found.setdefault((stage, agent), Curves(stage, agent))
+            curves = curves_of.setdefault((stage, agent), Curves(stage, agent))
             curves.points.setdefault(metric, []).append((int(line["steps"]), float(value)))
     order = list(stages)
-    return sorted(found.values(), key=lambda c: (order.index(c.stage), c.agent != c.stage, c.agent))
+    return sorted(
+        curves_of.values(), key=lambda c: (order.index(c.stage), c.agent != c.stage, c.agent)
+    )
 
 
 def reached_steps(all_curves: Sequence[Curves]) -> dict[str, int]:

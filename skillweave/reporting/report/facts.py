@@ -38,22 +38,22 @@ def name_of(run: RunDirectory) -> str:
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
     m = run.manifest
-    found = [("Environment", m["env"])]
+    rows = [("Environment", m["env"])]
     if m["env_kwargs"]:
-        found.append(("Made with", plain(m["env_kwargs"])))
-    found.append(("Recipe", m.get("recipe") or "declared in Python"))
-    found += [("Seed", str(m["seed"])), ("Made", m["created"].replace("T", " "))]
+        rows.append(("Made with", plain(m["env_kwargs"])))
+    rows.append(("Recipe", m.get("recipe") or "declared in Python"))
+    rows += [("Seed", str(m["seed"])), ("Made", m["created"].replace("T", " "))]
     if m["kind"] == "hierarchy":
-        found.append(("Skills", ", ".join(s["name"] for s in m["skills"])))
-        found.append(("A call lasts", _call_length(m)))
+        rows.append(("Skills", ", ".join(s["name"] for s in m["skills"])))
+        rows.append(("A call lasts", _call_length(m)))
         selector = m.get("selector")
-        found.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
-        found.append(("Learning", m.get("learn", "apart")))
+        rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
+        rows.append(("Learning", m.get("learn", "apart")))
         if m.get("interrupt") is not None:
-            found.append(("Calls are cut at", f"{m['interrupt']} deviations"))
+            rows.append(("Calls are cut at", f"{m['interrupt']} deviations"))
         if m.get("reflexes"):
-            found.append(("Reflexes", ", ".join(m["reflexes"])))
-    return found
+            rows.append(("Reflexes", ", ".join(m["reflexes"])))
+    return rows
 
 
 def _call_length(m: Mapping[str, Any]) -> str:
@@ -105,28 +105,28 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
 
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     """Return a sentence for each unfinished stage; ``steps``: those of its last metrics."""
-    found = []
+    sentences = []
     for entry in run.manifest["stages"]:
         name = entry["name"]
         budget = entry["budget"]
         if entry["status"] == "waiting":
-            found.append(f"The stage {name!r} has not begun.")
+            sentences.append(f"The stage {name!r} has not begun.")
         elif entry["status"] == "training":
             far = f"after {steps[name]:,}" if name in steps else "before the first line of metrics"
-            found.append(
+            sentences.append(
                 f"The stage {name!r} is not finished: it stands {far} of {budget:,} steps."
             )
-    if found:
-        found.append(
+    if sentences:
+        sentences.append(
             "Only a finished run can be played, so there are no episodes and no film. To finish "
             f"it: {command_words('resume', run)}"
         )
-    return found
+    return sentences
 
 
 def settings(m: Mapping[str, Any]) -> dict[str, Any]:
     """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    found: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
+    values: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
     names = (
         "kind",
         "learn",
@@ -145,16 +145,16 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "eval_episodes",
         "keep",
     )
-    found |= {k: m[k] for k in names if k in m}
+    values |= {k: m[k] for k in names if k in m}
     for skill in m.get("skills", ()):
-        own = {k: v for k, v in skill.items() if k != "name"}
-        found |= flat(f"skills.{skill['name']}", own)
+        fields = {k: v for k, v in skill.items() if k != "name"}
+        values |= flat(f"skills.{skill['name']}", fields)
     for entry in m["stages"]:
-        own = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
+        fields = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
         # From which run differs from seed to seed.
-        own |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}
-        found |= flat(entry["name"], own)
-    return found
+        fields |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}
+        values |= flat(entry["name"], fields)
+    return values
 
 
 def plain(value: Any) -> str:

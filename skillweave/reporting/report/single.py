@@ -114,9 +114,9 @@ def play_episodes(
             "Of the calls, neither the skills' own rewards nor their successes are known, as the "
             "run was loaded without the code of its skills: --recipe FILE.py gives it."
         )
-    wanted = [skill.color for skill in log.skills]
-    wanted += [None] * (len(log.labels) - len(wanted))
-    colors = [color_of(i, color) for i, color in enumerate(wanted)]
+    skill_colors = [skill.color for skill in log.skills]
+    skill_colors += [None] * (len(log.labels) - len(skill_colors))
+    colors = [color_of(i, color) for i, color in enumerate(skill_colors)]
     named = spec.observation_names()
     if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
         missing.append(misfit)
@@ -201,13 +201,13 @@ def _sentence(error: SkillweaveError) -> str:
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
     names = [skill["name"] for skill in run.manifest.get("skills", ())]
-    found = {name: color_of(i) for i, name in enumerate(names)}
+    colors = {name: color_of(i) for i, name in enumerate(names)}
     if played is not None:
-        found |= dict(zip(played.log.labels, played.colors, strict=True))
+        colors |= dict(zip(played.log.labels, played.colors, strict=True))
     for entry in run.manifest["stages"]:
         for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
-            found.setdefault(name, color_of(len(found)))
-    return {name: charts.hex_of(color) for name, color in found.items()}
+            colors.setdefault(name, color_of(len(colors)))
+    return {name: charts.hex_of(color) for name, color in colors.items()}
 
 
 def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -271,9 +271,9 @@ def _scores(
         ],
         "reflexes": reflex_rows(score.reflexes, sum(score.lengths)),
         "transitions": [
-            (path, transition_rows(list(own), counts))
-            for path, own in levels_of(score.skills).items()
-            if (counts := transitions(own)) is not None
+            (path, transition_rows(list(reports), counts))
+            for path, reports in levels_of(score.skills).items()
+            if (counts := transitions(reports)) is not None
         ],
     }
 
@@ -349,19 +349,19 @@ def _episodes(played: Played) -> dict[str, Any]:
     """Return the data of the played episodes for the page's script."""
     log = played.log
     colors = [charts.hex_of(c) for c in played.colors]
-    found: dict[str, Any] = {
+    data: dict[str, Any] = {
         "labels": list(log.labels),
         "colors": colors,
         "inks": [charts.ink_on(c) for c in played.colors],
         "episodes": played.shown,
     }
-    found["seen"], _ = seen(log.episodes[0].calls[:1], played.named)
+    data["seen"], _ = seen(log.episodes[0].calls[:1], played.named)
     if played.film is not None:
-        found["film"] = {"fps": played.film.fps, "every": played.film.every}
+        data["film"] = {"fps": played.film.fps, "every": played.film.every}
     if log.labels != (AGENT,):
         decisions = decision_data(log, played.named)
         used = sorted({row[-2] for row in decisions["rows"]})
         names = [log.labels[i] for i in used]
         decisions["spec"] = charts.choices(names, [colors[i] for i in used])
-        found["decisions"] = decisions
-    return found
+        data["decisions"] = decisions
+    return data

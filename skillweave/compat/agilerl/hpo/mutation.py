@@ -69,6 +69,8 @@ class Mutations:
                 settings = agent.native.member.config
                 ranges = {k: r for k, r in self._ranges.items() if hasattr(settings, k)}
                 chances = dict(zip(KINDS, (kinds / kinds.sum()).tolist(), strict=True))
-                said = agent.native.mutate(Native(**chances, ranges=ranges, **self._how), self.rng)
-                agent.mut = _WORDS.get(said.mutation) or _WORDS[next(iter(said.changes))]
+                change = agent.native.mutate(
+                    Native(**chances, ranges=ranges, **self._how), self.rng
+                )
+                agent.mut = _WORDS.get(change.mutation) or _WORDS[next(iter(change.changes))]
         return population
