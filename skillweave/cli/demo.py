@@ -16,7 +16,7 @@ from typing import Any
 from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.cli import commands
-from skillweave.cli.telling import put, save_score, tell
+from skillweave.cli.output import print_line, print_result, save_score
 from skillweave.errors import MissingExtra, RunError
 from skillweave.messages import shown_path
 from skillweave.recipes import lander_missions as missions
@@ -53,7 +53,7 @@ class Demo:
     def say(self, text: str = "") -> None:
         """Print a line at once, since the next one may take a minute."""
         if not self.command.json:
-            put(text)
+            print_line(text)
 
     def lander(self) -> None:
         """Learn LunarLander with the tutorial's three skills."""
@@ -181,4 +181,4 @@ def demo(command: commands.Demo) -> None:
         "own skills in 35 lines."
     )
     if command.json:
-        tell(command, shown.result, "")
+        print_result(command, shown.result, "")

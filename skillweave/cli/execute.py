@@ -17,9 +17,9 @@ from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import ASK, declared_in, load_from
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
+from skillweave.cli.output import print_result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
-from skillweave.cli.telling import run_words, save_score, tell
 from skillweave.cli.training import resume, train
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
@@ -67,9 +67,9 @@ def run(command: commands.Command) -> int:
         case commands.Export():
             _export(command)
         case commands.Push():
-            tell(command, *_push(command))
+            print_result(command, *_push(command))
         case commands.Pull():
-            tell(command, *_pull(command))
+            print_result(command, *_pull(command))
         case commands.ImportAgilerl():
             _import_agilerl(command)
     return 0
@@ -77,7 +77,7 @@ def run(command: commands.Command) -> int:
 
 def _sweep(command: commands.Sweep) -> int:
     result, text = sweep(command)
-    tell(command, result, text)
+    print_result(command, result, text)
     return 1 if result["failed"] else 0
 
 
@@ -95,7 +95,7 @@ def _evaluate(command: commands.Evaluate) -> None:
     result |= {"deterministic": command.deterministic, "skill": command.skill}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
         save_score(trained, score, command.seed, command.deterministic)
-    tell(command, result | score.to_json(), score.for_people())
+    print_result(command, result | score.to_json(), score.for_people())
 
 
 def _render(command: commands.Render) -> None:
@@ -110,7 +110,7 @@ def _render(command: commands.Render) -> None:
         quiet=command.quiet,
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
-    tell(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+    print_result(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
 
 
 def _plot(command: commands.Plot) -> None:
@@ -118,7 +118,7 @@ def _plot(command: commands.Plot) -> None:
     of_several = (command.metric, command.agent, *command.label)
     if len(runs) == 1 and all(word is None for word in of_several) and command.band == "iqr":
         paths = [str(path) for path in plot_run(runs[0], command.out)]
-        tell(command, {"paths": paths}, "\n".join(paths))
+        print_result(command, {"paths": paths}, "\n".join(paths))
         return
     figure = plot_curves(
         command.runs,
@@ -135,7 +135,7 @@ def _plot(command: commands.Plot) -> None:
         "metric": figure.metric,
         "lines": {line.label: line.seeds for line in figure.lines},
     }
-    tell(command, result, "\n".join([*map(str, figure.paths), figure.caption]))
+    print_result(command, result, "\n".join([*map(str, figure.paths), figure.caption]))
 
 
 def _report(command: commands.Report) -> None:
@@ -175,7 +175,7 @@ def _report_page(command: commands.Output, page: dict[str, Any]) -> None:
     lines = [page["verdict"].replace("`", "")] if "verdict" in page else []
     lines += [f"{page['path']}: {page['bytes'] / 1e6:.1f} MB, written in {page['seconds']:.1f} s"]
     lines += [f"missing: {line}" for line in page["missing"]]
-    tell(command, page, "\n".join(lines))
+    print_result(command, page, "\n".join(lines))
 
 
 def _list(command: commands.List) -> None:
@@ -192,7 +192,7 @@ def _list(command: commands.List) -> None:
         lines.append("runs:")
         printable = [{k: one_line(v) for k, v in r.items()} for r in runs]
         lines += [f"  {r['path']:<30} {r['kind']} on {r['env']}: {r['status']}" for r in printable]
-    tell(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
+    print_result(command, {"recipes": shipped, "runs": runs}, "\n".join(lines))
 
 
 def _run_line(path: Path) -> dict[str, Any]:
@@ -210,7 +210,7 @@ def _info(command: commands.Info) -> None:
     if not (Path(command.target) / "run.json").exists() and not Path(command.target).is_dir():
         settings = list_settings(recipes.load(command.target))
         text = "\n".join(f"{k}={v}" for k, v in settings.items())
-        tell(command, {"recipe": command.target, "settings": _plain(settings)}, text)
+        print_result(command, {"recipe": command.target, "settings": _plain(settings)}, text)
         return
     run = RunDirectory.open(command.target)
     m = run.manifest
@@ -218,7 +218,7 @@ def _info(command: commands.Info) -> None:
     sampled = load_evaluation(run, deterministic=False)
     scores = {} if saved is None else {"evaluation": saved.to_json()}
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    tell(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
+    print_result(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
 
 
 def run_lines(
@@ -281,7 +281,7 @@ def _plain(settings: dict[str, Any]) -> dict[str, Any]:
 def _weights(command: commands.Weights) -> None:
     trained = load_run(command.run, command.recipe)
     path = trained.save_weights(command.out)
-    tell(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
+    print_result(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 
 
 def _export(command: commands.Export) -> None:
@@ -290,7 +290,7 @@ def _export(command: commands.Export) -> None:
     name = Path(command.target).name.removesuffix(".safetensors")
     export = target(command).export(command.out or Path(f"{name}-onnx"))
     result = {"path": str(export.path), "files": list(export.files), "code": export.code}
-    tell(command, result, str(export))
+    print_result(command, result, str(export))
 
 
 def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
@@ -336,7 +336,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     out = command.out or command.file.with_suffix(".safetensors")
     algo = convert(command.file, out)
     text = f"wrote {out}: a {algo} agent, for {algo}.load of skillweave.compat.agilerl"
-    tell(command, {"path": str(out), "algorithm": algo}, text)
+    print_result(command, {"path": str(out), "algorithm": algo}, text)
 
 
 def target(command: commands.Watched | commands.Export) -> Run:

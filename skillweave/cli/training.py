@@ -14,8 +14,8 @@ from skillweave import recipes
 from skillweave.api import Hierarchy, Run
 from skillweave.api.loading import declared_by
 from skillweave.cli import commands
+from skillweave.cli.output import print_line, print_result, run_words, save_score
 from skillweave.cli.overrides import apply_overrides, parse_evolve
-from skillweave.cli.telling import put, run_words, save_score, tell
 from skillweave.collecting.cluster import Ray
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
@@ -46,12 +46,12 @@ def train(command: commands.Train) -> None:
     result, lines = _summary(command, trained, command.render)
     if command.versus_flat:
         if not command.json:  # now: the flat agent takes as long again
-            put("\n".join(lines))
+            print_line("\n".join(lines))
         flat = _trained(command, hierarchy, True, flat_out, baseline=True)
         result["flat"], more = _summary(command, flat)
         verdict = _verdict(result["evaluation"], result["flat"]["evaluation"])
         lines = ["", "the flat agent:", *more, "", *verdict]
-    tell(command, result, "\n".join(lines))
+    print_result(command, result, "\n".join(lines))
 
 
 def resume(command: commands.Resume) -> None:
@@ -64,7 +64,7 @@ def resume(command: commands.Resume) -> None:
     except KeyboardInterrupt as error:
         raise _interrupted(error, command.ray) from None
     result, lines = _summary(command, trained)
-    tell(command, result, "\n".join(lines))
+    print_result(command, result, "\n".join(lines))
 
 
 def _trained(

@@ -36,7 +36,8 @@ class SingleAgent:
         self.spaces = spaces
         self.seeds = Seeds(seed)
         self.updates = 0
-        self.rng, self.generator = (self.seeds / "act").numpy(), (self.seeds / "learn").torch()
+        self.rng = (self.seeds / "act").numpy()
+        self.generator = (self.seeds / "learn").torch()
         if member.state is None:
             member.state = make_algorithm(member.config, *spaces).init([self.seeds])
         self.become(member)

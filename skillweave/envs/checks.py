@@ -332,7 +332,7 @@ class Watch:
         self._coarse_noticed = first != 0  # only the first of several gives notices
         self._bounds = ImageBounds(name, space) if first == 0 else None
 
-    def begun(self, obs: Array, ids: Array | None = None) -> Array:
+    def check_reset(self, obs: Array, ids: Array | None = None) -> Array:
         """Return the first observations of environments ``ids`` (None: all), unchanged.
 
         Raises:
@@ -342,7 +342,7 @@ class Watch:
         self._check(obs, ids)
         return obs
 
-    def stepped(self, raw: Any, ids: Array | None = None) -> Any:
+    def check_step(self, raw: Any, ids: Array | None = None) -> Any:
         """Return the result (a ``RawStep``) of a step of environments ``ids``, unchanged.
 
         Raises:

@@ -214,7 +214,7 @@ class GymnasiumEngine:
         if self._draws.looks:
             self._notice_draws()
         self._masks.see(info, ids, obs=obs)
-        return self._watch.begun(obs, ids)
+        return self._watch.check_reset(obs, ids)
 
     def _notice_draws(self) -> None:
         """Give a notice if the environments have just drawn from global generators."""
@@ -238,7 +238,7 @@ class GymnasiumEngine:
             self._notice_draws()
         self._masks.see(info, ids, terminated | truncated, next_obs)
         raw = RawStep(next_obs, reward.astype(np.float32), terminated, truncated, info)
-        self._watch.stepped(raw, ids)
+        self._watch.check_step(raw, ids)
         raw.truncated = (truncated | self._watch.too_long(ids)) & ~terminated
         return raw
 

@@ -183,7 +183,7 @@ class EnvPoolEngine:
 
         obs, info = self._in_pools(ids, reset)
         self._masks.see(info, ids)
-        return self._watch.begun(obs, ids)
+        return self._watch.check_reset(obs, ids)
 
     def _act(self, action: Array, ids: Array) -> RawStep:
         if self._discrete:
@@ -197,7 +197,7 @@ class EnvPoolEngine:
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
         raw = RawStep(*self._in_pools(ids, step))
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
-        self._watch.stepped(raw, ids)
+        self._watch.check_step(raw, ids)
         raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated
         return raw
 

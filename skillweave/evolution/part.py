@@ -127,7 +127,7 @@ class Part:
                 resume_from=Progress(steps=start),
                 schedule_steps=schedule_steps * count,
                 skip_diverged=True,
-                on_tick=_telling(on_tick, spent - start),
+                on_tick=_counting_from(on_tick, spent - start),
             )
             parted(joined, places)
             self._unstack(stack, group)
@@ -164,7 +164,7 @@ class Part:
             resume_from=Progress(self.rounds, start),
             schedule_steps=schedule_steps * count,
             skip_diverged=True,
-            on_tick=_telling(on_tick, -start),
+            on_tick=_counting_from(on_tick, -start),
         )
         parted(joined, self.places)
         for stack, group in zip(stacks, groups, strict=True):
@@ -263,7 +263,7 @@ def spaces_of(learning_task: LearningTask) -> tuple[Any, Any]:
     return learning_task.observation_space, learning_task.action_space
 
 
-def _telling(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
+def _counting_from(on_tick: OnGenerationTick, before: int) -> Callable[[Tick], None]:
     """Return a listener that adds ``before`` steps to the ticks of one loop."""
     return lambda tick: on_tick(before + tick.steps, tick.metrics)
 

@@ -84,7 +84,7 @@ class Parts:
         """Environment steps of fitness measurements in other processes."""
         self.tally = EpisodeTally()
         """The tally of logged keys of ``info``."""
-        make = partial(_stationed, learning_task, _alone(config), seeds, self._bounds, episodes)
+        make = partial(_make_host, learning_task, _alone(config), seeds, self._bounds, episodes)
         self._workers = make_workers(make, parts, learning_task.name)
         self._closed = False
 
@@ -145,12 +145,12 @@ class Parts:
         )
 
 
-class StationedPart:
+class PartHost:
     """A part at its worker; arguments and results are plain data."""
 
     def __init__(self, part: Part, eval_envs: FitnessEnvs) -> None:
         self._part = part
-        self._arena = eval_envs
+        self._eval_envs = eval_envs
 
     def train(self, task: Training) -> Trained:
         """Train members."""
@@ -165,10 +165,10 @@ class StationedPart:
 
     def fitness(self, task: tuple[Sequence[Sent], Seeds]) -> tuple[Array, int]:
         """Return the members' fitness, and the environment steps of its measurement."""
-        before = self._arena.steps_made
+        before = self._eval_envs.steps_made
         members = _received(task[0], self._part.spaces)
-        fitness = self._part.fitness(members, self._arena, task[1])
-        return fitness, self._arena.steps_made - before
+        fitness = self._part.fitness(members, self._eval_envs, task[1])
+        return fitness, self._eval_envs.steps_made - before
 
     def state(self) -> dict[str, Array]:
         """Return the state for ``restore``."""
@@ -181,10 +181,10 @@ class StationedPart:
     def close(self) -> None:
         """Release the environments."""
         self._part.close()
-        self._arena.close()
+        self._eval_envs.close()
 
 
-def _stationed(
+def _make_host(
     learning_task: LearningTask,
     config: AlgorithmConfig,
     seeds: Seeds,
@@ -192,12 +192,12 @@ def _stationed(
     episodes: int,
     each: int,
     number: int,
-) -> StationedPart:
+) -> PartHost:
     seed_global_generators(seeds / "global" / number)
     first = bounds[number]
     end = bounds[number + 1]
     part = Part(learning_task, config, seeds, end - first, first)
-    return StationedPart(part, FitnessEnvs(learning_task, episodes, config.num_envs))
+    return PartHost(part, FitnessEnvs(learning_task, episodes, config.num_envs))
 
 
 def _alone(config: AlgorithmConfig) -> AlgorithmConfig:

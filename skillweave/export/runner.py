@@ -30,7 +30,8 @@ class Runner:
         self.entry = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
         if needs := {k: v for k, v in self.entry["code"].items() if k not in self.code}:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
-        self.dtype, self.root = np.dtype(self.entry["dtype"]), self.made(self.entry["policy"])
+        self.dtype = np.dtype(self.entry["dtype"])
+        self.root = self.made(self.entry["policy"])
         self.reset()
 
     def reset(self) -> None:
@@ -70,7 +71,7 @@ class Runner:
         kinds = (_Code, _Network, _Hierarchy, _Function, _Automaton)
         return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
-    def asks(self, name: str, about: Any) -> bool:
+    def holds(self, name: str, about: Any) -> bool:
         """Return the result of code on an observation or a step."""
         return bool(np.asarray(self.code[name](about))[0])
 
@@ -142,10 +143,10 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.guide.reset()
 
     def may_start(self) -> Any:
-        asks = self.runner.asks
+        holds = self.runner.holds
         obs = self.runner.obs
         code = [s["initiation"] for s in self.skills]
-        may = [name is None or asks(name, obs) for name in code]
+        may = [name is None or holds(name, obs) for name in code]
         return may & np.array([policy.may_start().any() for policy in self.policies])
 
     def act(self, mask: Any, last: Any = None) -> Any:
@@ -164,7 +165,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             self.why = RUNNING
         action = self.policies[self.skill].act(mask)
         for condition, code, fixed in self.entry["reflexes"]:
-            if runner.asks(condition, runner.obs):
+            if runner.holds(condition, runner.obs):
                 action = runner.action(fixed if code is None else runner.code[code](runner.obs)[0])
         return action
 
@@ -176,7 +177,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         (below := self.policies[self.skill]).observe(*when)
         stuck = below.why != RUNNING and not below.may_start().any()
         self.why = LIMIT if stuck or self.elapsed >= self.limit else RUNNING
-        if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
+        if entry["termination"] and runner.holds(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
             worth = self.critic.act(None)
@@ -187,7 +188,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         judge = entry["success"]
         self.succeeded = self.why == OWN
         if judge and self.why != RUNNING:
-            self.succeeded = runner.asks(judge, runner.step(*when))
+            self.succeeded = runner.holds(judge, runner.step(*when))
         self.selector.watch(self, elapsed, timed_out)
         self.guide.watch(self, elapsed, timed_out)
 
@@ -214,11 +215,11 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
         return mask[0] & np.isin(np.arange(mask.shape[1]), self.entry["skills"][self.state])
 
     def watch(self, last: Any, *when: Any) -> None:
-        asks = self.runner.asks
+        holds = self.runner.holds
         step = self.runner.step
         ended = {"success": last.succeeded, "failure": not last.succeeded}
         for origin, target, event, code in self.entry["transitions"]:
             over = last.why != RUNNING and ended.get(event)
-            if self.state == origin and (asks(code, step(*when)) if code else over):
+            if self.state == origin and (holds(code, step(*when)) if code else over):
                 self.state = target
                 return

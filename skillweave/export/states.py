@@ -71,7 +71,7 @@ class States:
                 "ONNX: train the skill, or give it an ONNX file"
             )
         what = "observations (1, ...) to actions (1, ...)"
-        return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
+        return {"kind": "Code", "code": self._code(f"{name}.policy", acts, what)}
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills = policy.skills
@@ -79,14 +79,17 @@ class States:
         selector = policy.selector
         samples = sampled or not skills.greedy_selector
         guide: Any = None if policy.guide is None else policy.guide.selector
-        judged = any(
-            isinstance(x, Automaton) or getattr(x, "asks_last", False) for x in (selector, guide)
+        needs_success = any(
+            isinstance(x, Automaton) or getattr(x, "takes_last_call", False)
+            for x in (selector, guide)
         )
         entry: dict[str, Any] = {
             "kind": "Hierarchy",
             "selector": self._selector(selector, f"{prefix}selector", samples),
             "guide": None if guide is None else self._selector(guide, f"{prefix}guide", False),
-            "skills": [self._skill(skills, i, prefix, judged) for i in range(len(skills.skills))],
+            "skills": [
+                self._skill(skills, i, prefix, needs_success) for i in range(len(skills.skills))
+            ],
             "lengths": list(skills.lengths),
             "reflexes": [self._reflex(reflex, prefix) for reflex in skills.reflexes],
             "critic": None,
@@ -99,14 +102,14 @@ class States:
             entry |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
         return entry
 
-    def _skill(self, skills: SkillSet, i: int, prefix: str, judged: bool) -> dict[str, Any]:
+    def _skill(self, skills: SkillSet, i: int, prefix: str, needs_success: bool) -> dict[str, Any]:
         skill = skills.skills[i]
         name = prefix + skills.skills[i].name
 
         def method(name: str, what: str) -> str | None:
             if not skill.defines(name):
                 return None
-            return self._asks(f"{prefix}{skill.name}.{name}", getattr(skill, name), what)
+            return self._code(f"{prefix}{skill.name}.{name}", getattr(skill, name), what)
 
         return {
             "name": skill.name,
@@ -115,7 +118,7 @@ class States:
             "max_steps": skill.max_steps,
             "initiation": method("initiation", "observations (1, ...) to (1,) bool"),
             "termination": method("termination", "a Step to (1,) bool"),
-            "success": method("success", "a Step to (1,) bool") if judged else None,
+            "success": method("success", "a Step to (1,) bool") if needs_success else None,
         }
 
     def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
@@ -123,10 +126,10 @@ class States:
         code = None
         fixed = None
         what = "observations (1, ...) to (1,) bool"
-        condition = self._asks(f"{name}.condition", reflex.condition, what)
+        condition = self._code(f"{name}.condition", reflex.condition, what)
         if callable(reflex.action):
             what = "observations (1, ...) to actions (1, ...)"
-            code = self._asks(f"{name}.action", reflex.action, what)
+            code = self._code(f"{name}.action", reflex.action, what)
         else:
             fixed = reflex.fixed(self.space).tolist()
         return [condition, code, fixed]
@@ -153,13 +156,13 @@ class States:
                     )
                 return self._automaton(selector, name)
             case FunctionSelector():
-                last = ", and the LastCall," if selector.asks_last else ""
+                last = ", and the LastCall," if selector.takes_last_call else ""
                 what = f"observations (1, ...){last} to skills (1,)"
                 return {
                     "kind": "Function",
-                    "code": self._asks(name, selector.function, what),
+                    "code": self._code(name, selector.function, what),
                     "names": list(selector.skills),
-                    "asks_last": selector.asks_last,
+                    "asks_last": selector.takes_last_call,
                 }
             case AgentPolicy():
                 return self._network(agent_graph(selector, sampled, name), name)
@@ -177,7 +180,7 @@ class States:
             if callable(event):
                 ends = ""
                 what = "a Step to (1,) bool"
-                code = self._asks(f"{name}.{function_name(event)}", event, what)
+                code = self._code(f"{name}.{function_name(event)}", event, what)
             transitions.append([origin, target, ends, code])
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
         start = selector.state_names.index(selector.start_state)
@@ -188,7 +191,7 @@ class States:
             "transitions": transitions,
         }
 
-    def _asks(self, name: str, function: Any, what: str) -> str:
+    def _code(self, name: str, function: Any, what: str) -> str:
         """Return the runner's name of a function; a second function of a name gets a number."""
         names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
         free = next(n for n in names if self.functions.get(n, function) == function)

@@ -53,7 +53,7 @@ class Progress:
         """Steps and seconds of each stage so far."""
         self._over: set[str] = set()
         self._recent: deque[tuple[int, float]] = deque()  # (steps, seconds) of the latest ticks
-        self._begun = self._shown = 0.0
+        self._started = self._shown = 0.0
 
     def __enter__(self) -> Self:
         self._display = None if self._quiet else open_display()
@@ -76,7 +76,7 @@ class Progress:
     def stage(self, name: str, budget: int) -> None:
         """Start a stage, or continue it; ``budget`` in environment steps."""
         self._plan[name] = budget
-        self._begun = self._shown = time.monotonic()
+        self._started = self._shown = time.monotonic()
         self._recent.clear()
         if self._display is None:
             self._line(f"{self._numbered(name)}: training for {budget:,} steps")
@@ -93,7 +93,7 @@ class Progress:
         while len(self._recent) > 2 and self._recent[1][1] < seconds - RECENT:
             self._recent.popleft()
         now = time.monotonic()
-        pause = max(EVERY, SPREAD * (now - self._begun))
+        pause = max(EVERY, SPREAD * (now - self._started))
         if self._display is not None:
             pause = self._display.every
         if self._quiet or now - self._shown < pause:
@@ -228,7 +228,7 @@ class EpisodeProgress:
         self._tried = False
 
     def __enter__(self) -> Self:
-        self._begun = self._shown = time.monotonic()
+        self._started = self._shown = time.monotonic()
         self._pause = PATIENCE
         return self
 
@@ -264,11 +264,11 @@ class EpisodeProgress:
             return
         text = f"{self._over:,} of {self._episodes:,} episodes, {self._steps:,} steps"
         say(f"{self._name}: {text}")
-        self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._begun))
+        self._pause = max(PLAIN_PATIENCE, SPREAD * (now - self._started))
 
     def _draw(self, now: float) -> None:
         assert self._display is not None
-        taken = now - self._begun
+        taken = now - self._started
         share = self._over / self._episodes
         left = f"{_clock(taken / share - taken)} left" if share else ""
         counted = f"{self._over:,} of {self._episodes:,} episodes"

@@ -146,7 +146,7 @@ def upload(name: str, files: Mapping[str, Path | bytes], private: bool = False) 
     """
     library = hub()
     api = hub_api()
-    with asking(api, name, writes=True):
+    with hub_errors(api, name, writes=True):
         api.create_repo(name, private=private or None, exist_ok=True)
         info = api.model_info(name, timeout=SECONDS)
         existing = [file.rfilename for file in info.siblings or ()]
@@ -240,7 +240,7 @@ def download(name: str, revision: str | None = None) -> Path:
         raise DeclarationError(
             f"revision is {short(revision)}; it must be a branch, a tag or a commit"
         )
-    with asking(api, name, revision=revision):
+    with hub_errors(api, name, revision=revision):
         info = _info(api, name, revision)
         options = {"revision": revision, "allow_patterns": list(WANTED)}
         if isinstance(info, Exception):  # no answer
@@ -299,7 +299,7 @@ def _is_data(file: str) -> bool:
 
 
 @contextmanager
-def asking(
+def hub_errors(
     api: Any, name: str, *, writes: bool = False, revision: str | None = None
 ) -> Iterator[None]:
     """Convert errors of the hub's library within the block to a RunError."""

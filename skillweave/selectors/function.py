@@ -34,11 +34,11 @@ class FunctionSelector(ReadySelector):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(f"function {function_name(function)}()")
         self.function = function
-        self.asks_last = required_arguments(function) > 1
+        self.takes_last_call = required_arguments(function) > 1
 
     def start(self, n: int) -> Memory:
         """Return the initial last call, for functions that use it; else an empty memory."""
-        if not self.asks_last:
+        if not self.takes_last_call:
             return {}
         return {
             "skill": np.full(n, -1),
@@ -57,7 +57,7 @@ class FunctionSelector(ReadySelector):
     ) -> tuple[Array, Memory]:
         """Return the function's choices, (n,), checked."""
         function = self.function
-        if self.asks_last:
+        if self.takes_last_call:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
             value = called(lambda seen: function(seen, last), read_only(obs), self._who)
             arguments: Any = (obs, last)
@@ -76,7 +76,7 @@ class FunctionSelector(ReadySelector):
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Store the end of the last call."""
-        if not self.asks_last:
+        if not self.takes_last_call:
             return memory
         return {
             "skill": last.skill.copy(),

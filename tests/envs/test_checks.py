@@ -209,13 +209,13 @@ def raw(obs, reward=(0.0, 0.0)):
 def test_the_watch_counts_the_steps_of_each_environment():
     watch = Watch("X", BOX, 3)
     fine, bad = np.zeros((2, 2), np.float32), np.float32([[0, 0], [np.nan, 0]])
-    watch.begun(np.zeros((3, 2), np.float32))
+    watch.check_reset(np.zeros((3, 2), np.float32))
     for _ in range(4):
-        watch.stepped(raw(fine), np.array([0, 2]))
-    watch.begun(fine[:1], np.array([0]))
+        watch.check_step(raw(fine), np.array([0, 2]))
+    watch.check_reset(fine[:1], np.array([0]))
     for row, step in ((2, 5), (0, 1)):
         with pytest.raises(SkillweaveError, match=f"X: environment {row}, step {step} "):
-            watch.stepped(raw(bad), np.array([1, row]))
+            watch.check_step(raw(bad), np.array([1, row]))
 
 
 def test_the_watch_sees_the_numbers_in_the_parts_of_an_observation():
@@ -230,17 +230,17 @@ def test_the_watch_sees_the_numbers_in_the_parts_of_an_observation():
 def test_large_numbers_are_numbers():
     watch = Watch("X", BOX, 2)
     huge = np.full((2, 2), 3e38, np.float32)  # their squares are infinite
-    assert watch.begun(huge) is huge
-    watch.stepped(raw(huge, (1e15, -1e15)))
+    assert watch.check_reset(huge) is huge
+    watch.check_step(raw(huge, (1e15, -1e15)))
 
 
 @pytest.mark.parametrize("reward", [2e15, -3e38])
 def test_a_reward_too_large_to_be_squared_names_its_environment(reward):
     # Before, training ended with a NaN and the advice to lower the learning rate.
     watch = Watch("X", BOX, 2)
-    watch.begun(zeros := np.zeros((2, 2), np.float32))
+    watch.check_reset(zeros := np.zeros((2, 2), np.float32))
     with pytest.raises(SkillweaveError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
-        watch.stepped(raw(zeros, (0.0, reward)))
+        watch.check_step(raw(zeros, (0.0, reward)))
 
 
 def test_envpool_is_watched_too(monkeypatch):

@@ -16,9 +16,9 @@ from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 
 
-def tell(command: commands.Output, data: dict[str, Any], text: str) -> None:
+def print_result(command: commands.Output, data: dict[str, Any], text: str) -> None:
     """Print JSON if ``--json`` is given, else the text."""
-    put(as_json(data) if command.json else text)
+    print_line(as_json(data) if command.json else text)
 
 
 def as_json(data: object) -> str:
@@ -26,7 +26,7 @@ def as_json(data: object) -> str:
     return json.dumps(data, default=str).replace("\x7f", "\\u007f")
 
 
-def put(text: str = "") -> None:
+def print_line(text: str = "") -> None:
     """Print a line of results.
 
     Raises:
