@@ -23,54 +23,6 @@ from skillweave.spaces.packing import parts
 from skillweave.types import Array
 
 
-class _Module(nn.Module):
-    """A user's module on one observation, as ``TorchPolicy`` runs it."""
-
-    def __init__(self, policy: TorchPolicy, masked: bool) -> None:
-        super().__init__()
-        self.module = policy.module
-        self.masked = masked
-        self.spaces = policy.observation_space, policy.action_space
-
-    def forward(self, *given: Tensor) -> Tensor:
-        """Return the action; inputs: leaves, mask, noise."""
-        left = iter(given)
-        output = self.module(_nested(self.spaces[0], left))
-        mask = next(left) if self.masked else None
-        return _decoded(output, self.spaces[1], mask, next(left, None))
-
-
-def _nested(space: gym.Space[Any], leaves: Iterator[Tensor]) -> Any:
-    """Return the leaves in the structure of the module's input."""
-    inner = parts(space)
-    if inner is None:
-        return next(leaves).float()
-    values = {name: _nested(part, leaves) for name, part in inner.items()}
-    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
-
-
-def _decoded(
-    output: Tensor, space: gym.Space[Any], mask: Tensor | None, noise: Tensor | None
-) -> Tensor:
-    """Convert a network's output (1, …) to an action, as ``skills.outputs.decoded`` does."""
-    shape = (1, *(space.shape or ()))
-    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
-    if isinstance(space, Box):
-        low, high = (torch.from_numpy(x) for x in (space.low, space.high))
-        return output.reshape(shape).to(dtype).clamp(low, high)
-    if not output.is_floating_point():
-        return output.reshape(shape).to(dtype)
-    if noise is not None:
-        output = output + noise
-    if isinstance(space, MultiBinary):
-        return (output > 0).reshape(shape).to(dtype)
-    if mask is not None:
-        output = output.masked_fill(~mask, -torch.inf)
-    codec = action_codec(space)
-    best = torch.stack([x.argmax(-1) for x in output.split(list(codec.parts), dim=1)], dim=1)
-    return (best.reshape(shape) + torch.from_numpy(_start(space))).to(dtype)
-
-
 def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
     """Return the graph of a user's module; inputs and outputs as in ``agent_graph``.
 
@@ -123,6 +75,60 @@ def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
     whole = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
     whole.ir_version = model.ir_version
     return Graph(whole.SerializeToString(deterministic=True), choices, noise=noise)
+
+
+# A user's module
+
+
+class _Module(nn.Module):
+    """A user's module on one observation, as ``TorchPolicy`` runs it."""
+
+    def __init__(self, policy: TorchPolicy, masked: bool) -> None:
+        super().__init__()
+        self.module = policy.module
+        self.masked = masked
+        self.spaces = policy.observation_space, policy.action_space
+
+    def forward(self, *given: Tensor) -> Tensor:
+        """Return the action; inputs: leaves, mask, noise."""
+        left = iter(given)
+        output = self.module(_nested(self.spaces[0], left))
+        mask = next(left) if self.masked else None
+        return _decoded(output, self.spaces[1], mask, next(left, None))
+
+
+def _nested(space: gym.Space[Any], leaves: Iterator[Tensor]) -> Any:
+    """Return the leaves in the structure of the module's input."""
+    inner = parts(space)
+    if inner is None:
+        return next(leaves).float()
+    values = {name: _nested(part, leaves) for name, part in inner.items()}
+    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
+
+
+def _decoded(
+    output: Tensor, space: gym.Space[Any], mask: Tensor | None, noise: Tensor | None
+) -> Tensor:
+    """Convert a network's output (1, …) to an action, as ``skills.outputs.decoded`` does."""
+    shape = (1, *(space.shape or ()))
+    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
+    if isinstance(space, Box):
+        low, high = (torch.from_numpy(x) for x in (space.low, space.high))
+        return output.reshape(shape).to(dtype).clamp(low, high)
+    if not output.is_floating_point():
+        return output.reshape(shape).to(dtype)
+    if noise is not None:
+        output = output + noise
+    if isinstance(space, MultiBinary):
+        return (output > 0).reshape(shape).to(dtype)
+    if mask is not None:
+        output = output.masked_fill(~mask, -torch.inf)
+    codec = action_codec(space)
+    best = torch.stack([x.argmax(-1) for x in output.split(list(codec.parts), dim=1)], dim=1)
+    return (best.reshape(shape) + torch.from_numpy(_start(space))).to(dtype)
+
+
+# An ONNX file
 
 
 _REAL = (1, 10, 11, 16)  # ONNX's numbers of float32, float16, float64 and bfloat16
@@ -184,6 +190,9 @@ class _Nodes:
             first += n
         joined = self.then("Concat", *best, axis=1)
         return self.then("Add", joined, _start(space).reshape(1, -1))
+
+
+# Both
 
 
 def _start(space: Any) -> Array:

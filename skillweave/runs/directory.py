@@ -70,6 +70,7 @@ First = Callable[["RunDirectory"], None]
 FINAL = "final"
 """The folder of final states."""
 LINES = ("metrics_bytes", "lineage_bytes")
+"""Fields of headers and of the manifest: sizes of the files of lines."""
 
 
 LONGEST_NAME = 255
@@ -88,30 +89,7 @@ FOLDERS = {
 LEFT = ("wandb",)
 """Folders of a run's trackers; they stay, because they belong to the tracker."""
 LOCK_TEXT = re.compile(rb"(\d+ [^\n]*\n)?")
-
-
-def _check_file_names(manifest: Mapping[str, Any]) -> None:
-    """Raise a DeclarationError where the name of a policy's file would be too long."""
-    for entry in manifest["stages"]:
-        for name in (entry["name"], *entry["learns"]):
-            file = _policy_file(entry["name"], name)
-            if len(file) + MORE > LONGEST_NAME:
-                raise DeclarationError(
-                    f"the weights of {shown(name, 100)} would be in a file whose name has "
-                    f"{len(file)} letters, and file systems take {LONGEST_NAME - MORE}; give "
-                    "skills on the way to it shorter names"
-                )
-
-
-def _policy_file(stage: str, name: str | None) -> str:
-    """Return the file name of a stage's policy, or of one of its learners."""
-    path = stage if name in (None, stage) else f"{stage}.{name}"
-    return f"{file_name(path)}.safetensors"
-
-
-def file_name(path: str) -> str:
-    """Return the file name of a path in the hierarchy: ``inner.skill`` for ``inner/skill``."""
-    return path.replace("/", ".")
+"""The content of a lock file: a process and its machine, or nothing."""
 
 
 class RunDirectory:
@@ -512,6 +490,33 @@ class RunDirectory:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
+
+
+# Names of files
+
+
+def _check_file_names(manifest: Mapping[str, Any]) -> None:
+    """Raise a DeclarationError where the name of a policy's file would be too long."""
+    for entry in manifest["stages"]:
+        for name in (entry["name"], *entry["learns"]):
+            file = _policy_file(entry["name"], name)
+            if len(file) + MORE > LONGEST_NAME:
+                raise DeclarationError(
+                    f"the weights of {shown(name, 100)} would be in a file whose name has "
+                    f"{len(file)} letters, and file systems take {LONGEST_NAME - MORE}; give "
+                    "skills on the way to it shorter names"
+                )
+
+
+def _policy_file(stage: str, name: str | None) -> str:
+    """Return the file name of a stage's policy, or of one of its learners."""
+    path = stage if name in (None, stage) else f"{stage}.{name}"
+    return f"{file_name(path)}.safetensors"
+
+
+def file_name(path: str) -> str:
+    """Return the file name of a path in the hierarchy: ``inner.skill`` for ``inner/skill``."""
+    return path.replace("/", ".")
 
 
 # Directories that a new run may take: an empty one, or one whose run has not learnt anything
