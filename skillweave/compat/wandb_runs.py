@@ -32,7 +32,7 @@ def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None
 
 
 def stay_offline() -> None:
-    """Without a login, set wandb to offline, so that it does not ask for one.
+    """Set wandb to offline if the user has no login, so that it does not request one.
 
     A line on stderr reports it, once, when wandb is imported.
     """

@@ -33,8 +33,9 @@ MOST = 65_536
 SLOW = 50e-6
 """Seconds of a step above which several processes step the environments."""
 PIECES = 5
-STEPS = 50
-"""The number of timed pieces, and the most steps of each, to measure the seconds of a step."""
+"""The number of timed pieces, to measure the seconds of a step."""
+PIECE_STEPS = 50
+"""The most steps of a timed piece."""
 PIECE_SECONDS = 0.1
 """The most seconds of a timed piece."""
 EngineName = Literal["auto", "envpool", "sync"]
@@ -382,7 +383,7 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
         spent = 0.0
         steps = 0
         until = time.perf_counter() + PIECE_SECONDS
-        while steps == 0 or (steps < STEPS and time.perf_counter() < until):
+        while steps == 0 or (steps < PIECE_STEPS and time.perf_counter() < until):
             action = random_actions(env.action_space, 1, rng, masks.now)[0]
             began = time.perf_counter()
             obs, _, terminated, truncated, info = env.step(int(action) if discrete else action)

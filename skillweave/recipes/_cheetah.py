@@ -101,7 +101,7 @@ class Patrol(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
-        """The half-cheetah's, without the return at which that is solved."""
+        """Return the half-cheetah's spec, without the return at which that is solved."""
         spec = super().spec
         return spec and replace(spec, reward_threshold=None)
 

@@ -59,7 +59,7 @@ class LookAround:
         return np.where(looks, RIGHT, around), after
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """There is nothing else to notice."""
+        """Return the memory unchanged: ``act`` has updated it."""
         return memory
 
     def acting(self, memory: Memory) -> Any:

@@ -42,7 +42,7 @@ ENDS: Any = {"continuing_task": False}
 
 
 def flat(obs: Any) -> Array:
-    """Place, speed and goal, (..., 6) float32, of PointMaze's observation."""
+    """Return place, speed and goal, (..., 6) float32, of PointMaze's observation."""
     return np.concatenate([obs["observation"], obs["desired_goal"]], axis=-1, dtype=np.float32)
 
 
@@ -62,16 +62,16 @@ class Maze(gym.ObservationWrapper[Any, Any, Any]):
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]  # Gymnasium has it so, too
-        """As it was made."""
+        """Return the render mode that it was made with."""
         return self._render_mode
 
     def observation(self, observation: Any) -> Array:
-        """Place, speed and goal, (6,)."""
+        """Return place, speed and goal, (6,)."""
         self._seen = flat(observation)
         return self._seen
 
     def render(self) -> Any:
-        """Walls, the goal as wide as it counts, and the ball, (H, W, 3) uint8."""
+        """Return a picture, (H, W, 3) uint8: walls, the ball, and the goal as wide as it counts."""
         if self._render_mode is None:
             return None
         walls = walls_of(self)
@@ -100,7 +100,7 @@ class MazePool(PoolWrapper):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def see(self, obs: Any, ids: Array) -> Array:
-        """Place, speed and goal, (k, 6)."""
+        """Return place, speed and goal, (k, 6)."""
         return flat(obs)
 
 
@@ -163,7 +163,7 @@ class ShortestPath:
         self._next = {tuple(c): ways_to(self.walls, tuple(c)) for c in np.argwhere(~self.walls)}
 
     def cell(self, place: Array) -> tuple[int, int]:
-        """Row and column of a place (2,)."""
+        """Return the row and the column of a place (2,)."""
         rows, columns = self.walls.shape
         row, column = np.floor((rows / 2 - place[1], place[0] + columns / 2)).astype(int)
         return int(row), int(column)

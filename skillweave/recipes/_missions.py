@@ -143,7 +143,7 @@ class Mission(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def spec(self) -> Any:  # type: ignore[override]  # Gymnasium has it so, too
-        """LunarLander's, without the return at which that is solved."""
+        """Return LunarLander's spec, without the return at which that is solved."""
         spec = super().spec
         return spec and replace(spec, reward_threshold=None)
 

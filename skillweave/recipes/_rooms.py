@@ -202,7 +202,7 @@ class RoomPool:
         return images, {}
 
     def step(self, action: Array, ids: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Act, each in its room."""
+        """Step each agent in its room."""
         n = len(ids)
         images = np.empty((n, *SPACE.shape), np.uint8)
         reward = np.empty(n, np.float32)
@@ -210,7 +210,7 @@ class RoomPool:
         by_room = self._by_room(ids)
         for pool, rows in by_room:
             pool.send(action[rows], ids[rows])
-        for pool, rows in by_room:  # all of them step meanwhile, none waits for another
+        for pool, rows in by_room:  # all rooms step at the same time
             obs, *results, _ = pool.recv()
             images[rows] = obs["image"]
             reward[rows], terminated[rows], truncated[rows] = results

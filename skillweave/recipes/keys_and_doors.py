@@ -2,8 +2,8 @@
 
 The agent sees the 7×7 cells before it: kind, colour and state of each. Seven skills are learnt
 once, in small rooms of several kinds, each for what it can see: a key, a shut door, a ball; one is
-written by hand. On each further task, where a reward is paid at the end alone, skills and selector
-go on together from there (``going_on``); or a selector learns it alone (``with_skills``).
+written by hand. Each further task pays a reward only at its end. There, skills and selector
+continue to learn together (``going_on``), or a selector learns alone (``with_skills``).
 
     skillweave train keys-and-doors
 
@@ -95,7 +95,7 @@ class Explore(Errand):
 def something_to_do(obs: Array) -> Array:
     """Return whether a skill with a target in view may start, (n,) bool.
 
-    Not `next_room`: an agent without memory would go to and fro through the door behind it.
+    `next_room` does not count: an agent without memory would walk to and fro through one door.
     """
     may_start: Array = np.any([skill.initiation(obs) for skill in ERRANDS], axis=0)
     return may_start
@@ -239,7 +239,7 @@ STEPS = {
     "drop": 100_000,
     "open_box": 800_000,
 }
-"""Most of them look for where a skill may start."""
+"""Training steps of each skill; most of them are spent on the way to where it may start."""
 
 
 APART = Apart(
@@ -267,7 +267,7 @@ def declare(rooms: str = "small", **how: Any) -> Hierarchy:
 
 
 def with_skills(rooms: str, skills: Mapping[str, Any], **how: Any) -> Hierarchy:
-    """Return the hierarchy in these rooms with skills that are there already, by name."""
+    """Return the hierarchy in these rooms with learnt skills, by name; only the selector learns."""
     hierarchy = declare(rooms, **({"apart": replace(APART, selector_steps=1_500_000)} | how))
     for skill in hierarchy.skills:
         skill.policy = skills[skill.name]

@@ -37,7 +37,7 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str]:
-        """The identity of a row."""
+        """Return the identity of a row."""
         return self.under, self.name
 
 

@@ -34,7 +34,7 @@ class Lineage:
 
     @property
     def winner(self) -> Born:
-        """The best of all so far."""
+        """Return the best member of all generations so far."""
         return max((b for b in self.born.values() if b.best), key=lambda b: b.generation)
 
     def parent(self, born: Born) -> Born | None:

@@ -18,25 +18,25 @@ from skillweave.terminal import printable, say
 from skillweave.training.episodes import INFO
 
 EVERY = 5.0
-"""Seconds between two plain lines, at first."""
+"""Seconds between two plain lines at the start of a stage."""
 SPREAD = 0.25
-"""The same later, as a share of the time that the stage has taken: a long run has few lines."""
+"""Later, the share of the stage's time between two lines, so that a long run has few lines."""
 RECENT = 10.0
-"""Seconds of training over which the speed is taken."""
+"""Seconds of training over which the speed is measured."""
 PATIENCE = 1.0
 """Seconds that an evaluation may take before its progress is shown."""
 PLAIN_PATIENCE = 30.0
-"""Distance of lines without a terminal, and the least seconds between two of them."""
+"""The least seconds between two lines of an evaluation, without a terminal."""
 IN_ALL = "in all"
 LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
 
 
 class Progress:
-    """Shows each stage's steps, return (mean of the last 100 episodes), speed and time left.
+    """A display of each stage's steps, return (mean of the last 100 episodes), speed and time left.
 
-    Where several learn in a stage, each has a line below it: how much it acts, and its own reward.
-    Of several stages it shows which one this is, and the time left in all.
+    If several policies learn in a stage, each has a line below it: its share of the steps, and its
+    own reward. If a run has several stages, their number and the time left in all are shown.
 
     A context manager and a listener of the training loops. Without a terminal or a notebook, in CI,
     and with NO_COLOR or TERM=dumb, it writes a line when a stage starts, some while it trains, and
@@ -208,15 +208,15 @@ class Progress:
 
 
 class EpisodeProgress:
-    """Shows how many episodes of an evaluation are over, where it takes longer than a second.
+    """A display of the episodes of an evaluation that are over, if it takes longer than a second.
 
-    It goes away when the evaluation ends. Without a terminal or a notebook there are lines, the
+    It disappears when the evaluation ends. Without a terminal or a notebook it writes lines, the
     first after half a minute.
 
     Args:
-        episodes: how many are played.
+        episodes: the number of episodes.
         quiet: show nothing.
-        name: what is played.
+        name: the name of the evaluation, for the display.
     """
 
     def __init__(self, episodes: int, *, quiet: bool = False, name: str = "evaluation") -> None:
@@ -238,12 +238,12 @@ class EpisodeProgress:
             self._display = None
 
     def watch(self, played: Any) -> None:
-        """See a step of some episodes (``Played``)."""
+        """Count a step of some episodes (``Played``)."""
         over = np.count_nonzero(played.over & (played.episode >= 0))
         self.count(int(played.lasted.sum()), int(over))
 
     def count(self, steps: int, over: int) -> None:
-        """See ``steps`` more steps, and ``over`` more episodes that have ended."""
+        """Count ``steps`` more steps, and ``over`` more episodes that have ended."""
         if self._quiet:
             return
         self._steps += steps

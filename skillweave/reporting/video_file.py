@@ -20,7 +20,7 @@ from skillweave.types import Array
 
 
 class VideoWriter:
-    """Writes a video frame by frame; the file appears only when all of it is there.
+    """A writer of a video, frame by frame; the file appears only when it is complete.
 
     Args:
         path: ends in .gif or .mp4. An existing file is replaced at the end, and stays as it is

@@ -28,7 +28,7 @@ class Curves:
 
     @property
     def label(self) -> str:
-        """Its name for people."""
+        """Return its name for people."""
         return self.stage if self.agent == self.stage else f"{self.agent} in {self.stage}"
 
 
@@ -75,6 +75,6 @@ def metrics_of(all_curves: list[Curves]) -> list[str]:
 
 
 def thinned(points: list[Any], most: int = MOST_POINTS) -> list[Any]:
-    """At most about ``most`` of the points, evenly, the last one among them."""
+    """Return at most about ``most`` of the points, evenly spaced, with the last one."""
     every = -(-len(points) // most)
     return points[::-1][::every][::-1] if every > 1 else points

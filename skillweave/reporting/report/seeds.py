@@ -28,7 +28,7 @@ class OverSeeds:
 
 
 def over_seeds(values: Array) -> OverSeeds:
-    """Interquartile means of values (seeds, …), with percentile intervals; always the same."""
+    """Compute interquartile means of values (seeds, …), and their intervals; always the same."""
     x = np.asarray(values, float)
     n = len(x)
     if n < 2:
