@@ -118,13 +118,13 @@ class SACAlgorithm(ActorCriticAlgorithm):
         params = self.learning_params(state)
         inputs = self.inputs(params, obs)
         alpha = self.alpha(state)
-        head = self.net(params.views, inputs)
+        dist_params = self.net(params.views, inputs)
         if self.codec.discrete:
             q = self.smallest(state.critic, inputs)
             return self.in_rewards(
-                state, expected_soft_value(masked_log_probs(head, mask), q, alpha)
+                state, expected_soft_value(masked_log_probs(dist_params, mask), q, alpha)
             )
-        mean, log_std = self.head.moments(head, None)
+        mean, log_std = self.head.moments(dist_params, None)
         q = self.smallest(state.critic, inputs, mean.tanh())
         return self.in_rewards(state, q + alpha * squashed_entropy(mean, log_std))
 
@@ -150,13 +150,13 @@ class SACAlgorithm(ActorCriticAlgorithm):
         """Return ``r + discount·V̄(s′)``, V̄ the soft value of the slow critics (eq. 5), (P, B)."""
         inputs = self.inputs(params, sample.next_obs)
         alpha = self.alpha(state)
-        head = self.net(self.layout.views(state.params), inputs)
+        dist_params = self.net(self.layout.views(state.params), inputs)
         slow = state.critic_target
         if self.codec.discrete:
-            log_p = masked_log_probs(head, sample.next_mask)
+            log_p = masked_log_probs(dist_params, sample.next_mask)
             value = expected_soft_value(log_p, self.smallest(slow, inputs), alpha)
         else:
-            action, log_prob = squashed_sample(*self.head.moments(head, None), noise[0])
+            action, log_prob = squashed_sample(*self.head.moments(dist_params, None), noise[0])
             value = self.smallest(slow, inputs, action) - alpha * log_prob
         reward = self.rewards(state, sample)
         if sample.between_obs is not None:
@@ -176,13 +176,13 @@ class SACAlgorithm(ActorCriticAlgorithm):
         assert sample.between_discount is not None
         lead = sample.between_discount.shape
         inputs = self.inputs(params, sample.between_obs.flatten(1, 2))
-        head = self.net(self.layout.views(state.params), inputs)
+        dist_params = self.net(self.layout.views(state.params), inputs)
         if self.codec.discrete:
             mask = sample.between_mask
-            log_p = masked_log_probs(head, None if mask is None else mask.flatten(1, 2))
+            log_p = masked_log_probs(dist_params, None if mask is None else mask.flatten(1, 2))
             entropy = -(log_p.exp() * log_p).sum(-1)
         else:
-            entropy = -squashed_sample(*self.head.moments(head, None), noise[0])[1]
+            entropy = -squashed_sample(*self.head.moments(dist_params, None), noise[0])[1]
         return discounted(sample.between_discount, entropy.view(lead)).sum(-1)
 
     def improve_policy(
@@ -205,14 +205,14 @@ class SACAlgorithm(ActorCriticAlgorithm):
         self, views: Views, state: State, mask: Tensor | None, inputs: Inputs, noise: list[Tensor]
     ) -> tuple[Tensor, Tensor]:
         """Return ``E[α·log π − min Q]`` (eq. 7) and the detached policy entropy, each (P,)."""
-        head = self.net(views, inputs)
+        dist_params = self.net(views, inputs)
         alpha = self.alpha(state)
         if self.codec.discrete:
-            log_p = masked_log_probs(head, mask)
+            log_p = masked_log_probs(dist_params, mask)
             with torch.no_grad():
                 q = self.smallest(state.critic, inputs)
             entropy = -(log_p.exp() * log_p).detach().sum(-1)
             return -expected_soft_value(log_p, q, alpha).mean(1), entropy.mean(1)
-        action, log_prob = squashed_sample(*self.head.moments(head, None), noise[0])
+        action, log_prob = squashed_sample(*self.head.moments(dist_params, None), noise[0])
         q = self.smallest(state.critic, inputs, action)
         return (alpha * log_prob - q).mean(1), -log_prob.detach().mean(1)

@@ -120,17 +120,19 @@ class NumpyPPOActor(NumpyActor):
 
     def sample(self, rows: Array, rng: np.random.Generator) -> Sampled:
         """Return actions (B, …) in policy units; log-probabilities, entropies, values (B,)."""
-        head = self.output(rows)
+        dist_params = self.output(rows)
         value = self.output(rows, "critic")[:, 0]
         value = value * self._scale + self._mean
         if not self._choices:
-            return *self._drawn(head, rng), value
-        shifted = head - head.max(-1, keepdims=True)
+            return *self._drawn(dist_params, rng), value
+        shifted = dist_params - dist_params.max(-1, keepdims=True)
         weight = np.exp(shifted)
         running = weight.cumsum(-1)
         total = running[:, -1:]
         action = (running <= rng.random((len(rows), 1), np.float32) * total).sum(-1)
-        np.minimum(action, head.shape[-1] - 1, out=action)  # where rounding led past the last
+        np.minimum(
+            action, dist_params.shape[-1] - 1, out=action
+        )  # where rounding led past the last
         log_p = shifted - np.log(total)
         entropy = -(weight * log_p).sum(-1) / total[:, 0]
         return action, log_p[np.arange(len(rows)), action], entropy, value

@@ -99,9 +99,9 @@ class _Worth(nn.Module):
     def forward(self, *obs: Tensor) -> Tensor:
         """Return the values (1, A)."""
         rows: Any = [x[None] for x in obs]
-        _, head, _ = self.policy.algorithm.act(self.policy.params, rows, None, None)
-        assert head is not None
-        return head[0]
+        _, values, _ = self.policy.algorithm.act(self.policy.params, rows, None, None)
+        assert values is not None
+        return values[0]
 
 
 def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:

@@ -93,11 +93,11 @@ class ActionHead:
             drawn = [torch.randn(shape, generator=g, **FLOAT) for g in generators]
         return torch.stack(drawn, dim=1)
 
-    def act(self, head: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
+    def act(self, dist_params: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return greedy or sampled actions of the distribution.
 
         Args:
-            head: dist_params (..., width), logits already masked.
+            dist_params: (..., width), logits already masked.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
             noise: one step of ``noise``; None: act greedily.
@@ -106,20 +106,20 @@ class ActionHead:
             Actions, (...) for Discrete, else (..., K) or (..., A).
         """
         if not self.discrete:
-            mean, log_std = self.moments(head, log_std)
+            mean, log_std = self.moments(dist_params, log_std)
             return mean if noise is None else torch.addcmul(mean, log_std.exp(), noise)
         if self.codec.multi:
-            head = self._parts(head)
+            dist_params = self._parts(dist_params)
             noise = None if noise is None else self._spread(noise)
-        return head.argmax(-1) if noise is None else categorical_sample(head, noise)
+        return dist_params.argmax(-1) if noise is None else categorical_sample(dist_params, noise)
 
     def stats(
-        self, head: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
+        self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Compute log-probabilities of actions and the entropy of the distribution.
 
         Args:
-            head: dist_params (..., width), a network's outputs.
+            dist_params: (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
             mask: (..., A) bool, allowed actions; None: all.
@@ -129,12 +129,12 @@ class ActionHead:
             Log-probability and entropy in nats, each (...).
         """
         if self.discrete:
-            head = mask_logits(head, mask)
+            dist_params = mask_logits(dist_params, mask)
             if not self.codec.multi:
-                return categorical_stats(head, action)
-            log_prob, entropy = categorical_stats(self._parts(head), action)
+                return categorical_stats(dist_params, action)
+            log_prob, entropy = categorical_stats(self._parts(dist_params), action)
             return log_prob.sum(-1), entropy.sum(-1)
-        mean, log_std = self.moments(head, log_std)
+        mean, log_std = self.moments(dist_params, log_std)
         log_prob, entropy = normal_stats(mean, log_std, action)
         if self.squash:
             log_prob = log_prob - tanh_log_det(action).sum(-1)
@@ -143,7 +143,7 @@ class ActionHead:
             entropy = entropy + tanh_log_det(mean + log_std.exp() * z).sum(-1)
         return log_prob, entropy
 
-    def surplus(self, head: Tensor, log_std: Tensor | None) -> Tensor | None:
+    def surplus(self, dist_params: Tensor, log_std: Tensor | None) -> Tensor | None:
         """Compute the cost of too much entropy, in nats, (...); None: no cost.
 
         A normal's entropy grows with its deviation without limit. Where rewards are rare, a bonus
@@ -152,28 +152,28 @@ class ActionHead:
         thirds. So a wider normal explores no more, and each nat beyond is a cost.
 
         Args:
-            head: dist_params (..., width), a network's outputs.
+            dist_params: (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
         """
         if not self._narrows:
             return None
-        mean, log_std = self.moments(head, log_std)
+        mean, log_std = self.moments(dist_params, log_std)
         beyond = (log_std - math.log(WIDEST)).clamp_min(0.0).expand_as(mean)
         return 2.0 * (beyond * self._bounded.on(beyond.device)).sum(-1)
 
     def kl(
         self,
-        head: Tensor,
+        dist_params: Tensor,
         log_std: Tensor | None,
         other: Tensor,
         other_log_std: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Compute KL(p ‖ q) before any squashing, p of ``head`` and q of ``other``.
+        """Compute KL(p ‖ q) before any squashing, p of ``dist_params`` and q of ``other``.
 
         Args:
-            head: dist_params (..., width) of p.
+            dist_params: (..., width) of p.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
             other: dist_params (..., width) of q.
@@ -184,11 +184,13 @@ class ActionHead:
             The divergence in nats, (...).
         """
         if not self.discrete:
-            return normal_kl(*self.moments(head, log_std), *self.moments(other, other_log_std))
-        head, other = mask_logits(head, mask), mask_logits(other, mask)
+            return normal_kl(
+                *self.moments(dist_params, log_std), *self.moments(other, other_log_std)
+            )
+        dist_params, other = mask_logits(dist_params, mask), mask_logits(other, mask)
         if not self.codec.multi:
-            return categorical_kl(head, other)
-        return categorical_kl(self._parts(head), self._parts(other)).sum(-1)
+            return categorical_kl(dist_params, other)
+        return categorical_kl(self._parts(dist_params), self._parts(other)).sum(-1)
 
     def with_log_prob(self, action: Tensor, log_prob: Tensor, log_std: Tensor | None) -> Tensor:
         """Return dist_params under which actions have exactly these log-probabilities (...).
@@ -204,25 +206,25 @@ class ActionHead:
         if self.discrete:
             rest = torch.log1p(-log_prob.exp().clamp(max=1.0 - 1e-6))
             rest = rest - math.log(max(1, self.codec.size - 1))
-            head = rest[..., None].expand(*rest.shape, self.codec.size)
-            return head.scatter(-1, action[..., None], log_prob[..., None])
+            dist_params = rest[..., None].expand(*rest.shape, self.codec.size)
+            return dist_params.scatter(-1, action[..., None], log_prob[..., None])
         assert log_std is not None
         peak, _ = normal_stats(action, log_std.expand_as(action), action)
         away = (2.0 * (peak - log_prob)).clamp(min=0.0) / self.codec.size
         return action - away.sqrt()[..., None] * log_std.exp()
 
-    def moments(self, head: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
+    def moments(self, dist_params: Tensor, log_std: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return mean and log deviation of a Box's normal, each (..., A) or broadcast to it.
 
         Args:
-            head: dist_params (..., width), a network's outputs.
+            dist_params: (..., width), a network's outputs.
             log_std: (..., A) or broadcast to it, the log deviation where it is a parameter; else
                 None.
         """
         if not self.std_in_head:
             assert log_std is not None
-            return head, log_std
-        mean, raw = head.chunk(2, dim=-1)
+            return dist_params, log_std
+        mean, raw = dist_params.chunk(2, dim=-1)
         return mean, clamp_inward(raw, *LOG_STD)
 
     def to_env(self, action: Array) -> Array:
