@@ -213,59 +213,61 @@ def _info(command: commands.Info) -> None:
         print_result(command, {"recipe": command.target, "settings": _plain(settings)}, text)
         return
     run = RunDirectory.open(command.target)
-    m = run.manifest
+    manifest = run.manifest
     saved = load_evaluation(run)
     sampled = load_evaluation(run, deterministic=False)
     scores = {} if saved is None else {"evaluation": saved.to_json()}
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    print_result(command, m | scores, "\n".join(run_lines(m, [saved, sampled], command.target)))
+    print_result(
+        command, manifest | scores, "\n".join(run_lines(manifest, [saved, sampled], command.target))
+    )
 
 
 def run_lines(
-    m: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
+    manifest: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
 ) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
-    env = one_line(m["env"])
-    created = one_line(m["created"])
-    lines = [f"{m['kind']} on {env}, seed {m['seed']}, made {created}"]
-    calls = f", call_steps {calls_from_json(m)}" if m["kind"] == "hierarchy" else ""
-    calls += f", ready selector: {m['selector']['kind']}" if "selector" in m else ""
-    calls += f", guide: {m['guide']['kind']}" if "guide" in m else ""
-    lines += [f"  recipe: {one_line(m.get('recipe') or '(declared in Python)')}{calls}"]
+    env = one_line(manifest["env"])
+    created = one_line(manifest["created"])
+    lines = [f"{manifest['kind']} on {env}, seed {manifest['seed']}, made {created}"]
+    calls = f", call_steps {calls_from_json(manifest)}" if manifest["kind"] == "hierarchy" else ""
+    calls += f", ready selector: {manifest['selector']['kind']}" if "selector" in manifest else ""
+    calls += f", guide: {manifest['guide']['kind']}" if "guide" in manifest else ""
+    lines += [f"  recipe: {one_line(manifest.get('recipe') or '(declared in Python)')}{calls}"]
     lines += [
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
-    for p in m["stages"]:
-        final = p.get("final", {}).get("return")
+    for stage in manifest["stages"]:
+        final = stage.get("final", {}).get("return")
         lines.append(
-            f"  {p['name']:<14} {p['status']:<9} {p.get('steps', 0):>10,} "
-            f"{p.get('seconds', 0):>8.1f} {p.get('steps_per_second', 0):>8,.0f} "
+            f"  {stage['name']:<14} {stage['status']:<9} {stage.get('steps', 0):>10,} "
+            f"{stage.get('seconds', 0):>8.1f} {stage.get('steps_per_second', 0):>8,.0f} "
             f"{'' if final is None else f'{final:.1f}':>8}"
         )
-        for name, start in p.get("starts", {}).items():
+        for name, start in stage.get("starts", {}).items():
             run = "" if start["run"] is None else f" {start['run']}"
             lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
-        if continued := p.get("continued"):
+        if continued := stage.get("continued"):
             lines.append(f"    continued after {', '.join(f'{k:,}' for k in continued)} steps")
-        if reached := p.get("reached"):
+        if reached := stage.get("reached"):
             lines.append(
-                f"    target reached after {reached['steps']:,} of {p['budget']:,} steps: "
-                f"{p['target']['of']} {reached['value']:g}"
+                f"    target reached after {reached['steps']:,} of {stage['budget']:,} steps: "
+                f"{stage['target']['of']} {reached['value']:g}"
             )
-        if stopped := p.get("stopped"):
+        if stopped := stage.get("stopped"):
             lines.append(
-                f"    a callback ended it after {stopped['steps']:,} of {p['budget']:,} steps"
+                f"    a callback ended it after {stopped['steps']:,} of {stage['budget']:,} steps"
             )
-        if best := p.get("best"):
+        if best := stage.get("best"):
             lines.append(f"    {best_words(best)}")
-        if winner := p.get("winner"):
+        if winner := stage.get("winner"):
             lines.append(
                 f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
                 f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
             )
-        if kept := p.get("kept"):
+        if kept := stage.get("kept"):
             lines.append(f"    {kept_words(kept)}")
-    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in m["versions"].items())]
+    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest["versions"].items())]
     for score in saved:
         if score is not None:
             how = "greedy" if score.deterministic else "sampled"

@@ -63,10 +63,17 @@ def rollout_of(
     log_std = algorithm.layout.views(state.params).get("actor.log_std")
     log_std = None if log_std is None else log_std[:, None].clone()
     log_probs = _tensor(log_prob, np.float32).view(lead)
-    head = algorithm.head.with_log_prob(actions, log_probs, log_std)
+    dist_params = algorithm.head.with_log_prob(actions, log_probs, log_std)
     rewards = rewards.view(lead)
     return Rollout(
-        before, actions, rewards, discount, following, last, dist_params=head, log_std=log_std
+        before,
+        actions,
+        rewards,
+        discount,
+        following,
+        last,
+        dist_params=dist_params,
+        log_std=log_std,
     )
 
 

@@ -137,13 +137,13 @@ class NumpyPPOActor(NumpyActor):
         entropy = -(weight * log_p).sum(-1) / total[:, 0]
         return action, log_p[np.arange(len(rows)), action], entropy, value
 
-    def _drawn(self, head: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    def _drawn(self, dist_params: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return actions, log-probabilities and entropies by torch, for all other action spaces."""
-        outputs = torch.from_numpy(head)
-        heads = self.algorithm.head
+        outputs = torch.from_numpy(dist_params)
+        head = self.algorithm.head
         log_std = None if self._log_std is None else self._log_std[0]
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        noise = heads.noise([generator], 1, len(head))[0, 0]
-        action = heads.act(outputs, log_std, noise)
-        log_prob, entropy = heads.stats(outputs, log_std, None, action)
-        return action.numpy(), log_prob.numpy(), entropy.expand(len(head)).numpy()
+        noise = head.noise([generator], 1, len(dist_params))[0, 0]
+        action = head.act(outputs, log_std, noise)
+        log_prob, entropy = head.stats(outputs, log_std, None, action)
+        return action.numpy(), log_prob.numpy(), entropy.expand(len(dist_params)).numpy()

@@ -46,15 +46,17 @@ def mutate(
 def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[Any, Any]]:
     """Return the old and new values of settings that differ, by dotted name."""
     changes: dict[str, tuple[Any, Any]] = {}
-    for f in fields(old):
-        a, b = getattr(old, f.name), getattr(new, f.name)
-        if a == b:
+    for field in fields(old):
+        before, after = getattr(old, field.name), getattr(new, field.name)
+        if before == after:
             continue
-        if isinstance(a, Network) and isinstance(b, Network):
-            parts = {k.name: (getattr(a, k.name), getattr(b, k.name)) for k in fields(a)}
-            changes |= {f"{f.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
+        if isinstance(before, Network) and isinstance(after, Network):
+            parts = {
+                k.name: (getattr(before, k.name), getattr(after, k.name)) for k in fields(before)
+            }
+            changes |= {f"{field.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
         else:
-            changes[f.name] = (a, b)
+            changes[field.name] = (before, after)
     return changes
 
 

@@ -131,10 +131,14 @@ def _encoder_units(
     after = tuple(Part(name, -2, start, encoder.size // count) for name, start in onward)
     if cnn.kind == "plain":
         return [Units(count, own(str(layer)), after if last else read(str(layer + 1)))]
-    s = layer
+    stage = layer
     after = after if last else read(f"{layer + 1}.in")
     return [  # the channels through the whole stage, and those within each of its blocks
-        Units(count, own(f"{s}.in", f"{s}.0.1", f"{s}.1.1"), read(f"{s}.0.0", f"{s}.1.0") + after),
-        Units(count, own(f"{s}.0.0"), read(f"{s}.0.1")),
-        Units(count, own(f"{s}.1.0"), read(f"{s}.1.1")),
+        Units(
+            count,
+            own(f"{stage}.in", f"{stage}.0.1", f"{stage}.1.1"),
+            read(f"{stage}.0.0", f"{stage}.1.0") + after,
+        ),
+        Units(count, own(f"{stage}.0.0"), read(f"{stage}.0.1")),
+        Units(count, own(f"{stage}.1.0"), read(f"{stage}.1.1")),
     ]

@@ -118,15 +118,15 @@ class _Film:
     def _begin(self) -> None:
         self._elapsed = 0
         self._total = 0.0
-        self._who = ""
+        self._skill = ""
         self._color = BLACK
         self._skills = Counter[str]()
 
     def before_step(self, memory: Memory) -> None:
         """Show what the policy is about to do."""
         if self.label is not None:
-            self._who, self._color = self.label(memory)
-            self._skills[self._who] += 1
+            self._skill, self._color = self.label(memory)
+            self._skills[self._skill] += 1
         if self._elapsed % self.every == 0:
             self._show("return")
 
@@ -148,7 +148,7 @@ class _Film:
 
     def _show(self, word: str, seconds: float | None = None) -> None:
         text = f"step {self._elapsed}   {word} {self._total:+.1f}"
-        self.video.add(caption(frame_of(self.env), self._who, self._color, text), seconds)
+        self.video.add(caption(frame_of(self.env), self._skill, self._color, text), seconds)
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:

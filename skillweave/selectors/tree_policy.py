@@ -132,10 +132,10 @@ def _as_json(node: Node) -> Any:
 class _Tick:
     """One evaluation of the tree for n environments, at a decision."""
 
-    def __init__(self, obs: Array, mask: Array, memory: Memory, who: str) -> None:
+    def __init__(self, obs: Array, mask: Array, memory: Memory, name: str) -> None:
         self.obs = obs
         self.mask = mask
-        self.who = who
+        self.name = name
         self.leaf = memory["leaf"].copy()
         self.succeeded = memory["succeeded"]
         self.before = memory["child"].copy()
@@ -175,7 +175,7 @@ class _Check:
         """Return the condition's status for the observations."""
         function = self.condition.function
         name = self.condition.name
-        holds = answer(function, tick.obs[rows], len(rows), bool, tick.who, name)
+        holds = answer(function, tick.obs[rows], len(rows), bool, tick.name, name)
         return np.where(holds, Status.SUCCESS, Status.FAILURE)
 
 

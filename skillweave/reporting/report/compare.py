@@ -122,7 +122,7 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
 
 def _scores(group: Group, saved: Saved) -> list[float]:
     """Return the mean returns of the group's runs that were evaluated."""
-    return [e.evaluation.mean for run in group.runs if (e := saved[run.path]) is not None]
+    return [score.evaluation.mean for run in group.runs if (score := saved[run.path]) is not None]
 
 
 def _group_words(group: Group, scores: list[float], say: Say) -> dict[str, Any]:
@@ -152,9 +152,9 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
     bars = []
     for group, group_scores in zip(groups, scores, strict=True):
         for run in group.runs:
-            if (e := saved[run.path]) is not None:
+            if (score := saved[run.path]) is not None:
                 seed = run.manifest["seed"]
-                dots.append({"group": group.key, "x": e.evaluation.mean, "seed": seed})
+                dots.append({"group": group.key, "x": score.evaluation.mean, "seed": seed})
         if group_scores:
             summary = over_seeds(np.array(group_scores))
             bar = {"group": group.key, "x": float(summary.mean)}
@@ -166,7 +166,9 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
 
 def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
     """Return for each skill its figures over the group's seeds, as ``mean (low to high)``."""
-    reports = [e.evaluation.to_json()["skills"] for run in group.runs if (e := saved[run.path])]
+    reports = [
+        score.evaluation.to_json()["skills"] for run in group.runs if (score := saved[run.path])
+    ]
     rows = []
     for name in dict.fromkeys(k for skills in reports for k in skills):
         seeds = [skills[name] for skills in reports if name in skills]
@@ -184,7 +186,7 @@ def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
 
 def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
     """Return transitions between skills, summed over the group's seeds; [] where one lacks them."""
-    evaluated = [e.evaluation.skills for run in group.runs if (e := saved[run.path])]
+    evaluated = [score.evaluation.skills for run in group.runs if (score := saved[run.path])]
     reports = [
         levels_of(skills).get("", {}) for skills in evaluated
     ]  # hierarchies below: one report

@@ -37,29 +37,29 @@ def name_of(run: RunDirectory) -> str:
 
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
-    m = run.manifest
-    rows = [("Environment", m["env"])]
-    if m["env_kwargs"]:
-        rows.append(("Made with", plain(m["env_kwargs"])))
-    rows.append(("Recipe", m.get("recipe") or "declared in Python"))
-    rows += [("Seed", str(m["seed"])), ("Made", m["created"].replace("T", " "))]
-    if m["kind"] == "hierarchy":
-        rows.append(("Skills", ", ".join(s["name"] for s in m["skills"])))
-        rows.append(("A call lasts", _call_length(m)))
-        selector = m.get("selector")
+    manifest = run.manifest
+    rows = [("Environment", manifest["env"])]
+    if manifest["env_kwargs"]:
+        rows.append(("Made with", plain(manifest["env_kwargs"])))
+    rows.append(("Recipe", manifest.get("recipe") or "declared in Python"))
+    rows += [("Seed", str(manifest["seed"])), ("Made", manifest["created"].replace("T", " "))]
+    if manifest["kind"] == "hierarchy":
+        rows.append(("Skills", ", ".join(s["name"] for s in manifest["skills"])))
+        rows.append(("A call lasts", _call_length(manifest)))
+        selector = manifest.get("selector")
         rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
-        rows.append(("Learning", m.get("learn", "apart")))
-        if m.get("interrupt") is not None:
-            rows.append(("Calls are cut at", f"{m['interrupt']} deviations"))
-        if m.get("reflexes"):
-            rows.append(("Reflexes", ", ".join(m["reflexes"])))
+        rows.append(("Learning", manifest.get("learn", "apart")))
+        if manifest.get("interrupt") is not None:
+            rows.append(("Calls are cut at", f"{manifest['interrupt']} deviations"))
+        if manifest.get("reflexes"):
+            rows.append(("Reflexes", ", ".join(manifest["reflexes"])))
     return rows
 
 
-def _call_length(m: Mapping[str, Any]) -> str:
-    if "call_lengths" in m:
-        return f"{plain(m['call_lengths'])} steps at most, as the selector chooses"
-    most = m["call_steps"]
+def _call_length(manifest: Mapping[str, Any]) -> str:
+    if "call_lengths" in manifest:
+        return f"{plain(manifest['call_lengths'])} steps at most, as the selector chooses"
+    most = manifest["call_steps"]
     if most is None:
         return "until the skill stops"
     return "1 step" if most == 1 else f"at most {most:,} steps"
@@ -124,9 +124,9 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     return sentences
 
 
-def settings(m: Mapping[str, Any]) -> dict[str, Any]:
+def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    values: dict[str, Any] = {"env": m["env"]} | flat("env_kwargs", m["env_kwargs"])
+    values: dict[str, Any] = {"env": manifest["env"]} | flat("env_kwargs", manifest["env_kwargs"])
     names = (
         "kind",
         "learn",
@@ -145,11 +145,11 @@ def settings(m: Mapping[str, Any]) -> dict[str, Any]:
         "eval_episodes",
         "keep",
     )
-    values |= {k: m[k] for k in names if k in m}
-    for skill in m.get("skills", ()):
+    values |= {k: manifest[k] for k in names if k in manifest}
+    for skill in manifest.get("skills", ()):
         fields = {k: v for k, v in skill.items() if k != "name"}
         values |= flat(f"skills.{skill['name']}", fields)
-    for entry in m["stages"]:
+    for entry in manifest["stages"]:
         fields = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
         # From which run differs from seed to seed.
         fields |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}

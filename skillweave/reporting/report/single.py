@@ -226,17 +226,17 @@ def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[
 
 
 def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) -> dict[str, Any]:
-    m = run.manifest
+    manifest = run.manifest
     return {
         "title": facts.name_of(run),
-        "kind": "hierarchy" if m["kind"] == "hierarchy" else "plain agent",
-        "env": m["env"],
+        "kind": "hierarchy" if manifest["kind"] == "hierarchy" else "plain agent",
+        "env": manifest["env"],
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
-        "settings": [(k, facts.plain(v)) for k, v in facts.settings(m).items()],
-        "versions": list(m["versions"].items()),
-        "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in m["stages"]),
-        "training_seconds": sum(entry.get("seconds", 0.0) for entry in m["stages"]),
+        "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
+        "versions": list(manifest["versions"].items()),
+        "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in manifest["stages"]),
+        "training_seconds": sum(entry.get("seconds", 0.0) for entry in manifest["stages"]),
         "missing": missing,
         "finished": run.finished,
     }
