@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +32,7 @@ from skillweave.algorithms import config as table
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import DeclarationError
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 
@@ -158,6 +160,7 @@ def test_settings_are_found_by_name_and_survive_json():
     assert config_from_json(data) == config
     assert named_config("a2c", "here") == example().A2C()
     assert isinstance(make_algorithm(config, BOX, LINE), example().A2CAlgorithm)
+    assert replace(PPO(), device="auto").device == "auto"
 
 
 def test_an_algorithm_that_nobody_registered_is_an_error_that_says_what_to_do():
@@ -180,10 +183,6 @@ def test_the_latest_of_a_name_counts_and_the_librarys_own_stay():
     assert again is not first
     assert type(config_from_json(config_to_json(again()))) is again
 
-    taken = dataclass(frozen=True)(type("PPO", (OnPolicy,), {}))
-    with pytest.raises(SkillweaveError, match="PPO is an algorithm of this library"):
-        register_algorithm(taken, example().A2CAlgorithm)
-
 
 @pytest.mark.parametrize("method", ["fresh_state", "parameter_groups", "act", "value", "update"])
 def test_a_method_that_is_missing_is_named(method):
@@ -197,35 +196,53 @@ def test_a_method_that_is_missing_is_named(method):
         getattr(algorithm, method)(*[None] * given)
 
 
-def test_what_cannot_be_registered_is_told():
-    module = example()
-    with pytest.raises(SkillweaveError, match=r"int is no subclass of skillweave\.Algorithm"):
-        register_algorithm(module.A2C, int)  # type: ignore[arg-type]
-    other = type("Other", (module.A2CAlgorithm,), {"store": "replay"})
-    with pytest.raises(SkillweaveError, match="must be a frozen dataclass on OffPolicy"):
-        register_algorithm(module.A2C, other)
-    with pytest.raises(SkillweaveError, match="must be a frozen dataclass on OnPolicy"):
-        register_algorithm(SAC, module.A2CAlgorithm)
-    odd = type("Odd", (module.A2CAlgorithm,), {"store": "drawer"})
-    with pytest.raises(SkillweaveError, match="'drawer'; it must be 'rollout' or 'replay'"):
-        register_algorithm(module.A2C, odd)
-    bare = type("Bare", (Algorithm,), {})
-    with pytest.raises(SkillweaveError, match=r"lacks fresh_state, .*, store, action_spaces"):
-        register_algorithm(module.A2C, bare)
+def changed(**attributes: Any) -> Any:
+    """Return a class like the example's, with other attributes."""
+    return type("Changed", (example().A2CAlgorithm,), attributes)
 
 
-def test_a_space_that_it_cannot_act_in_names_those_that_can():
-    both = "PPO, SelfImitationPPO"
-    with pytest.raises(SkillweaveError, match=rf"A2C cannot act in MultiBinary.*; {both} can"):
-        make_algorithm(own(), BOX, gym.spaces.MultiBinary(2))
-    td3 = named_config("TD3", "here")
-    with pytest.raises(SkillweaveError, match=rf"TD3 cannot .*Discrete.*; {both}, DQN, SAC, A2C"):
-        make_algorithm(td3, BOX, LINE)
+MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
+    "no algorithm": (
+        lambda: register_algorithm(example().A2C, int),  # type: ignore[arg-type]
+        r"int is no subclass of skillweave\.Algorithm",
+    ),
+    "settings of another store": (
+        lambda: register_algorithm(example().A2C, changed(store="replay")),
+        "must be a frozen dataclass on OffPolicy",
+    ),
+    "settings of another algorithm": (
+        lambda: register_algorithm(SAC, example().A2CAlgorithm),
+        "must be a frozen dataclass on OnPolicy",
+    ),
+    "an unknown store": (
+        lambda: register_algorithm(example().A2C, changed(store="drawer")),
+        "'drawer'; it must be 'rollout' or 'replay'",
+    ),
+    "no methods": (
+        lambda: register_algorithm(example().A2C, type("Bare", (Algorithm,), {})),
+        r"lacks fresh_state, .*, store, action_spaces",
+    ),
+    "the name of a built-in algorithm": (
+        lambda: register_algorithm(
+            dataclass(frozen=True)(type("PPO", (OnPolicy,), {})), example().A2CAlgorithm
+        ),
+        "PPO is an algorithm of this library",
+    ),
+    "a space of bits": (
+        lambda: make_algorithm(own(), BOX, gym.spaces.MultiBinary(2)),
+        "A2C cannot act in MultiBinary.*; PPO, SelfImitationPPO can",
+    ),
+    "a discrete space": (
+        lambda: make_algorithm((own(), named_config("TD3", "here"))[1], BOX, LINE),
+        "TD3 cannot .*Discrete.*; PPO, SelfImitationPPO, DQN, SAC, A2C",
+    ),
+    "a common setting": (lambda: own(gamma=2.0), r"A2C\.gamma is 2"),
+    "a device": (lambda: own(device="tpu"), r"A2C\.device is 'tpu'; it must be one of"),
+}
 
 
-def test_settings_that_are_common_are_checked():
-    with pytest.raises(SkillweaveError, match=r"A2C\.gamma is 2"):
-        own(gamma=2.0)
-    with pytest.raises(SkillweaveError, match=r"A2C\.device is 'tpu'; it must be one of"):
-        own(device="tpu")
-    assert replace(PPO(), device="auto").device == "auto"
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named(mistake):
+    make, message = MISTAKES[mistake]
+    with pytest.raises(DeclarationError, match=message):
+        make()
