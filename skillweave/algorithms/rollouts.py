@@ -75,7 +75,7 @@ class Cells:
 
 
 def first_true(flags: Tensor, count: int) -> Tensor:
-    """Return the indices of the first ``count`` True rows, (P, count); then those of others."""
+    """Return the indices of the first ``count`` True rows, (P, count), then of other rows."""
     order = flags.to(torch.int8).argsort(dim=1, descending=True, stable=True)
     return order[:, :count]
 

@@ -74,8 +74,8 @@ class SkillCriticAlgorithm(Algorithm):
     ) -> tuple[Tensor, Tensor, None]:
         """Return the skill of highest value, and all values in deviations of the return.
 
-        With ``deciding``, the last value is that of deciding again. While the selector still draws
-        skills at random, values are scaled down, so few calls are interrupted.
+        With ``deciding``, the last value is the one of a new decision. While the selector still
+        draws skills at random, values are scaled down, so few calls are interrupted.
         """
         q = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
         return q[..., : self.skills].argmax(-1), q, None

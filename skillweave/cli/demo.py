@@ -26,7 +26,7 @@ MISSION = "tour"
 """Fly left, fly right, land."""
 NEW_SELECTOR_STEPS = 300_000
 EPISODES = {"lunar-lander": 100, MISSION: 50}
-"""Episodes of each score; their seeds are none of training's."""
+"""Episodes of each score; training uses other seeds."""
 FLAT_RESULTS = Path(__file__).with_name("demo_flat.json")
 COMPLETE = 0.999
 """A mission's return is the share of its legs that are done."""
@@ -153,7 +153,7 @@ class Demo:
 
 
 def shares(usage: dict[str, float]) -> str:
-    """Return how much each skill acts, in words."""
+    """Return each skill's share of the steps, in words."""
     return ", ".join(f"{name} {share:.0%}" for name, share in usage.items())
 
 

@@ -345,7 +345,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
     """Return the trained policy that a command names.
 
     Raises:
-        RunError: there is none, or it needs code that was not given.
+        RunError: no such run or weights file, or the policy needs code that was not given.
     """
     path = Path(command.target)
     if command.pretrained:

@@ -32,7 +32,7 @@ class Mark(TypedDict):
     """Content of the file."""
 
     recipe: str
-    """As it was given."""
+    """The recipe, as the user named it."""
     code: str
     """A checksum of its code."""
 

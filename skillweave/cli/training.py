@@ -75,7 +75,7 @@ def _trained(
     evolve: dict[str, Evolution | None] | None = None,
     baseline: bool = False,
 ) -> Run:
-    """Train one of both; a ``baseline`` that is to be compared learns from nothing."""
+    """Train the hierarchy or its flat agent; a ``baseline`` starts with fresh weights."""
     try:
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(

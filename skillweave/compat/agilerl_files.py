@@ -37,8 +37,8 @@ def convert(path: Path, out: Path) -> str:
     The pickle is read without running code from it (see ``pickles``). The optimiser starts fresh.
 
     Raises:
-        RunError: the file is missing, names what is refused, is no checkpoint of
-            AgileRL's, or holds what no native policy computes; the message names it.
+        RunError: the file is missing, contains a refused object, is not a checkpoint of AgileRL, or
+            describes a policy that does not exist here; the message names it.
     """
     data = read_torch_pickle(path)
     algo: Any = data.get("algo") if isinstance(data, dict) else None
@@ -140,7 +140,7 @@ def _agent(algo: str, data: Mapping[str, Any]) -> tuple[Any, Any]:
         weights |= _named(shapes, "critic", critics[0])
     apart = critics if kind is TD3 else []
     valued = [_named(algorithm.critics.layout.shapes, "critic", critic) for critic in apart]
-    state = algorithm.init([Seeds(0)])  # only now: what is described is as large as what is there
+    state = algorithm.init([Seeds(0)])  # not before: the file has weights of the described sizes
     _fill(algorithm.layout.views(state.params), weights)
     if kind is not PPO:
         state.target.copy_(state.params)
@@ -199,7 +199,7 @@ def network_of(described: Mapping[str, Any], usual: str | None = None) -> Networ
     hidden = described["hidden_size"]
     layer_norm = bool(described.get("layer_norm"))
     activation = ACTIVATIONS[str(name)]
-    planes: Any = None if cnn is None else "first"  # AgileRL reads all images so
+    planes: Any = None if cnn is None else "first"  # the layout of all images in AgileRL
     widths = tuple(int(n) for n in hidden)
     return Network(widths, activation, layer_norm, cnn, planes=planes)  # type: ignore[arg-type]
 

@@ -1,6 +1,6 @@
 """Several engines of one kind as one, for a population's members.
 
-Stands alone because it implements the stepping part of ``Engine``.
+Stands alone because it is an engine itself, which implements the stepping part of ``Engine``.
 """
 
 from __future__ import annotations

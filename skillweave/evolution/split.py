@@ -139,7 +139,7 @@ class Parts:
         return [members[first:end] for first, end in pairwise(self._bounds)]
 
     def _columns(self, ids: Sequence[Array]) -> Array:
-        """Convert numbers of environments in each part to those of the population."""
+        """Convert environments' numbers in each part to numbers in the population."""
         return np.concatenate(
             [rows + first * self._each for rows, first in zip(ids, self._bounds[:-1], strict=True)]
         )

@@ -142,7 +142,7 @@ def split(
 
 
 def spread_count(count: Tensor, like: Tensor) -> Tensor:
-    """Return Adam's steps of each parameter (P, …, D), expanded from those of members (P,)."""
+    """Return Adam's steps by parameter (P, …, D), expanded from steps by member (P,)."""
     return count.view(*count.shape, *[1] * (like.ndim - count.ndim)).expand_as(like)
 
 

@@ -201,7 +201,7 @@ def _start(space: Any) -> Array:
 
 
 def _choices(policy: Any) -> int:
-    """Return the width of the mask; 0: there is none."""
+    """Return the width of the mask; 0: no mask."""
     space = policy.action_space
     return 0 if isinstance(space, Box | MultiBinary) else action_codec(space).size
 

@@ -50,11 +50,11 @@ class Graph:
 
     content: bytes
     choices: int = 0
-    """Width of the input ``mask``; 0: there is none."""
+    """Width of the input ``mask``; 0: no mask."""
     memory: int = 0
-    """Width of the input ``memory`` and of the output of the same name; 0: there is none."""
+    """Width of the input ``memory`` and of the output of the same name; 0: no memory."""
     noise: tuple[tuple[str, int], ...] = ()
-    """Inputs ``noise.0``, …: a distribution by NumPy's name, and how many numbers."""
+    """Inputs ``noise.0``, …: a distribution by NumPy's name, and the count of its numbers."""
 
 
 def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:

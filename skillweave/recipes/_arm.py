@@ -18,7 +18,7 @@ NEAR = 0.05
 HOLD = 5
 """Steps for which the block must be there."""
 TABLE = 0.425
-"""Height of a block's middle that lies on the table, in metres."""
+"""Height of the middle of a block on the table, in metres."""
 CAMERA = {
     "distance": 1.2,
     "azimuth": 132.0,
@@ -124,7 +124,7 @@ def block_place(world: Any) -> Array:
 
 
 def nudge_block(world: Any, place: Array, rng: np.random.Generator, speed: float) -> None:
-    """Push the block somewhere; back to the middle where it lies at the edge of the arm's reach."""
+    """Push the block in a random direction; inwards if it is at the edge of the arm's reach."""
     angle = rng.uniform(-np.pi, np.pi)
     way = np.array([np.cos(angle), np.sin(angle)])
     inwards = world.initial_gripper_xpos[:2] - place[:2]

@@ -27,7 +27,7 @@ LEG = slice(18, 21)
 class Route:
     """The points of a patrol, in their order, again and again: observations and rewards.
 
-    A point is visited when it is passed, in the direction in which it lies from the point before.
+    A point is visited when the half-cheetah passes it in the direction from the point before.
 
     Args:
         points: two or three, in metres; each differs from the one before.

@@ -22,10 +22,10 @@ ENTERING = 3
 
 
 class LookAround:
-    """Go straight on for some cells, look to all four sides, go on, and look again.
+    """A policy that walks straight for some cells, looks to all four sides, and repeats that.
 
-    Its memory counts turns, and steps since the last one: an observation shows only the cells in
-    front of the agent.
+    Its memory counts turns, and steps since the last one, because an observation shows only the
+    cells in front of the agent.
     """
 
     observation_space = SPACE
@@ -45,7 +45,7 @@ class LookAround:
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Turn right, once around; then straight on, around what is in the way."""
+        """Return turns to the right, once around; then steps straight on, around obstacles."""
         turns = memory["turns"]
         paces = memory["paces"]
         again = (paces >= PACES) | ((paces > 0) & ~free(ahead(obs)))

@@ -93,7 +93,7 @@ def walls_of(env: gym.Env[Any, Any]) -> Array:
 
 
 class MazePool(PoolWrapper):
-    """Many balls, each in a maze of its own."""
+    """Many balls, each in its own maze."""
 
     def __init__(self, pool: Any) -> None:
         super().__init__(pool, SPACE)
@@ -128,7 +128,7 @@ def spec(maze: str = "large") -> EnvSpec:
     """Return the maze of this name, for ``Hierarchy(env=...)``.
 
     Raises:
-        DeclarationError: there is none of this name.
+        DeclarationError: no maze has this name.
     """
     if maze not in MAZES:
         raise DeclarationError(f"no maze {maze!r}; there are: {', '.join(MAZES)}")

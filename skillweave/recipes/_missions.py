@@ -22,7 +22,7 @@ LANDER = "LunarLander-v3"
 EPISODE = 1000
 """Steps of an episode, at most: 20 seconds, as LunarLander's."""
 KINDS = ("left", "right", "hover", "land")
-"""What a leg of a mission can be."""
+"""The kinds of legs of a mission."""
 LEGS = 3
 """The most legs that a mission has."""
 LAND = KINDS.index("land")
@@ -65,11 +65,11 @@ class Progress:
         self._missions = np.array(rows)
         self._gusts = gusts
         self.left = np.full((num_envs, LEGS), -1)
-        """What is still to be done, (num_envs, 3): numbers of kinds in order; −1: nothing."""
+        """The remaining legs, (num_envs, 3): numbers of kinds, in order; −1: no leg."""
         self.held = np.zeros(num_envs, np.int64)
-        """For how many steps it has hovered in the box."""
+        """Steps for which the lander has hovered in the box."""
         self.legs = np.ones(num_envs, np.int64)
-        """How many legs the whole mission has."""
+        """The number of legs of the whole mission."""
         self._time = np.zeros(num_envs, np.int64)
 
     def begin(self, ids: Array, rngs: Sequence[np.random.Generator]) -> None:

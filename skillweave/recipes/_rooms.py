@@ -226,7 +226,7 @@ def spec(name: str = "small") -> EnvSpec:
     """Return the rooms of this name, for ``Hierarchy(env=...)``.
 
     Raises:
-        DeclarationError: there are none of this name.
+        DeclarationError: no rooms have this name.
     """
     if name not in ROOMS:
         raise DeclarationError(f"no rooms {name!r}; there are: {', '.join(ROOMS)}")

@@ -54,7 +54,7 @@ class Errand(Skill):
     def reward(self, step: Step) -> Array:
         """Return 1 where it is done; before, 0.04 for each cell nearer; less 0.02 a step.
 
-        Nearer to what it aims at: a skill without an aim is paid for its end alone.
+        "Nearer" is the distance to its target; a skill without a target is paid only at its end.
         """
         before, after = steps_to(self.aim(step.obs)), steps_to(self.aim(step.next_obs))
         reward: Array = np.where(self.success(step), 1.0, 0.04 * (before - after)) - 0.02

@@ -5,8 +5,8 @@ in a box for two seconds, land on the pad. A leg pays its share of 1 when it is 
 else pays. Four skills are learnt once, each by a reward of its own that is independent of missions;
 a selector learns for each mission when to call which.
 
-Observations: LunarLander's (0 to 7); what is still to be done, leg by leg, each one-hot of left,
-right, hover, land (8 to 19); which share of the two seconds it has hovered (20).
+Observations: LunarLander's (0 to 7); the remaining legs, each one-hot of left, right, hover, land
+(8 to 19); the share of the two seconds for which it has hovered (20).
 
     skillweave train lander-missions
 
@@ -214,7 +214,7 @@ def environment(mission: str = "any", gusts: bool = False) -> Any:
     """Return the landers with a mission, by its name.
 
     Raises:
-        DeclarationError: there is none of this name.
+        DeclarationError: no mission has this name.
     """
     if mission not in MISSIONS:
         raise DeclarationError(f"no mission {mission!r}; there are: {', '.join(MISSIONS)}")

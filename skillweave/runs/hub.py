@@ -307,7 +307,7 @@ def hub_errors(
         yield
     except SkillweaveError:
         raise
-    except Exception as error:  # of any of the libraries that it stands on
+    except Exception as error:  # of any library that it uses
         raise RunError(_sentence(error, api.endpoint, name, writes, revision)) from error
 
 

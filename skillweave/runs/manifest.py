@@ -33,7 +33,7 @@ MOST_NAMES = 16
 NodePath = Annotated[
     str, Check("names of letters, digits, '_' and '-', with '/' between", _is_path)
 ]
-"""A name after those of the hierarchies that it is in: ``inner/skill``."""
+"""A name behind the names of the hierarchies around it: ``inner/skill``."""
 
 
 class NestedEntry(TypedDict):

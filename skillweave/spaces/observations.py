@@ -18,7 +18,7 @@ from skillweave.types import Array
 
 _SMALLEST = 16  # sides of a plain matrix of bytes that is an image
 _WIDEST = 2.0**24
-"""The widest range of pixels: wider bounds are only those of a data type."""
+"""The widest range of pixels: wider bounds belong to the data type, not to an image."""
 _PICTURE = 36  # the least side of a picture, as opposed to a board
 
 
@@ -78,7 +78,7 @@ def image_layout(space: gym.Space[Any]) -> ImageLayout | None:
 
 
 def _has_bounds(space: gym.spaces.Box) -> bool:
-    """Return whether the bounds of a Box are narrower than those of its data type."""
+    """Return whether the bounds of a Box are narrower than the data type's."""
     if not space.is_bounded():
         return False
     span = space.high.astype(np.float64) - space.low.astype(np.float64)

@@ -1,4 +1,4 @@
-"""The agents: only AgileRL's names and signatures for what the native API does."""
+"""The agents: AgileRL's names and signatures, on the native API."""
 
 from typing import Any
 

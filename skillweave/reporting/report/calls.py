@@ -34,7 +34,7 @@ def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
 def episode_data(
     log: CallLog, film: Film | None, named: ObsNames | None = None
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return each episode with its calls, and sentences on what is left out.
+    """Return each episode with its calls, and sentences about parts that are left out.
 
     Those in the film come first, in its order.
 
@@ -136,7 +136,7 @@ def decision_data(log: CallLog, named: ObsNames | None = None) -> dict[str, Any]
 def seen(calls: Sequence[Call], named: ObsNames | None) -> tuple[list[str], list[list[float]]]:
     """Return the names of the numbers observed at the starts of calls, and their values.
 
-    There are none where observations have no names, or more than the page has room for.
+    Both are empty if observations have no names, or more numbers than fit on the page.
     """
     if named is None or not calls:
         return [], []

@@ -15,7 +15,7 @@ from skillweave.reporting.palette import RGB
 Spec = dict[str, Any]
 STEPS = "environment steps"
 COMPLEMENT = ("gamma", "gae_lambda")
-"""Settings that are drawn as what they lack to one."""
+"""Settings that are drawn as their difference from one."""
 
 
 def chart(description: str, height: int, **rest: Any) -> Spec:

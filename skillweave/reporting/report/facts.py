@@ -1,4 +1,4 @@
-"""Facts of a run's files in words: what was trained and how, and what is missing."""
+"""Facts of a run's files in words: its settings, its stages, and the unfinished ones."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
 
 
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
-    """Return a sentence for each unfinished stage; ``steps``: those of its last metrics."""
+    """Return a sentence for each unfinished stage; ``steps``: by stage, at its last metrics."""
     sentences = []
     for entry in run.manifest["stages"]:
         name = entry["name"]

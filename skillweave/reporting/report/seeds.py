@@ -34,7 +34,7 @@ def over_seeds(values: Array) -> OverSeeds:
     if n < 2:
         return OverSeeds(interquartile_means(x), None, None)
     drawn = np.random.default_rng(0).integers(0, n, (n, RESAMPLES))
-    # One resample is a column, so that the first axis stays that of seeds.
+    # A resample is a column, so the first axis remains the seeds.
     means = interquartile_means(x[drawn])
     low, high = np.percentile(means, (2.5, 97.5), axis=0)
     return OverSeeds(interquartile_means(x), low, high)

@@ -1,4 +1,4 @@
-"""The verdict: one sentence on what a policy does, made from an evaluation."""
+"""The verdict on a policy: one sentence, written from an evaluation."""
 
 from __future__ import annotations
 
