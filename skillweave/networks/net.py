@@ -10,16 +10,16 @@ from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
 from skillweave.networks.stacked import (
     Views,
-    cell,
     mlp,
     mlp_init_,
     mlp_shapes,
     orthogonal_,
-    project,
+    rnn_gates,
     rnn_init_,
     rnn_memory_size,
+    rnn_sequence,
     rnn_shapes,
-    sequence,
+    rnn_step,
 )
 from skillweave.ops.device import INT, Constant
 from skillweave.spaces import ObsCodec
@@ -108,8 +108,8 @@ class Net:
         rnn = self.network.rnn
         name = f"{self.name}.rnn"
         assert rnn is not None
-        gates = project(views, name, self(views, inputs))
-        memory = cell(views, name, rnn, gates, memory)
+        gates = rnn_gates(views, name, self(views, inputs))
+        memory = rnn_step(views, name, rnn, gates, memory)
         return self._head(views, memory[..., : rnn.size]), memory
 
     def sequence(
@@ -130,7 +130,7 @@ class Net:
         steps = starts.shape[1:]
         assert rnn is not None
         x = self(views, {k: v.flatten(1, 2) for k, v in inputs.items()}).unflatten(1, steps)
-        after = sequence(views, f"{self.name}.rnn", rnn, x, memory, starts)
+        after = rnn_sequence(views, f"{self.name}.rnn", rnn, x, memory, starts)
         out = self._head(views, after[..., : rnn.size].flatten(1, 2))
         return out.unflatten(1, steps), after
 

@@ -164,12 +164,12 @@ def rnn_init_(views: Views, prefix: str, generators: list[torch.Generator]) -> N
         views[f"{prefix}.{name}"].zero_()
 
 
-def project(views: Views, prefix: str, x: Tensor) -> Tensor:
+def rnn_gates(views: Views, prefix: str, x: Tensor) -> Tensor:
     """Return the inputs' part of the gates, (P, B, in) to (P, B, gates·H): all steps at once."""
     return torch.baddbmm(views[f"{prefix}.bias"], x, views[f"{prefix}.input"])
 
 
-def cell(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> Tensor:
+def rnn_step(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> Tensor:
     """Step: map projected inputs (P, B, gates·H) and recurrent state (P, B, M) to the next state.
 
     The output is the state's first H numbers. Gates as in torch.nn.LSTMCell and GRUCell.
@@ -187,7 +187,7 @@ def cell(views: Views, prefix: str, rnn: RNN, gates: Tensor, memory: Tensor) -> 
     return torch.lerp(torch.tanh(xn + r * hn), h, z)
 
 
-def sequence(
+def rnn_sequence(
     views: Views, prefix: str, rnn: RNN, x: Tensor, memory: Tensor, starts: Tensor
 ) -> Tensor:
     """Return the recurrent states after each of T steps, (P, T, B, M).
@@ -197,10 +197,10 @@ def sequence(
         memory: recurrent state (P, B, M) before the first step.
         starts: (P, T, B) bool, an episode begins at this step: its recurrent state is zero.
     """
-    gates = project(views, prefix, x.flatten(1, 2)).unflatten(1, x.shape[1:3])
+    gates = rnn_gates(views, prefix, x.flatten(1, 2)).unflatten(1, x.shape[1:3])
     keep = (~starts).unsqueeze(-1)
     after = []
     for t in range(x.shape[1]):
-        memory = cell(views, prefix, rnn, gates[:, t], memory * keep[:, t])
+        memory = rnn_step(views, prefix, rnn, gates[:, t], memory * keep[:, t])
         after.append(memory)
     return torch.stack(after, dim=1)

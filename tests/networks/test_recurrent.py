@@ -5,12 +5,12 @@ from torch import nn
 from skillweave.networks.config import RNN
 from skillweave.networks.stacked import (
     Layout,
-    cell,
-    project,
+    rnn_gates,
     rnn_init_,
     rnn_memory_size,
+    rnn_sequence,
     rnn_shapes,
-    sequence,
+    rnn_step,
 )
 
 P, T, B, IN, H = 3, 6, 4, 5, 7
@@ -50,7 +50,7 @@ def one(torchs: nn.Module, kind: str, x, memory):
 def test_a_cell_is_torchs(kind):
     rnn, layout, flat, x, memory, _ = made(kind)
     views = layout.views(flat)
-    after = cell(views, "rnn", rnn, project(views, "rnn", x[:, 0]), memory)
+    after = rnn_step(views, "rnn", rnn, rnn_gates(views, "rnn", x[:, 0]), memory)
     for m in range(P):
         expected = one(reference(kind, views, m), kind, x[m, 0], memory[m])
         torch.testing.assert_close(after[m], expected)
@@ -60,7 +60,7 @@ def test_a_cell_is_torchs(kind):
 def test_a_sequence_is_torchs_cell_step_by_step_from_nothing_where_an_episode_starts(kind):
     rnn, layout, flat, x, memory, start = made(kind)
     views = layout.views(flat)
-    after = sequence(views, "rnn", rnn, x, memory, start)
+    after = rnn_sequence(views, "rnn", rnn, x, memory, start)
     assert start.any(1).any()
     for m in range(P):
         torchs, now = reference(kind, views, m), memory[m]
@@ -68,7 +68,7 @@ def test_a_sequence_is_torchs_cell_step_by_step_from_nothing_where_an_episode_st
             now = now.masked_fill(start[m, t][:, None], 0.0)
             now = one(torchs, kind, x[m, t], now)
             torch.testing.assert_close(after[m, t], now)
-    alone = sequence(layout.views(flat[1:2]), "rnn", rnn, x[1:2], memory[1:2], start[1:2])
+    alone = rnn_sequence(layout.views(flat[1:2]), "rnn", rnn, x[1:2], memory[1:2], start[1:2])
     torch.testing.assert_close(alone[0], after[1])
 
 
@@ -77,15 +77,15 @@ def test_gradients_through_time_are_torchs_and_stop_where_an_episode_starts(kind
     rnn, layout, flat, x, memory, start = made(kind)
     x.requires_grad_()
     leaves = layout.leaves(flat)
-    after = sequence(leaves, "rnn", rnn, x, memory, start)
+    after = rnn_sequence(leaves, "rnn", rnn, x, memory, start)
     grads = torch.autograd.grad(after[:, -1].sum(), [x, *leaves.values()], retain_graph=True)
     for m in range(P):
         own = layout.leaves(flat[m : m + 1])
         now, inputs = memory[m], x[m].detach().requires_grad_()
         for t in range(T):
             now = now.masked_fill(start[m, t][:, None], 0.0)
-            gates = project(own, "rnn", inputs[None, t])
-            now = cell(own, "rnn", rnn, gates, now[None])[0]
+            gates = rnn_gates(own, "rnn", inputs[None, t])
+            now = rnn_step(own, "rnn", rnn, gates, now[None])[0]
         expected = torch.autograd.grad(now.sum(), inputs)[0]
         torch.testing.assert_close(grads[0][m], expected)
         for b in range(B):
@@ -100,7 +100,9 @@ def test_the_memory_holds_what_comes_out_first(kind, size):
     rnn, layout, flat, x, memory, _ = made(kind)
     assert rnn_memory_size(rnn) == size == memory.shape[-1]
     views = layout.views(flat)
-    after = sequence(views, "rnn", rnn, x, torch.zeros_like(memory), x.new_zeros(P, T, B).bool())
+    after = rnn_sequence(
+        views, "rnn", rnn, x, torch.zeros_like(memory), x.new_zeros(P, T, B).bool()
+    )
     assert after[..., :H].abs().max() < 1.0
     if kind == "gru":
         return
