@@ -82,7 +82,7 @@ def _sweep(command: commands.Sweep) -> int:
 
 
 def _evaluate(command: commands.Evaluate) -> None:
-    trained = target(command)
+    trained = _load_target(command)
     score = trained.evaluate(
         command.episodes,
         seed=command.seed,
@@ -99,7 +99,7 @@ def _evaluate(command: commands.Evaluate) -> None:
 
 
 def _render(command: commands.Render) -> None:
-    trained = target(command)
+    trained = _load_target(command)
     path = command.out or Path(f"{Path(command.target).name.removesuffix('.safetensors')}.gif")
     result = trained.render(
         path,
@@ -147,7 +147,7 @@ def _report(command: commands.Report) -> None:
     recipe = command.recipe or (named if named in recipes.names() else None)
     if run.finished:
         try:
-            trained = load_run(command.run, recipe)
+            trained = _load_run(command.run, recipe)
         except SkillweaveError as error:
             if command.recipe is not None:
                 raise
@@ -281,7 +281,7 @@ def _plain(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _weights(command: commands.Weights) -> None:
-    trained = load_run(command.run, command.recipe)
+    trained = _load_run(command.run, command.recipe)
     path = trained.save_weights(command.out)
     print_result(command, {"path": str(path), "bytes": path.stat().st_size}, f"wrote {path}")
 
@@ -290,7 +290,7 @@ def _export(command: commands.Export) -> None:
     if not command.onnx:
         raise DeclarationError("choose an export format: --onnx")
     name = Path(command.target).name.removesuffix(".safetensors")
-    export = target(command).export(command.out or Path(f"{name}-onnx"))
+    export = _load_target(command).export(command.out or Path(f"{name}-onnx"))
     result = {"path": str(export.path), "files": list(export.files), "code": export.code}
     print_result(command, result, str(export))
 
@@ -308,11 +308,11 @@ def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
     """Copy a run from the hub; return its new place as JSON and for people."""
     _no_bars()
     name = check_name(command.name).partition("/")[2]
-    path = pull_run(command.name, command.out or free(Path("runs") / name), command.revision)
+    path = pull_run(command.name, command.out or _free_path(Path("runs") / name), command.revision)
     return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
 
 
-def free(path: Path) -> Path:
+def _free_path(path: Path) -> Path:
     """Return ``path``, or the first of path-2, path-3, … that does not exist."""
     number = 1
     candidate = path
@@ -341,7 +341,10 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
     print_result(command, {"path": str(out), "algorithm": algo}, text)
 
 
-def target(command: commands.Watched | commands.Export) -> Run:
+# Policies that commands name
+
+
+def _load_target(command: commands.Watched | commands.Export) -> Run:
     """Return the trained policy that a command names.
 
     Raises:
@@ -351,7 +354,7 @@ def target(command: commands.Watched | commands.Export) -> Run:
     if command.pretrained:
         return Hierarchy.pretrained(command.target)
     if path.is_dir():
-        return load_run(path, command.recipe)
+        return _load_run(path, command.recipe)
     if path.suffix == ".safetensors":
         header = open_weights(path)[1]
         if header.get("kind") == "agent" and "env" in header:
@@ -364,6 +367,6 @@ def target(command: commands.Watched | commands.Export) -> Run:
     raise RunError(f"{command.target} is neither a run nor a weights file{hint}")
 
 
-def load_run(path: Path, recipe: str | None) -> Run:
+def _load_run(path: Path, recipe: str | None) -> Run:
     """Load the finished run at ``path``, with the code of a ``recipe`` if one is given."""
     return load_from(path, recipe=recipe, ask=ASK)
