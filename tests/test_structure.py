@@ -366,6 +366,47 @@ def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
     assert result.stdout.strip() == "[]"
 
 
+# Lines
+
+
+PACKED_ROOMS = {
+    "api",
+    "buffers",
+    "collecting",
+    "experience",
+    "hierarchy",
+    "skills",
+    "training",
+    "types",
+}
+"""Rooms in which lines are packed yet; the set may only shrink."""
+
+
+def packed(source: str) -> list[str]:
+    """Return lines that the formatter must skip, and that set several attributes at once."""
+    lines = source.splitlines()
+    numbers = {i + 1 for i, line in enumerate(lines) if "# fmt: " + "skip" in line}
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
+            continue
+        targets = getattr(node.targets[0], "elts", ())
+        if targets and all(isinstance(target, ast.Attribute) for target in targets):
+            numbers.add(node.lineno)
+    return [f"line {number}: {lines[number - 1].strip()}" for number in sorted(numbers)]
+
+
+def test_the_search_for_packed_lines_finds_them() -> None:
+    source = "self.a, self.b = a, b\na, b = b, a\nself.a, self.b = both\n"
+    assert packed(source) == ["line 1: self.a, self.b = a, b"]
+    assert len(packed("x = [\n    1, 2,\n]  # fmt: " + "skip\n")) == 1
+
+
+@pytest.mark.parametrize("path", MODULES, ids=module_of)
+def test_no_lines_are_packed(path: Path) -> None:
+    if room_of(module_of(path)) not in PACKED_ROOMS:
+        assert packed(path.read_text()) == []
+
+
 # Docstrings
 
 

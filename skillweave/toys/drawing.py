@@ -31,7 +31,8 @@ class Canvas:
         self.scale = pixels / (2 * extent)
         """Pixels of one unit of length."""
         middles = (np.arange(pixels) + 0.5) / self.scale - extent
-        self._x, self._y = middles[None, :], -middles[:, None]
+        self._x = middles[None, :]
+        self._y = -middles[:, None]
         self._picture = np.full((pixels, pixels, 3), color, np.float64)
 
     def copy(self) -> Canvas:
