@@ -1,4 +1,4 @@
-"""The content of a run's ``lineage.jsonl``: generations, and the ancestors of the winner."""
+"""The content of a run's ``lineage.jsonl``: generations, ancestors of the winner, and settings."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import Any
 
 from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory
+
+COMPLEMENT = ("gamma", "gae_lambda")
+"""Settings that are drawn as their difference from one."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,12 @@ class Born:
     """It was the best so far."""
     settings: dict[str, Any]
 
+    def number(self, setting: str) -> float:
+        """Return the value of a setting as it is drawn; of several widths their sum."""
+        value = self.settings[setting]
+        number: float = sum(value) if isinstance(value, list) else value
+        return 1.0 - number if setting in COMPLEMENT else number
+
 
 @dataclass(frozen=True)
 class Lineage:
@@ -36,6 +45,12 @@ class Lineage:
     def winner(self) -> Born:
         """Return the best member of all generations so far."""
         return max((b for b in self.born.values() if b.best), key=lambda b: b.generation)
+
+    @property
+    def varied(self) -> list[str]:
+        """Return the settings in which members differ."""
+        members = self.born.values()
+        return [k for k in self.winner.settings if len({str(b.settings[k]) for b in members}) > 1]
 
     def parent(self, born: Born) -> Born | None:
         """Return a member's parent; None in the first generation."""
@@ -81,3 +96,25 @@ def _sort(value: Any) -> str:
     if isinstance(value, list):
         return "numbers" if all(type(x) is int for x in value) else "?"
     return "number" if type(value) in (int, float) else type(value).__name__
+
+
+def setting_title(setting: str) -> str:
+    """Return the title of a setting's axis."""
+    if setting == "hidden":
+        return "hidden units, all layers"
+    return f"1 − {setting}" if setting in COMPLEMENT else setting
+
+
+def changes_words(born: Born) -> str:
+    """Return the changed settings of a member in words; empty: none."""
+    return ", ".join(
+        f"{k.removeprefix('network.')} {short_value(old)} → {short_value(new)}"
+        for k, (old, new) in born.changes.items()
+    )
+
+
+def short_value(value: Any) -> str:
+    """Return a setting's value in few letters."""
+    if isinstance(value, list):
+        return "-".join(map(str, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""Colours: one for each skill, and those that captions are made of."""
+"""Colours of skills and captions, and how they are written."""
 
 from __future__ import annotations
 
@@ -29,6 +29,18 @@ LINE = (110, 110, 118)
 """The line between a frame and its caption."""
 OWN_COLORS = (BAND, LINE, WHITE, BLACK, *PALETTE)
 """Colours that captions are made of."""
+
+
+def hex_of(color: RGB) -> str:
+    """Return a colour as the web writes it: ``#e69f00``."""
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+def is_light(color: RGB) -> bool:
+    """Return whether black is read better than white on a colour (WCAG 2)."""
+    red, green, blue = ((c / 255) ** 2.2 for c in color)
+    # Black and white contrast equally with a relative luminance of 0.18.
+    return bool(0.2126 * red + 0.7152 * green + 0.0722 * blue > 0.18)
 
 
 def color_of(index: int, wanted: RGB | None = None) -> RGB:

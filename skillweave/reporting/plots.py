@@ -7,15 +7,22 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import MissingExtra, RunError
-from skillweave.reporting.lineage import Born, Lineage, read_lineage
-from skillweave.reporting.palette import color_of
+from skillweave.reporting.lineage import (
+    Born,
+    Lineage,
+    changes_words,
+    read_lineage,
+    setting_title,
+    short_value,
+)
+from skillweave.reporting.palette import color_of, hex_of
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.hub import must_be_own
 
 FAINT = "#c9c9cf"
+"""The colour of members that did not lead to the winner."""
 TEXT = "#4a4a52"
-COMPLEMENT = ("gamma", "gae_lambda")
-"""Settings that are drawn as their difference from one."""
+"""The colour of notes."""
 
 
 def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
@@ -40,7 +47,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     metrics = list(run.metrics())
     for i, stage in enumerate(run.manifest["stages"]):
         name = stage["name"]
-        color = _hex(i)
+        color = hex_of(color_of(i + 1))
         if lineage := read_lineage(run, name):
             figure = draw_lineage(Figure, lineage, name, color)
         else:
@@ -62,8 +69,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
 def draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
     """Draw fitness by generation, and below it the path of each setting that differs."""
     path = lineage.path(lineage.winner)
-    everyone = list(lineage.born.values())
-    shown = [k for k in lineage.winner.settings if _varies(everyone, k)]
+    shown = lineage.varied
     rows = -(-len(shown) // 2)
     figure = make(figsize=(10, 4.2 + 1.9 * rows), layout="constrained")
     grid = figure.add_gridspec(1 + rows, 2, height_ratios=[4.0, *[1.8] * rows])
@@ -90,7 +96,7 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
     for born in path:
         if born.mutation not in ("goes on", "none", "start"):
             at = born.generation, born.fitness
-            what = ", ".join(_change(k, *v) for k, v in born.changes.items()) or "weights"
+            what = changes_words(born) or "weights"
             axes.annotate(
                 what,
                 at,
@@ -130,11 +136,7 @@ def _draw_setting(
         words = sorted({b.settings[setting] for b in lineage.born.values()})
 
     def value(born: Born) -> float:
-        setting_value = born.settings[setting]
-        if words:
-            return words.index(setting_value)
-        number = sum(setting_value) if isinstance(setting_value, list) else setting_value
-        return 1.0 - number if setting in COMPLEMENT else number
+        return words.index(born.settings[setting]) if words else born.number(setting)
 
     values = [value(b) for b in lineage.born.values()]
     for born in lineage.born.values():
@@ -145,10 +147,9 @@ def _draw_setting(
         axes.set_yticks(range(len(words)), words)
     elif min(values) > 0 and max(values) > 5 * min(values):
         axes.set_yscale("log")
-    label = "hidden units, all layers" if setting == "hidden" else setting
-    _plain(axes, f"1 - {setting}" if setting in COMPLEMENT else label)
+    _plain(axes, setting_title(setting))
     won = path[-1].settings[setting]
-    axes.set_title(f"winner: {_short(won)}", loc="right", fontsize=8, color=TEXT)
+    axes.set_title(f"winner: {short_value(won)}", loc="right", fontsize=8, color=TEXT)
 
 
 def _draw_curve(make: Any, curve: list[tuple[int, float]], name: str, color: str) -> Any:
@@ -169,23 +170,5 @@ def _plain(axes: Any, label: str, below: str = "generation") -> None:
         axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-def _varies(born: Sequence[Born], setting: str) -> bool:
-    return len({str(b.settings.get(setting)) for b in born}) > 1
-
-
 def _has_return(metrics: dict[str, Any], stage: str) -> bool:
     return metrics.get("stage") == stage and {"return", "steps"} <= metrics.keys()
-
-
-def _change(setting: str, old: Any, new: Any) -> str:
-    return f"{setting.removeprefix('network.')} {_short(old)} → {_short(new)}"
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list):
-        return "-".join(map(str, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _hex(index: int) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color_of(index + 1))

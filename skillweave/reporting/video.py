@@ -18,7 +18,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
 from skillweave.messages import error_text, whole_number
 from skillweave.notebooks import Markup, joined, paragraph
-from skillweave.reporting.palette import BAND, BLACK, LINE, PALETTE, RGB, WHITE, color_of
+from skillweave.reporting.palette import BAND, BLACK, LINE, PALETTE, RGB, WHITE, color_of, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
@@ -253,14 +253,12 @@ def _text(text: str, size: int, ink: RGB, ground: RGB) -> Array:
 @functools.lru_cache(maxsize=256)
 def _chip(text: str, color: RGB, size: int, width: int) -> Array:
     """Return a name on its colour, at most ``width`` pixels wide."""
-    # Black and white contrast equally with a relative luminance of 0.18 (WCAG 2).
-    luminance = (np.asarray(color) / 255) ** 2.2 @ (0.2126, 0.7152, 0.0722)
     short = text
     pad = size // 2
     while text and _font(size).getlength(short) > width - 2 * pad:
         text = text[:-1]
         short = f"{text}..." if text else ""
-    name = _text(short, size, BLACK if luminance > 0.18 else WHITE, color)
+    name = _text(short, size, BLACK if is_light(color) else WHITE, color)
     chip = np.full((name.shape[0] + 2, name.shape[1] + 2 * pad, 3), color, np.uint8)
     _paste(chip, name, pad)
     return chip

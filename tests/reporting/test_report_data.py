@@ -14,6 +14,7 @@ from reporting.walkway import CALLS, Moody, Walkway, declare
 
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
+from skillweave.reporting.palette import hex_of
 from skillweave.reporting.report import calls, charts
 from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
@@ -180,7 +181,7 @@ def test_thinned_keeps_the_last_point() -> None:
 
 def test_a_word_on_a_colour_is_black_or_white() -> None:
     assert (charts.ink_on((255, 255, 255)), charts.ink_on((0, 0, 60))) == ("#000", "#fff")
-    assert charts.hex_of((1, 255, 16)) == "#01ff10"
+    assert hex_of((1, 255, 16)) == "#01ff10"
 
 
 # Of runs that were trained

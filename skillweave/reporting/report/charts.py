@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from skillweave.reporting.lineage import Born, Lineage
-from skillweave.reporting.palette import RGB
+from skillweave.reporting.lineage import Born, Lineage, changes_words, setting_title
+from skillweave.reporting.palette import RGB, is_light
 
 Spec = dict[str, Any]
 STEPS = "environment steps"
-COMPLEMENT = ("gamma", "gae_lambda")
-"""Settings that are drawn as their difference from one."""
 
 
 def chart(description: str, height: int, **rest: Any) -> Spec:
@@ -153,17 +151,14 @@ def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
     """Return a chart for each setting that differed: its values by generation."""
     everyone = list(lineage.born.values())
     path = lineage.path(lineage.winner)
-    shown = [k for k in lineage.winner.settings if len({str(b.settings[k]) for b in everyone}) > 1]
-    return [(k, _setting(k, everyone, path, color)) for k in shown]
+    return [(k, _setting(k, everyone, path, color)) for k in lineage.varied]
 
 
 def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: str) -> Spec:
     words = any(isinstance(b.settings[name], str) for b in everyone)
 
     def value(born: Born) -> Any:
-        setting_value = born.settings[name]
-        number = sum(setting_value) if isinstance(setting_value, list) else setting_value
-        return 1.0 - number if name in COMPLEMENT else number
+        return born.settings[name] if words else born.number(name)
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
     if not words:
@@ -186,41 +181,18 @@ def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: s
     return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layer)
 
 
-def setting_title(name: str) -> str:
-    """Return the title of a setting's axis."""
-    if name == "hidden":
-        return "hidden units, all layers"
-    return f"1 − {name}" if name in COMPLEMENT else name
-
-
 def what_changed(born: Born) -> str:
     """Return a member's mutation in words."""
     if not born.changes:
         return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(
             born.mutation, born.mutation
         )
-    return ", ".join(
-        f"{k.removeprefix('network.')} {short(old)} → {short(new)}"
-        for k, (old, new) in born.changes.items()
-    )
-
-
-def short(value: Any) -> str:
-    """Return a setting's value in few letters."""
-    if isinstance(value, list):
-        return "-".join(map(str, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def hex_of(color: RGB) -> str:
-    """Return a colour as the web writes it."""
-    return "#{:02x}{:02x}{:02x}".format(*color)
+    return changes_words(born)
 
 
 def ink_on(color: RGB) -> str:
-    """Return black or white, whichever is read better on a colour (WCAG 2)."""
-    red, green, blue = ((c / 255) ** 2.2 for c in color)
-    return "#000" if 0.2126 * red + 0.7152 * green + 0.0722 * blue > 0.18 else "#fff"
+    """Return black or white, whichever is read better on a colour."""
+    return "#000" if is_light(color) else "#fff"
 
 
 def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:

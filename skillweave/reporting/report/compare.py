@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.reporting.palette import color_of
+from skillweave.reporting.palette import color_of, hex_of
 from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
 from skillweave.reporting.report.groups import Group, differences, grouped
@@ -48,7 +48,7 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     groups = grouped(runs)
     saved = {run.path: load_evaluation(run) for run in runs}
     curves_of = {run.path: read_curves(run) for run in runs}
-    colors = [charts.hex_of(color_of(i)) for i in range(len(groups))]
+    colors = [hex_of(color_of(i)) for i in range(len(groups))]
     keys = [group.key for group in groups]
     curves = _curves(groups, curves_of, colors)
     everything = [c for curves in curves_of.values() for c in curves]

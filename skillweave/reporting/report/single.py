@@ -12,8 +12,8 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
-from skillweave.reporting.lineage import read_lineage
-from skillweave.reporting.palette import RGB, color_of
+from skillweave.reporting.lineage import read_lineage, setting_title, short_value
+from skillweave.reporting.palette import RGB, color_of, hex_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.calls import (
@@ -207,12 +207,12 @@ def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     for entry in run.manifest["stages"]:
         for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
             colors.setdefault(name, color_of(len(colors)))
-    return {name: charts.hex_of(color) for name, color in colors.items()}
+    return {name: hex_of(color) for name, color in colors.items()}
 
 
 def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return the curves with their charts, as plain JSON."""
-    usual = charts.hex_of(color_of(1))
+    usual = hex_of(color_of(1))
     return [
         {
             "spec": charts.curve(c.label, colors.get(c.agent, usual)),
@@ -325,9 +325,7 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
             (b.generation + 1, b.member, charts.what_changed(b), number(b.fitness, scale))
             for b in lineage.path(lineage.winner)
         ]
-        names = [
-            (charts.setting_title(k), charts.short(lineage.winner.settings[k])) for k, _ in paths
-        ]
+        names = [(setting_title(k), short_value(lineage.winner.settings[k])) for k, _ in paths]
         sections.append({"stage": entry["name"], "line": line, "settings": names})
     return {"lineages": sections}
 
@@ -336,7 +334,7 @@ def _skills(played: Played) -> dict[str, Any]:
     """Return words and tables of the episodes that were played."""
     log = played.log
     named = zip(log.labels, played.colors, strict=True)
-    legend = [(k, charts.hex_of(c), charts.ink_on(c)) for k, c in named]
+    legend = [(k, hex_of(c), charts.ink_on(c)) for k, c in named]
     return {
         "legend": legend,
         "episodes": len(log.episodes),
@@ -348,7 +346,7 @@ def _skills(played: Played) -> dict[str, Any]:
 def _episodes(played: Played) -> dict[str, Any]:
     """Return the data of the played episodes for the page's script."""
     log = played.log
-    colors = [charts.hex_of(c) for c in played.colors]
+    colors = [hex_of(c) for c in played.colors]
     data: dict[str, Any] = {
         "labels": list(log.labels),
         "colors": colors,
