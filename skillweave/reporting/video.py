@@ -192,6 +192,12 @@ class Film(dict[str, Any]):
         return joined([Markup(shown), caption])
 
 
+def enlarged(frame: Array) -> Array:
+    """Return a frame (H, W, 3) enlarged k times, so that it has at least ``MIN_WIDTH`` pixels."""
+    factor = -(-MIN_WIDTH // frame.shape[1])
+    return frame if factor <= 1 else frame.repeat(factor, axis=0).repeat(factor, axis=1)
+
+
 # Captions
 
 
@@ -210,9 +216,7 @@ def caption(
     Returns:
         (H·k + band, W·k, 3) uint8, of even height.
     """
-    factor = -(-MIN_WIDTH // frame.shape[1])
-    if factor > 1:
-        frame = frame.repeat(factor, axis=0).repeat(factor, axis=1)
+    frame = enlarged(frame)
     height, width = frame.shape[:2]
     size = size or min(max(round(min(height / 22, width / 28)), 12), 40)
     band = round(1.8 * size)

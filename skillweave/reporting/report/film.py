@@ -15,14 +15,12 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
-from skillweave.reporting.video import frame_of
+from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.training.call_log import EpisodeLog
-from skillweave.types import Array
 
 MOST_FRAMES = 1_500
 MOST_BYTES = 2_800_000  # as text in the page a third more
-MIN_WIDTH = 240  # pixels; smaller frames are enlarged
 HOLD = 12  # frames for which the end of an episode stays
 USUAL_FPS = 30
 
@@ -86,7 +84,7 @@ def _replay(
     engine.reset_some(row, [episode.seed])
     for i, (action, reward) in enumerate(zip(episode.actions, episode.rewards, strict=True)):
         if i % every == 0:
-            video.add(_enlarged(frame_of(env)))
+            video.add(enlarged(frame_of(env)))
         raw = engine.step(action[None], row)
         progress.count(1, i + 1 == len(episode.actions))
         over = bool(raw.terminated[0] | raw.truncated[0])
@@ -96,9 +94,4 @@ def _replay(
                 f"thing in step {i + 1}: it does not repeat itself"
             )
     for _ in range(HOLD):
-        video.add(_enlarged(frame_of(env)))
-
-
-def _enlarged(frame: Array) -> Array:
-    factor = -(-MIN_WIDTH // frame.shape[1])
-    return frame if factor <= 1 else frame.repeat(factor, axis=0).repeat(factor, axis=1)
+        video.add(enlarged(frame_of(env)))
