@@ -126,4 +126,4 @@ def test_the_count_leaves_out_what_is_no_code():
 
 def test_the_shim_is_thin():
     files = (ROOT / "skillweave/compat/agilerl").rglob("*.py")
-    assert sum(statements(path.read_text()) for path in files) <= 450
+    assert sum(statements(path.read_text()) for path in files) <= 480
