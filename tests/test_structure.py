@@ -289,6 +289,7 @@ UNEXPLAINED = {
     "hierarchy.budgets",
     "hierarchy.fitting",
     "hierarchy.select_best",
+    "skills.info_read",
     "training.joint_learner",
     "training.periodic",
     "training.reflex_tally",
