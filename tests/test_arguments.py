@@ -14,7 +14,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.arguments import checked_names
-from skillweave.errors import KINDS, SkillweaveError
+from skillweave.errors import KINDS, DeclarationError
 
 
 @checked_names
@@ -122,7 +122,7 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
 
 @pytest.mark.parametrize(("call", "words"), WRONG, ids=[words[:60] for _, words in WRONG])
 def test_the_message_says_what_is_meant(call: Callable[[], Any], words: str) -> None:
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(DeclarationError) as caught:
         call()
     assert words in str(caught.value)
 
@@ -147,7 +147,7 @@ def test_a_subclass_of_a_user_may_have_attributes_of_its_own() -> None:
             self.notes = "mine"
 
     assert Mine().notes == "mine"
-    with pytest.raises(SkillweaveError, match="is 'skills' meant"):
+    with pytest.raises(DeclarationError, match="is 'skills' meant"):
         Mine().skils = []  # type: ignore[attr-defined]
 
 
@@ -176,7 +176,7 @@ ERRORS = {name for name, home in sw._HOME.items() if home == "errors"}
 
 @pytest.mark.parametrize("name", sorted(set(sw.__all__) - INSIDE - ERRORS))
 def test_every_public_name_refuses_an_unknown_argument(name: str) -> None:
-    with pytest.raises(SkillweaveError, match=r"no (setting|argument) 'quxx'|needs "):
+    with pytest.raises(DeclarationError, match=r"no (setting|argument) 'quxx'|needs "):
         getattr(sw, name)(quxx=1)
 
 
@@ -185,5 +185,5 @@ def test_every_method_of_a_run_refuses_an_unknown_argument(name: str) -> None:
     method = vars(sw.Run)[name]
     if isinstance(method, property):
         return
-    with pytest.raises(SkillweaveError, match=r"no argument 'quxx'|needs "):
+    with pytest.raises(DeclarationError, match=r"no argument 'quxx'|needs "):
         method(object(), quxx=1)

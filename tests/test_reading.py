@@ -10,7 +10,7 @@ from typing import Any, Literal, NotRequired, TypedDict
 import pytest
 
 from skillweave.algorithms.config import DQN, PPO, config_from_json, config_to_json
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.evolution.config import Evolution, evolution_from_json, evolution_to_json
 from skillweave.reading import DEEPEST, check_file, fit, parse_json, read_file, shown
 from skillweave.settings import LARGEST, AtLeastOne, Count
@@ -73,14 +73,14 @@ GOOD: dict[str, Any] = {"parts": [{"status": "done"}], "limit": None}
     ],
 )
 def test_what_does_not_fit_is_told_by_its_field(change: dict[str, Any], says: str) -> None:
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         fit(Outer, GOOD | change, "x.json")
     assert says in str(caught.value)
     assert len(str(caught.value)) < 200
 
 
 def test_a_missing_field_is_named() -> None:
-    with pytest.raises(SkillweaveError, match=r"x\.json is damaged: no field 'limit'"):
+    with pytest.raises(RunError, match=r"x\.json is damaged: no field 'limit'"):
         fit(Outer, {"parts": []}, "x.json")
 
 
@@ -123,10 +123,10 @@ def test_an_evolution_of_wrong_types_is_told_by_its_field(value: Any) -> None:
     for name in ("population", "selection", "mutations", "start"):
         if name == "population" and value == 5:
             continue
-        with pytest.raises(SkillweaveError, match=f"^runs/x.* evolution.{name}"):
+        with pytest.raises(RunError, match=f"^runs/x.* evolution.{name}"):
             evolution_from_json(data | {name: value}, "runs/x")
     changed = data | {"mutations": data["mutations"] | {"units": [value]}}
-    with pytest.raises(SkillweaveError, match=r"^runs/x: evolution\.mutations\.units"):
+    with pytest.raises(RunError, match=r"^runs/x: evolution\.mutations\.units"):
         evolution_from_json(changed, "runs/x")
 
 
@@ -139,7 +139,7 @@ def test_an_evolution_of_wrong_types_is_told_by_its_field(value: Any) -> None:
     ids=["very deep", "deep", "nan", "infinite", "not UTF-8", "many digits", "cut off"],
 )
 def test_json_that_could_not_be_written_is_damaged(text: str | bytes) -> None:
-    with pytest.raises(SkillweaveError, match=r"x\.json is damaged"):
+    with pytest.raises(RunError, match=r"x\.json is damaged"):
         parse_json(text, "x.json")
 
 
@@ -149,7 +149,7 @@ def test_json_that_could_not_be_written_is_damaged(text: str | bytes) -> None:
      '["\\ud800"]'.encode("utf-16-le")],
 )  # fmt: skip
 def test_half_a_character_in_json_is_damage(text: str | bytes) -> None:
-    with pytest.raises(SkillweaveError, match=r"x\.json is damaged: .* half of a character"):
+    with pytest.raises(RunError, match=r"x\.json is damaged: .* half of a character"):
         parse_json(text, "x.json")
 
 
@@ -173,14 +173,14 @@ def test_what_is_no_plain_file_is_refused_at_once(tmp_path: Path) -> None:
         (tmp_path / "none", "does not exist"),
         (Path("a\0b"), "cannot be read"),
     ):
-        with pytest.raises(SkillweaveError, match=says):
+        with pytest.raises(RunError, match=says):
             check_file(path)
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     with (tmp_path / "x").open("wb") as file:
         file.truncate(10**12)
-    with pytest.raises(SkillweaveError, match=r"1,000,000,000,000 bytes.*at most 100"):
+    with pytest.raises(RunError, match=r"1,000,000,000,000 bytes.*at most 100"):
         read_file(tmp_path / "x", 100)
 
 
@@ -193,5 +193,5 @@ def test_a_setting_that_is_yes_no_or_a_word_comes_back_from_json(kind: Any, comp
 
 @pytest.mark.parametrize("wrong", [1, "always", None, [True]])
 def test_a_setting_that_is_neither_yes_nor_no_nor_its_word_is_named(wrong: Any) -> None:
-    with pytest.raises(SkillweaveError, match=r"compile is .*; it must be true, false or auto"):
+    with pytest.raises(RunError, match=r"compile is .*; it must be true, false or auto"):
         config_from_json(config_to_json(PPO()) | {"compile": wrong})

@@ -23,7 +23,7 @@ from skillweave.algorithms.config import (
     config_from_json,
     config_to_json,
 )
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.settings import described, fitted
 
 if TYPE_CHECKING:
@@ -345,7 +345,7 @@ def test_a_file_is_held_against_the_same_checks(kind: Any) -> None:
         for value in field_kind.refused:
             if isinstance(value, type):
                 continue
-            with pytest.raises(SkillweaveError) as caught:
+            with pytest.raises(RunError) as caught:
                 config_from_json(data | {name: value}, "run.json", "stages[0].algorithm")
             said = str(caught.value)
             assert said.startswith("run.json"), value

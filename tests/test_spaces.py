@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Te
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError, RunError
 from skillweave.spaces import (
     action_codec,
     obs_codec,
@@ -130,16 +130,14 @@ def test_between_the_parts_of_an_observation_is_nothing():
 
 @pytest.mark.parametrize("space", [Text(3), Dict({"a": Tuple((Text(3),))})], ids=str)
 def test_an_unsupported_observation_space_says_which_are_supported(space):
-    with pytest.raises(
-        SkillweaveError, match=r"observation .* Box, Discrete, MultiDiscrete, MultiB"
-    ):
+    with pytest.raises(EnvError, match=r"observation .* Box, Discrete, MultiDiscrete, MultiB"):
         obs_codec(space)
 
 
 @pytest.mark.parametrize("space", [Box(0, 9, (1,), np.int64), Dict({"a": Discrete(2)})], ids=str)
 def test_an_unsupported_action_space_says_which_are_supported(space):
     wanted = r"supported are: Discrete, MultiDiscrete, MultiBinary, Box \(of floats\)"
-    with pytest.raises(SkillweaveError, match=wanted):
+    with pytest.raises(EnvError, match=wanted):
         action_codec(space)
 
 
@@ -321,7 +319,7 @@ def test_a_space_survives_json(space):
     ids=str,
 )
 def test_json_that_is_no_space_is_an_error_for_people(data):
-    with pytest.raises(SkillweaveError, match="space"):
+    with pytest.raises(RunError, match="space"):
         space_from_json(data)
 
 
@@ -358,5 +356,5 @@ def test_spaces_of_pixels_are_the_same_if_pixels_mean_the_same():
 
 
 def test_a_space_that_holds_no_number_is_refused():
-    with pytest.raises(SkillweaveError, match=r"the observation space Box.* holds no number"):
+    with pytest.raises(EnvError, match=r"the observation space Box.* holds no number"):
         obs_codec(gym.spaces.Box(0.0, 1.0, (0,), np.float32))

@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array, iterate
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.spaces import (
     obs_codec,
     obs_dtype,
@@ -202,7 +202,7 @@ def test_one_vector_of_floats_costs_no_copy():
 
 @pytest.mark.parametrize("space", [Dict({}), Tuple(()), Dict([(1, Discrete(2))])], ids=str)
 def test_parts_need_names(space):
-    with pytest.raises(SkillweaveError, match="at least one part, each with text as its name"):
+    with pytest.raises(EnvError, match="at least one part, each with text as its name"):
         obs_codec(space)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from skillweave import PPO, EnvSpec, Hierarchy, Skill, evaluate
-from skillweave.errors import SkillweaveError
+from skillweave.errors import PolicyError, SkillweaveError
 from skillweave.messages import error_text
 from skillweave.skills.outputs import blame
 from skillweave.tracebacks import LIBRARY, place
@@ -181,7 +181,7 @@ def test_an_error_in_a_ready_policy_names_its_line(tmp_path: Path) -> None:
 
     hierarchy = Hierarchy("CartPole-v1", [Ready()])
     where = rf"ZeroDivisionError.*\({HERE}, line {line_of('a policy fails')}\)"
-    with pytest.raises(SkillweaveError, match=where):
+    with pytest.raises(PolicyError, match=where):
         hierarchy.train(tmp_path / "run", quiet=True)
 
 
@@ -203,9 +203,9 @@ def test_an_error_in_a_policy_of_the_users_own_names_its_line(tmp_path: Path) ->
     where = rf"KeyError: 'left' \({HERE}, line {line_of('# act fails')}\)"
     tiny = PPO(num_envs=2, n_steps=8, batch_size=16)
     hierarchy = Hierarchy("CartPole-v1", [Ready()], selector=tiny, steps=100)
-    with pytest.raises(SkillweaveError, match=rf"skill 'ready': its policy's act\(\).*{where}"):
+    with pytest.raises(PolicyError, match=rf"skill 'ready': its policy's act\(\).*{where}"):
         hierarchy.train(tmp_path / "run", quiet=True)
-    with pytest.raises(SkillweaveError, match=rf"the policy's act\(\) raised {where}"):
+    with pytest.raises(PolicyError, match=rf"the policy's act\(\) raised {where}"):
         evaluate(Own(), "CartPole-v1", episodes=1)
 
 

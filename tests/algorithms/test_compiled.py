@@ -31,6 +31,7 @@ from skillweave import (
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
+from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Rollout, Sample
 from skillweave.seeding import Seeds
 
@@ -247,7 +248,7 @@ def test_what_cannot_be_compiled_goes_on_without_where_it_is_tried() -> None:
 
 def test_a_memory_is_not_compiled_where_it_is_tried() -> None:
     assert PPO(compile="auto", network=Network(rnn=RNN())).compile == "auto"
-    with pytest.raises(SkillweaveError, match=r"compile is True; it must be False where network"):
+    with pytest.raises(DeclarationError, match=r"compile is True; it must be False where network"):
         PPO(compile=True, network=Network(rnn=RNN()))
 
 
@@ -259,7 +260,7 @@ def test_a_torch_that_cannot_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert hasattr(config, "trace_autograd_ops")
     monkeypatch.setattr("torch._dynamo.config", Old())
-    with pytest.raises(SkillweaveError, match=r"DQN\.compile.*2\.13"):
+    with pytest.raises(DeclarationError, match=r"DQN\.compile.*2\.13"):
         Compiled(lambda: None, DQN(compile=True))
     assert Compiled(lambda: 3, DQN(compile="auto"))() == 3
 

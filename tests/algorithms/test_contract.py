@@ -40,7 +40,7 @@ from skillweave.algorithms.config import (
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
 from skillweave.collecting.skill_collector import SkillCollector
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
@@ -626,7 +626,7 @@ def test_an_algorithm_that_cannot_act_names_those_that_can(kind, space, able, mo
         return
     names = [k.__name__ for k in KINDS if k in able]
     says = f"{', '.join(names)} can" if names else "no algorithm here can"
-    with pytest.raises(SkillweaveError) as error:
+    with pytest.raises(DeclarationError) as error:
         make_algorithm(kind(), obs, space)
     assert str(error.value) == f"{kind.__name__} cannot act in {space}; {says}"
 
@@ -636,5 +636,5 @@ def test_a_policy_in_a_file_without_its_weights_says_which(tmp_path: Path):
     policy = AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))
     tensors, header = policy.to_file()
     tensors = {k: v for k, v in tensors.items() if k != "q.1.bias"}
-    with pytest.raises(SkillweaveError, match=r"agent: tensor q\.1\.bias should be \(1, 3\)"):
+    with pytest.raises(RunError, match=r"agent: tensor q\.1\.bias should be \(1, 3\)"):
         AgentPolicy.from_file(tensors, header, "agent")

@@ -15,10 +15,11 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
 from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 from torch.utils._pytree import tree_map
 
-from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Network, SelfImitationPPO
 from skillweave.algorithms import rollouts
 from skillweave.algorithms.base import state_to
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Rollout, Sample
 from skillweave.networks.config import CNN, RNN
 from skillweave.ops.device import Constant, all_false, on_host, resolve_device
@@ -201,9 +202,9 @@ def test_a_question_for_a_value_would_be_noticed():
 def test_a_device_that_is_not_there_is_told(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("cpu") == resolve_device("auto") == torch.device("cpu")
-    with pytest.raises(SkillweaveError, match=r"'cuda'.* finds no CUDA device here; use 'cpu'"):
+    with pytest.raises(DeclarationError, match=r"'cuda'.* finds no CUDA device here; use 'cpu'"):
         resolve_device("cuda")
-    with pytest.raises(SkillweaveError, match="'tpu'; it must be one of cpu, cuda, auto"):
+    with pytest.raises(DeclarationError, match="'tpu'; it must be one of cpu, cuda, auto"):
         resolve_device("tpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert resolve_device("cuda") == resolve_device("auto") == torch.device("cuda")

@@ -20,7 +20,7 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Sample
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.ops.losses import weighted_mean
@@ -47,7 +47,7 @@ TOGETHER: list[tuple[type, str, object, str]] = [
 @pytest.mark.parametrize(("kind", "name", "value", "asked"), TOGETHER)
 def test_settings_that_do_not_fit_each_other_are_named(kind, name, value, asked):
     beside = {"v_max": {"v_min": -10.0}, "v_min": {"v_max": 0.0}}.get(name, {})
-    with pytest.raises(SkillweaveError, match=rf"{kind.__name__}\.{name} is .*must be {asked}$"):
+    with pytest.raises(DeclarationError, match=rf"{kind.__name__}\.{name} is .*must be {asked}$"):
         kind(**{**beside, name: value})
 
 
@@ -77,7 +77,7 @@ def test_settings_survive_json(config):
     ],
 )
 def test_unknown_settings_in_json_are_named(change, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(RunError, match=says):
         config_from_json({**config_to_json(SAC()), **change})
 
 

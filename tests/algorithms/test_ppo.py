@@ -13,7 +13,7 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalise
@@ -447,7 +447,7 @@ def test_a_terminal_observation_that_is_not_finite_does_no_harm():
 
 
 def test_a_batch_is_no_larger_than_a_rollout():
-    with pytest.raises(SkillweaveError, match=r"PPO\.batch_size is 4097; it must be at most 4096"):
+    with pytest.raises(DeclarationError, match=r"PPO\.batch_size is 4097; it must be at most 4096"):
         PPO(batch_size=64 * 64 + 1)
 
 
@@ -456,7 +456,7 @@ def test_a_small_rollout_needs_no_batch_size_of_its_own():
 
 
 def test_the_kl_schedule_asks_for_its_target():
-    with pytest.raises(SkillweaveError, match=r"PPO\.target_kl is None; .* 'kl'"):
+    with pytest.raises(DeclarationError, match=r"PPO\.target_kl is None; .* 'kl'"):
         PPO(learning_rate_schedule="kl")
 
 
@@ -476,5 +476,5 @@ def test_settings_survive_json():
     ],
 )
 def test_unknown_settings_in_json_are_named(change, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(RunError, match=says):
         config_from_json({**config_to_json(PPO()), **change})

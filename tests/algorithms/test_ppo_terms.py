@@ -9,10 +9,11 @@ import torch
 from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from toys import Toy, learn
 
-from skillweave import PPO, Network, SkillweaveError
+from skillweave import PPO, Network
 from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.ppo import Terms, samples_of
+from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Rollout
 from skillweave.networks.heads import ActionHead
 from skillweave.ops.distributions import with_epsilon
@@ -57,11 +58,11 @@ def test_who_acts_has_the_floor_and_who_is_greedy_has_not():
 
 
 def test_a_floor_needs_discrete_actions():
-    with pytest.raises(SkillweaveError, match="epsilon needs discrete actions"):
+    with pytest.raises(DeclarationError, match="epsilon needs discrete actions"):
         make_algorithm(PPO(epsilon=0.1), SEEN, SEEN)
-    with pytest.raises(SkillweaveError, match="epsilon"):
+    with pytest.raises(DeclarationError, match="epsilon"):
         PPO(epsilon=1.5)
-    with pytest.raises(SkillweaveError, match="epsilon_fraction"):
+    with pytest.raises(DeclarationError, match="epsilon_fraction"):
         PPO(epsilon_fraction=1.5)
 
 

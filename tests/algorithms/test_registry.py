@@ -24,7 +24,6 @@ from skillweave import (
     Mutations,
     Network,
     Skill,
-    SkillweaveError,
     register_algorithm,
     train_agent,
 )
@@ -32,7 +31,7 @@ from skillweave.algorithms import config as table
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 
@@ -168,11 +167,11 @@ def test_an_algorithm_that_nobody_registered_is_an_error_that_says_what_to_do():
     config = own()
     table._REGISTERED.pop("A2C")
     says = r"no algorithm is registered for '?A2C'?; there are: PPO, .*\.register_algorithm"
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(RunError, match=says):
         config_from_json(data, "run.json", "phases[0].algorithm")
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         make_algorithm(config, BOX, LINE)
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         train_agent("CartPole-v1", config, 100, "nowhere")
 
 
@@ -188,11 +187,11 @@ def test_the_latest_of_a_name_counts_and_the_librarys_own_stay():
 def test_a_method_that_is_missing_is_named(method):
     kind = example().A2CAlgorithm
     lacking = type("Half", (kind,), {method: getattr(Algorithm, method)})
-    with pytest.raises(SkillweaveError, match=rf"Half lacks {method}; see skillweave\.Algorithm"):
+    with pytest.raises(DeclarationError, match=rf"Half lacks {method}; see skillweave\.Algorithm"):
         register_algorithm(example().A2C, lacking)
     algorithm = lacking(own(), BOX, LINE)
     given = {"fresh_state": 1, "parameter_groups": 0, "act": 4, "value": 2, "update": 3}[method]
-    with pytest.raises(SkillweaveError, match=rf"Half has no method '{method}'"):
+    with pytest.raises(DeclarationError, match=rf"Half has no method '{method}'"):
         getattr(algorithm, method)(*[None] * given)
 
 

@@ -15,7 +15,7 @@ from toys import Masked, Toy, learn
 
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.experience import Sample
 from skillweave.networks.config import Network
 from skillweave.ops.losses import critic_loss, masked_entropy_target
@@ -321,7 +321,7 @@ def test_under_a_mask_the_temperature_does_not_grow_without_bound():
 @pytest.mark.parametrize(("space", "aim"), [(CHOICES, 1.2), (FORCES, 1.5)])
 def test_an_entropy_that_no_policy_has_is_refused(space, aim):
     with pytest.raises(
-        SkillweaveError, match=r"SAC\.target_entropy is .*at most 1\.\d+, the entropy"
+        DeclarationError, match=r"SAC\.target_entropy is .*at most 1\.\d+, the entropy"
     ):
         make(space, target_entropy=aim)
 

@@ -22,11 +22,12 @@ from small_runs import (
 )
 
 import skillweave as sw
-from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Hierarchy, Linear, SelfImitationPPO
 from skillweave.algorithms.config import SkillCritic, config_from_json, config_to_json
 from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.cli.overrides import apply_overrides
+from skillweave.errors import DeclarationError
 from skillweave.runs.manifest import read_manifest
 from skillweave.seeding import Seeds
 
@@ -86,15 +87,17 @@ def test_what_is_no_schedule_is_a_sentence(kind):
         ("fast", rf"{name}\.learning_rate is 'fast'; it must be a positive number, Linear"),
         ((1, 2), rf"{name}\.learning_rate is \(1, 2\); it must be a positive number"),
     ):
-        with pytest.raises(SkillweaveError, match=says):
+        with pytest.raises(DeclarationError, match=says):
             kind(learning_rate=rate)
     for values, says in (((math.inf, 0), "Linear.start is inf"), ((1e-3, -1), "Linear.end is -1")):
-        with pytest.raises(SkillweaveError, match=says):
+        with pytest.raises(DeclarationError, match=says):
             Linear(*values)
 
 
 def test_a_schedule_leaves_no_place_for_another_one():
-    with pytest.raises(SkillweaveError, match="learning_rate_schedule is 'kl', which adapts a num"):
+    with pytest.raises(
+        DeclarationError, match="learning_rate_schedule is 'kl', which adapts a num"
+    ):
         PPO(learning_rate=Linear(1e-3, 0), learning_rate_schedule="kl", target_kl=0.01)
 
 
@@ -107,7 +110,7 @@ def test_a_function_is_checked_each_time_it_is_used():
     bad_values = [bad.value]
     config = PPO(learning_rate=_named_global(schedule))
     bad_values[0] = math.inf
-    with pytest.raises(SkillweaveError, match=r"returned inf; it must return a finite number"):
+    with pytest.raises(DeclarationError, match=r"returned inf; it must return a finite number"):
         rate_now(config, torch.ones(1), 0.3)
 
 
@@ -125,7 +128,7 @@ def test_an_algorithm_of_the_users_own_that_does_not_follow_schedules_refuses_th
 
     monkeypatch.setattr(PPOAlgorithm, "follows_schedules", False)
     spaces = gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(2)
-    with pytest.raises(SkillweaveError, match="does not follow schedules: give a number"):
+    with pytest.raises(DeclarationError, match="does not follow schedules: give a number"):
         make_algorithm(PPO(learning_rate=Linear(1e-3, 0)), *spaces)
 
 
@@ -170,7 +173,9 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
     monkeypatch.setattr(named, "_KNOWN", {})
     agent = sw.Agent.from_manifest(manifest)
     assert agent.load(run.path).policy is not None
-    with pytest.raises(SkillweaveError, match="a function of your own, and its code is not loaded"):
+    with pytest.raises(
+        DeclarationError, match="a function of your own, and its code is not loaded"
+    ):
         rate_now(agent.algorithm, torch.ones(1), 0.0)
 
 
@@ -179,7 +184,7 @@ def test_it_does_not_mutate():
     assert "learning_rate" not in sw.Mutations().ranges_of(config)
     assert "gamma" in sw.Mutations().ranges_of(config)
     ranges = {"learning_rate": sw.Range(1e-4, 1e-2)}
-    with pytest.raises(SkillweaveError, match="learning_rate is a schedule, which cannot mutate"):
+    with pytest.raises(DeclarationError, match="learning_rate is a schedule, which cannot mutate"):
         sw.Mutations(ranges=ranges).ranges_of(config)
 
 
@@ -196,7 +201,7 @@ def test_the_command_line_writes_it_as_a_call():
     apply_overrides(declared, ["algorithm.learning_rate=1e-4"])
     assert declared.selector.learning_rate == Linear(3e-4, 0.0)
     assert declared.algorithm.learning_rate == 1e-4
-    with pytest.raises(SkillweaveError, match=r"selector\.learning_rate=linear"):
+    with pytest.raises(DeclarationError, match=r"selector\.learning_rate=linear"):
         apply_overrides(declared, ["selector.learning_rate=linear(3)"])
 
 

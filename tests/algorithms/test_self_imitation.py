@@ -7,9 +7,10 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from skillweave import PPO, Network, SelfImitationPPO, SkillweaveError
+from skillweave import PPO, Network, SelfImitationPPO
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Rollout
 from skillweave.seeding import Seeds
 from skillweave.training.learner import Stack
@@ -176,12 +177,12 @@ def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
     algorithm, state = make()
     Stack(algorithm, state)
     state.kept_action[0, 0] = 3
-    with pytest.raises(SkillweaveError, match=r"SelfImitationPPO has kept .* action .* altered"):
+    with pytest.raises(RunError, match=r"SelfImitationPPO has kept .* action .* altered"):
         Stack(algorithm, state)
     grid = make_algorithm(CONFIG, Discrete(4), THREE)
     state = grid.init([Seeds(0)])
     state.kept_obs.fill_(4)
-    with pytest.raises(SkillweaveError, match="choice that does not exist"):
+    with pytest.raises(RunError, match="choice that does not exist"):
         Stack(grid, state)
 
 
@@ -193,14 +194,14 @@ def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
     ],
 )  # fmt: skip
 def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(SkillweaveError, match=rf"SelfImitationPPO\.{name} is {value!r}; it must"):
+    with pytest.raises(DeclarationError, match=rf"SelfImitationPPO\.{name} is {value!r}; it must"):
         SelfImitationPPO(**{name: value})
 
 
 def test_memory_is_refused():
     from skillweave import RNN
 
-    with pytest.raises(SkillweaveError, match=r"SelfImitationPPO\.network .* without rnn"):
+    with pytest.raises(DeclarationError, match=r"SelfImitationPPO\.network .* without rnn"):
         SelfImitationPPO(network=Network(rnn=RNN("gru", 4)))
 
 

@@ -16,7 +16,7 @@ from small_runs import interrupt_at_checkpoint
 
 from skillweave import recipes
 from skillweave.cli import main
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 
 COMMANDS = ("train", "resume", "evaluate", "render", "plot", "report", "compare", "list", "info")
@@ -493,7 +493,7 @@ def test_a_python_user_may_keep_an_evaluation_too(trained: Trained, tmp_path: Pa
     found = loaded.evaluate(2, save=True)
     assert loaded.info()["evaluation"].items() >= found.to_json().items()
     for how in ({"skill": "left"}, {"engine": "auto"}):
-        with pytest.raises(SkillweaveError, match="leave out skill and engine"):
+        with pytest.raises(DeclarationError, match="leave out skill and engine"):
             loaded.evaluate(2, save=True, **how)
 
 

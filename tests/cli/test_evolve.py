@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from skillweave import Evolution, Hierarchy, Range, Skill, SkillweaveError, Tournament, Truncation
+from skillweave import Evolution, Hierarchy, Range, Skill, Tournament, Truncation
 from skillweave.cli.main import main
 from skillweave.cli.overrides import parse_evolve
+from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
@@ -83,7 +84,7 @@ def test_settings_become_a_plan_for_each_stage():
     ],
 )
 def test_what_cannot_be_is_refused_by_name(setting, said):
-    with pytest.raises(SkillweaveError, match=said):
+    with pytest.raises(DeclarationError, match=said):
         parse_evolve([setting], declared(), False)
 
 
@@ -157,14 +158,14 @@ def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
     manifest: dict[str, Any] = dict(RunDirectory.open(run).manifest)
     empty = RunDirectory.create(tmp_path / "empty", manifest)
-    with pytest.raises(SkillweaveError, match="nothing to draw"):
+    with pytest.raises(RunError, match="nothing to draw"):
         plot_run(empty)
     (empty.path / "lineage.jsonl").write_text('{"stage": "left"}\n')
-    with pytest.raises(SkillweaveError, match=r"lineage.jsonl, line 1 is damaged"):
+    with pytest.raises(RunError, match=r"lineage.jsonl, line 1 is damaged"):
         plot_run(empty)
 
 
 def test_without_matplotlib_it_names_the_extra(run: Path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[plot\]"):
+    with pytest.raises(MissingExtra, match=r"skillweave\[plot\]"):
         plot_run(RunDirectory.open(run))

@@ -11,7 +11,7 @@ from skillweave.cli import main, sweep
 from skillweave.cli.main import _with_addresses
 from skillweave.cli.sweep import summary
 from skillweave.cli.sweep_code import code_files
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.recipes import load, source
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
@@ -270,7 +270,7 @@ def test_seeds(text, seeds):
 
 @pytest.mark.parametrize("text", ["", "3:1", "-1:2", "a", "1,1", "1:2:3"])
 def test_what_are_no_seeds_is_told(text):
-    with pytest.raises(SkillweaveError, match="write 0:20 for 0 to 19"):
+    with pytest.raises(DeclarationError, match="write 0:20 for 0 to 19"):
         sweep.parse_seeds(text)
 
 
@@ -284,7 +284,7 @@ def test_choices_are_all_combinations_and_values_may_be_tuples():
 
 @pytest.mark.parametrize("each", [["a"], ["a="], ["a=1,1"], ["a=1,,2"], ["a=1", "a=2"]])
 def test_what_are_no_choices_is_told(each):
-    with pytest.raises(SkillweaveError, match="--set-each"):
+    with pytest.raises(DeclarationError, match="--set-each"):
         sweep.parse_choices(each)
 
 

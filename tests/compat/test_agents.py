@@ -12,7 +12,7 @@ from skillweave.compat.agilerl.algorithms.dqn_rainbow import RainbowDQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
 from skillweave.compat.batches import rollout_of
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
 KINDS = {
@@ -255,9 +255,9 @@ def test_what_cannot_be_is_said(make, says):
 
 def test_a_checkpoint_of_another_algorithm_or_none_is_refused(tmp_path):
     KINDS["ddpg"]().saveCheckpoint(tmp_path / "ddpg.pt")
-    with pytest.raises(SkillweaveError, match="DDPG"):
+    with pytest.raises(RunError, match="DDPG"):
         TD3.load(tmp_path / "ddpg.pt")
-    with pytest.raises(SkillweaveError, match=r"TD3.*not of PPO"):
+    with pytest.raises(RunError, match=r"TD3.*not of PPO"):
         PPO.load(tmp_path / "ddpg.pt")
-    with pytest.raises(SkillweaveError, match="does not exist"):
+    with pytest.raises(RunError, match="does not exist"):
         PPO.load(tmp_path / "nothing.pt")

@@ -23,7 +23,7 @@ from skillweave.compat.agilerl.algorithms.dqn import DQN
 from skillweave.compat.agilerl.algorithms.ppo import PPO
 from skillweave.compat.agilerl.algorithms.td3 import TD3
 from skillweave.compat.pickles import read_torch_pickle
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs.files import read_tensors
 
 OBS = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
@@ -142,7 +142,7 @@ def test_a_td3_checkpoint_has_its_critics(tmp_path):
 
 def test_load_refuses_a_pickle_and_says_what_to_do(tmp_path):
     ppo_file(tmp_path / "old.pt")
-    with pytest.raises(SkillweaveError, match=r"import-agilerl .*old\.pt --trust"):
+    with pytest.raises(RunError, match=r"import-agilerl .*old\.pt --trust"):
         PPO.load(tmp_path / "old.pt")
 
 
@@ -258,10 +258,10 @@ for path in sys.argv[1:]:
 def test_a_pickle_that_is_huge_when_written_out_is_refused(tmp_path):
     doubling = b"".join(b"](h%ch%ceq%c" % (i, i, i + 1) for i in range(60))
     path = write_program(tmp_path / "x.pt", b"\x80\x02]q\x00" + doubling + b".")
-    with pytest.raises(SkillweaveError, match="more than 500,000 objects"):
+    with pytest.raises(RunError, match="more than 500,000 objects"):
         read_torch_pickle(path)
     path = write_program(tmp_path / "x.pt", b"\x80\x02(" + b"N" * 600_000 + b"t.")
-    with pytest.raises(SkillweaveError, match="more than 500,000 operations"):
+    with pytest.raises(RunError, match="more than 500,000 operations"):
         read_torch_pickle(path)
 
 
@@ -269,9 +269,9 @@ def test_sizes_that_a_file_declares_are_looked_at_before_it_is_read(tmp_path):
     zeros = b"\x80\x02(" + b"0" * 10_000_000
     path = write_program(tmp_path / "x.pt", zeros, compression=zipfile.ZIP_DEFLATED)
     assert path.stat().st_size < 50_000
-    with pytest.raises(SkillweaveError, match=r"x\.pt: refused: it declares 10,000,003 bytes"):
+    with pytest.raises(RunError, match=r"x\.pt: refused: it declares 10,000,003 bytes"):
         read_torch_pickle(path)
-    with pytest.raises(SkillweaveError, match="its pickle declares 20,000,000 bytes"):
+    with pytest.raises(RunError, match="its pickle declares 20,000,000 bytes"):
         read_torch_pickle(write_program(path, b"N" * 20_000_000))
 
 
@@ -287,7 +287,7 @@ def test_a_zip_that_is_quoted_at_length_is_told_in_short(tmp_path):
     data = bytearray(path.read_bytes())
     data[26:28] = struct.pack("<H", 10_000)  # the length of its file's name, which zipfile quotes
     path.write_bytes(data)
-    with pytest.raises(SkillweaveError, match=r"x\.pt is no checkpoint of torch\.save") as raised:
+    with pytest.raises(RunError, match=r"x\.pt is no checkpoint of torch\.save") as raised:
         read_torch_pickle(path)
     assert len(str(raised.value)) < 1_000
 
@@ -308,7 +308,7 @@ BUILDS = {
 )
 def test_a_pickle_cannot_set_attributes_of_what_reads_it(tmp_path, thing, state):
     path = write_program(tmp_path / "x.pt", b"\x80\x02" + thing + state + b"b.")
-    with pytest.raises(SkillweaveError, match=r"refused|is damaged"):
+    with pytest.raises(RunError, match=r"refused|is damaged"):
         read_torch_pickle(path)
     for kind in (*pickles._ALLOWED.values(), pickles.Inert, pickles._Array, torch.Tensor):
         assert not hasattr(kind, "evil")
@@ -324,9 +324,7 @@ def test_a_pickle_cannot_set_attributes_of_a_tensor(tmp_path):
     with zipfile.ZipFile(tmp_path / "y.pt", "w") as file:
         for n, data in members.items():
             file.writestr(n, data)
-    with pytest.raises(
-        SkillweaveError, match="refused: the pickle sets the attributes of a tensor"
-    ):
+    with pytest.raises(RunError, match="refused: the pickle sets the attributes of a tensor"):
         read_torch_pickle(tmp_path / "y.pt")
 
 

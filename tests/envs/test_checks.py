@@ -7,7 +7,7 @@ import pytest
 from skillweave.envs.checks import CheckedEnv, Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, EnvError
 
 BOX = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 GOOD = np.zeros(2, np.float32), 1.0, False, False, {}
@@ -84,7 +84,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_answer_is_told_with_the_environment_and_the_step(case):
     answer, says = WRONG[case]
-    with pytest.raises(SkillweaveError, match=f"(?s)Scripted: environment 0, step 3 .*{says}"):
+    with pytest.raises(EnvError, match=f"(?s)Scripted: environment 0, step 3 .*{says}"):
         third_step(scripted(answer))
 
 
@@ -133,7 +133,7 @@ def test_an_observation_is_of_its_space(space, good, bad):
         def step(self, action):
             return but(obs=bad)
 
-    with pytest.raises(SkillweaveError, match=r"environment 0, step 1.*observation_space"):
+    with pytest.raises(EnvError, match=r"environment 0, step 1.*observation_space"):
         third_step(Wrong)
 
 
@@ -142,11 +142,9 @@ def test_an_error_of_an_environment_is_told_with_its_line_and_is_its_cause():
         def step(self, action):
             return 1 / (action - action)
 
-    with pytest.raises(
-        SkillweaveError, match=r"environment 0, step 1.*ZeroDivisionError.*test_chec"
-    ):
+    with pytest.raises(EnvError, match=r"environment 0, step 1.*ZeroDivisionError.*test_chec"):
         third_step(Falls)
-    with pytest.raises(SkillweaveError) as raised:
+    with pytest.raises(EnvError) as raised:
         third_step(Falls)
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
@@ -162,7 +160,7 @@ def test_an_error_of_an_environment_is_told_with_its_line_and_is_its_cause():
     ],
 )
 def test_the_first_observation_is_looked_at_too(reset, says):
-    with pytest.raises(SkillweaveError, match=f"environment 0, step 0 .*{says}"):
+    with pytest.raises(EnvError, match=f"environment 0, step 0 .*{says}"):
         third_step(scripted(GOOD, reset=reset))
 
 
@@ -177,7 +175,7 @@ def test_the_first_observation_is_looked_at_too(reset, says):
     ],
 )
 def test_what_makes_no_environment_is_told(made, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(EnvError, match=says):
         make_engine(EnvSpec(made), 2)
 
 
@@ -188,16 +186,16 @@ def test_what_makes_no_environment_is_told(made, says):
     ],
 )
 def test_a_wrong_specification_names_the_field(given, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         EnvSpec(**given)
 
 
 def test_settings_that_gymnasium_does_not_know_and_wrappers_that_fail_are_told():
-    with pytest.raises(SkillweaveError, match=r"CartPole-v1.*could not be made: TypeError"):
+    with pytest.raises(EnvError, match=r"CartPole-v1.*could not be made: TypeError"):
         EnvSpec("CartPole-v1", {"wings": 2}).make()
-    with pytest.raises(SkillweaveError, match=r"CartPole-v1.*could not be made: ZeroDivision"):
+    with pytest.raises(EnvError, match=r"CartPole-v1.*could not be made: ZeroDivision"):
         EnvSpec("CartPole-v1", wrappers=(lambda env: 1 / 0,)).make()
-    with pytest.raises(SkillweaveError, match="CartPole-v1 made None"):
+    with pytest.raises(EnvError, match="CartPole-v1 made None"):
         EnvSpec("CartPole-v1", wrappers=(lambda env: None,)).make()
 
 
@@ -214,7 +212,7 @@ def test_the_watch_counts_the_steps_of_each_environment():
         watch.check_step(raw(fine), np.array([0, 2]))
     watch.check_reset(fine[:1], np.array([0]))
     for row, step in ((2, 5), (0, 1)):
-        with pytest.raises(SkillweaveError, match=f"X: environment {row}, step {step} "):
+        with pytest.raises(EnvError, match=f"X: environment {row}, step {step} "):
             watch.check_step(raw(bad), np.array([1, row]))
 
 
@@ -222,7 +220,7 @@ def test_the_watch_sees_the_numbers_in_the_parts_of_an_observation():
     space = gym.spaces.Dict(a=gym.spaces.Discrete(2), b=gym.spaces.Dict(c=BOX))
     engine = make_engine(EnvSpec(nested := scripted(GOOD, observation_space=space)), 1)
     nested.reset = lambda self, **_: ({"a": 0, "b": {"c": np.float32([1, np.inf])}}, {})
-    with pytest.raises(SkillweaveError, match=r"observation \(b\.c\) has 1 of 2.*inf"):
+    with pytest.raises(EnvError, match=r"observation \(b\.c\) has 1 of 2.*inf"):
         engine.reset(0)
     engine.close()
 
@@ -239,7 +237,7 @@ def test_a_reward_too_large_to_be_squared_names_its_environment(reward):
     # Before, training ended with a NaN and the advice to lower the learning rate.
     watch = Watch("X", BOX, 2)
     watch.check_reset(zeros := np.zeros((2, 2), np.float32))
-    with pytest.raises(SkillweaveError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
+    with pytest.raises(EnvError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
         watch.check_step(raw(zeros, (0.0, reward)))
 
 
@@ -260,7 +258,7 @@ def test_envpool_is_watched_too(monkeypatch):
     pool = Pool()
     pool.step = broken
     monkeypatch.setattr(engine, "_pools", [pool])
-    with pytest.raises(SkillweaveError, match=r"CartPole-v1: environment 1, step 1.*4 of 4"):
+    with pytest.raises(EnvError, match=r"CartPole-v1: environment 1, step 1.*4 of 4"):
         engine.step(np.zeros(2, np.int64))
 
 
@@ -271,5 +269,5 @@ def test_the_time_limit_is_found_below_other_wrappers():
 
 
 def test_too_many_environments_are_refused_before_they_are_made():
-    with pytest.raises(SkillweaveError, match=r"1,000,000,000 environments of Scripted.*at most"):
+    with pytest.raises(EnvError, match=r"1,000,000,000 environments of Scripted.*at most"):
         make_engine(EnvSpec(Scripted), 10**9)

@@ -8,7 +8,7 @@ import pytest
 from toys import Ledger, Rememberer, actions, cartpole
 
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, EnvError, MissingExtra
 
 # EnvPool's own, for some environments; that users do not see it is tested once, below.
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")
@@ -120,7 +120,7 @@ def test_some_can_be_reset_to_seeds_of_their_own(engine, name):
 def test_envpool_says_that_it_cannot_reset_single_environments_to_a_seed(engine):
     e = engine("envpool")
     e.reset(0)
-    with pytest.raises(SkillweaveError, match="EnvPool cannot reset single environments"):
+    with pytest.raises(EnvError, match="EnvPool cannot reset single environments"):
         e.reset_some(np.array([0]), seeds=[1])
 
 
@@ -240,12 +240,12 @@ def test_making_an_engine_is_silent(engine, name):
 
 
 def test_an_engine_in_processes_of_its_own_is_gone_and_the_message_says_what_there_is():
-    with pytest.raises(SkillweaveError, match="must be one of auto, envpool, sync"):
+    with pytest.raises(DeclarationError, match="must be one of auto, envpool, sync"):
         EnvSpec(Ledger, engine="async")
 
 
 def test_envpool_refuses_what_it_cannot_run():
-    with pytest.raises(SkillweaveError, match=r"EnvPool cannot run Ledger.*engine='auto'"):
+    with pytest.raises(EnvError, match=r"EnvPool cannot run Ledger.*engine='auto'"):
         make_engine(EnvSpec(Ledger, engine="envpool"), 2)
 
 
@@ -260,7 +260,7 @@ def test_envpool_refuses_what_it_cannot_run():
 @pytest.mark.parametrize("engine_name", ["auto", "sync"])
 def test_an_unknown_environment_gives_close_matches(wrong, match, engine_name, monkeypatch):
     monkeypatch.delitem(gym.registry, "LunarLander-v2", raising=False)  # the shim's, if imported
-    with pytest.raises(SkillweaveError, match=rf"no environment '{wrong}'.*{match}") as found:
+    with pytest.raises(EnvError, match=rf"no environment '{wrong}'.*{match}") as found:
         make_engine(EnvSpec(wrong, engine=engine_name), 1)
     assert ".." not in str(found.value)
 
@@ -275,7 +275,7 @@ def test_a_missing_dependency_names_the_extra(monkeypatch):
 
 
 def test_a_function_that_cannot_render_is_named():
-    with pytest.raises(SkillweaveError, match="Ledger cannot be rendered"):
+    with pytest.raises(EnvError, match="Ledger cannot be rendered"):
         EnvSpec(Ledger).make("rgb_array")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from skillweave.envs import make
 from skillweave.envs.make import EnvSpec, workers_for
-from skillweave.errors import SkillweaveError
+from skillweave.errors import EnvError
 from skillweave.training.stage import assign_workers
 
 
@@ -92,7 +92,7 @@ def test_a_registered_environment_need_not_know_how_it_is_rendered():
     gym.register("Unseen-v0", Unseen)
     try:
         assert isinstance(EnvSpec("Unseen-v0").make().unwrapped, Unseen)
-        with pytest.raises(SkillweaveError, match=r"Unseen-v0.*render_mode"):
+        with pytest.raises(EnvError, match=r"Unseen-v0.*render_mode"):
             EnvSpec("Unseen-v0").make("rgb_array")
     finally:
         del gym.registry["Unseen-v0"]
@@ -121,9 +121,9 @@ def test_a_function_that_makes_environments_gets_kwargs():
     for made in (spec.make(), spec.make(render_mode="rgb_array")):
         assert made.spec.max_episode_steps == 7
         made.close()
-    with pytest.raises(SkillweaveError, match=r"short could not be made: TypeError.*'longer'"):
+    with pytest.raises(EnvError, match=r"short could not be made: TypeError.*'longer'"):
         EnvSpec(short, kwargs={"longer": 7}).make()
-    with pytest.raises(SkillweaveError, match=r"short could not be made: TypeError.*'longer'"):
+    with pytest.raises(EnvError, match=r"short could not be made: TypeError.*'longer'"):
         EnvSpec(short, kwargs={"longer": 7}).make(render_mode="rgb_array")
 
 
@@ -131,5 +131,5 @@ def test_a_class_that_takes_nothing_is_told_that_films_need_render_mode():
     class Bare(gym.Env):
         observation_space = action_space = gym.spaces.Discrete(2)
 
-    with pytest.raises(SkillweaveError, match=r"Bare cannot be rendered: .* must take render_mode"):
+    with pytest.raises(EnvError, match=r"Bare cannot be rendered: .* must take render_mode"):
         EnvSpec(Bare).make(render_mode="rgb_array")

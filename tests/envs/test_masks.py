@@ -17,7 +17,6 @@ from skillweave import (
     Network,
     Selection,
     Skill,
-    SkillweaveError,
     TrainDefaults,
     evaluate,
 )
@@ -26,6 +25,7 @@ from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.errors import EnvError
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Array
@@ -155,7 +155,7 @@ def test_a_mask_of_several_choices_has_their_numbers_one_after_another():
     )
     assert {tuple(a) for a in drawn[:, 0]} == {(0, 2), (1, 2)}
     assert {tuple(a) for a in drawn[:, 1]} == {(1, 0), (1, 1)}
-    with pytest.raises(SkillweaveError, match="environment 1 allows no action"):
+    with pytest.raises(EnvError, match="environment 1 allows no action"):
         masks.see({"action_mask": np.array([[1, 1, 0, 0, 1], [1, 1, 0, 0, 0]])})
 
 
@@ -164,7 +164,7 @@ def test_a_mask_of_several_choices_has_their_numbers_one_after_another():
 )
 def test_a_mask_of_another_shape_is_named(mask):
     masks = ActionMasks(gym.spaces.Discrete(3), 2)
-    with pytest.raises(SkillweaveError, match=r"action_mask.*shape \(2, 3\).*Discrete\(3\)"):
+    with pytest.raises(EnvError, match=r"action_mask.*shape \(2, 3\).*Discrete\(3\)"):
         masks.see({"action_mask": mask})
 
 
@@ -173,7 +173,7 @@ def test_a_mask_that_allows_nothing_names_the_environment_unless_the_episode_is_
     told = {"action_mask": np.array([[0, 1, 0], [0, 0, 0]], np.int8)}
     masks.see(told, np.array([1, 3]), np.array([False, True]))
     assert masks.now[[1, 3]].tolist() == [[False, True, False], [True] * 3]
-    with pytest.raises(SkillweaveError, match=r"environment 3 allows no action.*action_mask"):
+    with pytest.raises(EnvError, match=r"environment 3 allows no action.*action_mask"):
         masks.see(told, np.array([1, 3]), np.array([False, False]))
 
 
@@ -299,7 +299,7 @@ def test_what_a_policy_made_elsewhere_takes_is_for_the_environment_to_judge():
     found = evaluate(stubborn, EnvSpec("Taxi-v4"), episodes=2)
     assert found.lengths == (200, 200)
     stubborn = ScriptedPolicy(lambda obs: np.full(len(obs), 3), *_spaces(Gate))
-    with pytest.raises(SkillweaveError, match=r"step 1 of its episode.*3 is forbidden"):
+    with pytest.raises(EnvError, match=r"step 1 of its episode.*3 is forbidden"):
         evaluate(stubborn, EnvSpec(Gate), episodes=1)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.envs.make import make_engine, workers_for
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import EnvError, MissingExtra
 
 N = 5
 
@@ -104,7 +104,7 @@ def test_where_a_pool_cannot_be_made_the_environment_itself_is_stepped():
         raise MissingExtra("the clock", "envpool")
 
     assert type(make_engine(sw.EnvSpec(OneClock, pool=missing), 2)).__name__ == "GymnasiumEngine"
-    with pytest.raises(SkillweaveError, match=r"EnvPool cannot run OneClock"):
+    with pytest.raises(EnvError, match=r"EnvPool cannot run OneClock"):
         make_engine(sw.EnvSpec(OneClock, pool=missing, engine="envpool"), 2)
 
 
@@ -112,7 +112,7 @@ def test_a_pool_of_another_environment_is_told():
     class Wide(Clock):
         observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
 
-    with pytest.raises(SkillweaveError, match=r"OneClock: its pool's observation_space is Box.*3"):
+    with pytest.raises(EnvError, match=r"OneClock: its pool's observation_space is Box.*3"):
         make_engine(sw.EnvSpec(OneClock, pool=Wide), 2)
 
 
@@ -142,5 +142,5 @@ def test_what_envpool_shows_may_be_changed():
 def test_an_environment_that_envpool_does_not_have_is_told():
     pytest.importorskip("envpool")
     says = r"EnvPool has no environment 'CartPool-v1'.* Close matches: .*CartPole-v1"
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(EnvError, match=says):
         sw.envpool("CartPool-v1", 2, 1, 0)

@@ -21,8 +21,8 @@ from skillweave import (
     Mutations,
     Network,
     SelfImitationPPO,
-    SkillweaveError,
 )
+from skillweave.errors import DeclarationError
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
 from skillweave.evolution.stacks import Member, copy, join, split
 from skillweave.ops.optim import adam_
@@ -226,7 +226,7 @@ def test_whatever_is_drawn_stays_within_the_limits_and_can_act(name, activation)
 
 def test_layer_norm_and_no_layers_are_refused():
     for network in (Network((8,), layer_norm=True), Network(())):
-        with pytest.raises(SkillweaveError, match=r"Mutations\.architecture"):
+        with pytest.raises(DeclarationError, match=r"Mutations\.architecture"):
             check_architecture(PPO(network=network), Mutations(), "")
     off = Mutations(none=0.4, architecture=0.0)
     check_architecture(PPO(network=Network((8,), layer_norm=True)), off, "")

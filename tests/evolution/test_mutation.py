@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range, SkillweaveError
+from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range
 from skillweave.algorithms.parameters import LARGEST
+from skillweave.errors import DeclarationError
 from skillweave.evolution.config import KINDS
 from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
 from skillweave.evolution.stacks import Member, join
@@ -179,7 +180,7 @@ def test_random_settings_cover_their_ranges_and_fit_together():
     ],
 )
 def test_mutations_that_an_agent_does_not_have_are_refused(config, evolution, said):
-    with pytest.raises(SkillweaveError, match=said):
+    with pytest.raises(DeclarationError, match=said):
         check_mutations(config, evolution, "stage x: ")
 
 
@@ -211,7 +212,7 @@ def test_a_temperature_that_is_learnt_does_not_mutate():
     assert "ent_coef" not in Mutations().ranges_of(learnt)
     by = Evolution(mutations=Mutations(ranges={"ent_coef": Range(1e-3, 0.5)}))
     check_mutations(FIXED, by, "")
-    with pytest.raises(SkillweaveError, match=r"ent_coef.*learn_ent_coef"):
+    with pytest.raises(DeclarationError, match=r"ent_coef.*learn_ent_coef"):
         check_mutations(learnt, by, "stage x: ")
 
 

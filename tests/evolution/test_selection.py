@@ -15,10 +15,10 @@ from skillweave import (
     Heir,
     Mutations,
     Range,
-    SkillweaveError,
     Tournament,
     Truncation,
 )
+from skillweave.errors import DeclarationError, TrainingError
 from skillweave.evolution.config import evolution_from_json, evolution_to_json
 from skillweave.evolution.selection import select
 
@@ -62,7 +62,7 @@ def test_all_that_diverged_are_replaced_whatever_the_share():
 
 @pytest.mark.parametrize("selection", [Tournament(), Truncation()])
 def test_when_all_have_diverged_it_says_so(selection):
-    with pytest.raises(SkillweaveError, match="every member has diverged"):
+    with pytest.raises(TrainingError, match="every member has diverged"):
         chosen(selection, [-np.inf] * 4)
 
 
@@ -78,9 +78,9 @@ class Own:
 
 def test_a_selection_of_ones_own_is_used_and_checked():
     assert chosen(Own()) == [Heir(1, True)] * 6
-    with pytest.raises(SkillweaveError, match=r"Own\.select\(\) must return"):
+    with pytest.raises(TrainingError, match=r"Own\.select\(\) must return"):
         chosen(Own(2))
-    with pytest.raises(SkillweaveError, match=r"Own\.select\(\) must return"):
+    with pytest.raises(TrainingError, match=r"Own\.select\(\) must return"):
         chosen(Own(9))
 
 
@@ -113,7 +113,7 @@ def test_a_selection_of_ones_own_is_used_and_checked():
     ],
 )
 def test_what_cannot_be_is_refused_by_name(make, said):
-    with pytest.raises(SkillweaveError, match=said):
+    with pytest.raises(DeclarationError, match=said):
         make()
 
 
@@ -145,7 +145,7 @@ def test_json_holds_all_of_it(selection):
 
 def test_json_knows_a_selection_of_ones_own_by_name_only():
     told = evolution_to_json(Evolution(selection=Own()))
-    with pytest.raises(SkillweaveError, match="selection of your own, Own"):
+    with pytest.raises(DeclarationError, match="selection of your own, Own"):
         evolution_from_json(told, "run x")
     mine = Own()
     assert evolution_from_json(told, "run x", mine).selection is mine

@@ -30,6 +30,7 @@ from skillweave import (
 )
 from skillweave.collecting.placement import Placement, make_collectors
 from skillweave.collecting.workers import WorkerHost, Workers
+from skillweave.errors import DeclarationError
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
@@ -222,7 +223,7 @@ def test_a_part_that_dies_again_and_again_is_told(tmp_path):
 @pytest.mark.parametrize("cluster", [None, Ray(collectors=2)])
 def test_what_cannot_be_split_is_refused(config, says, cluster, tmp_path, monkeypatch):
     monkeypatch.setattr("skillweave.training.stage.resolve_device", lambda device: device)
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         agent(None if cluster else 2, config=config).train(
             tmp_path / "run", quiet=True, evolve=EVOLVE, cluster=cluster
         )

@@ -33,6 +33,7 @@ from skillweave import (
     Truncation,
     train_agent,
 )
+from skillweave.errors import DeclarationError
 from skillweave.evolution import stage as evolving
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import has_diverged
@@ -436,7 +437,7 @@ def test_a_selection_of_ones_own_is_asked_for_again_when_a_run_goes_on(tmp_path,
         train("ppo", tmp_path / "run", by)
     monkeypatch.undo()
     agent = Agent(spec("ppo"), CONFIGS["ppo"], 256)
-    with pytest.raises(SkillweaveError, match="Copycat"):
+    with pytest.raises(DeclarationError, match="Copycat"):
         agent.resume(tmp_path / "run", quiet=True)
     run = agent.resume(tmp_path / "run", quiet=True, evolve=by)
     assert [x["mutation"] for x in lineage(run.path)] == ["start"] * 3 + ["goes on"] * 6
@@ -485,6 +486,6 @@ def test_skills_and_selector_evolve_each_by_its_own_plan(tmp_path):
 )
 def test_a_plan_that_does_not_fit_is_refused_before_anything_is_written(plan, said, tmp_path):
     hierarchy = Hierarchy(spec("ppo"), [Left(), Right()], algorithm=CONFIGS["ppo"], learn="apart")
-    with pytest.raises(SkillweaveError, match=said):
+    with pytest.raises(DeclarationError, match=said):
         hierarchy.train(tmp_path / "run", quiet=True, evolve=plan)
     assert not (tmp_path / "run").exists()

@@ -14,10 +14,11 @@ import torch
 from torch import nn
 from toys import ASKS, SHOWS
 
-from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
+from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api.player import Player
+from skillweave.errors import MissingExtra, PolicyError
 from skillweave.export import runner as runner_module
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
@@ -187,13 +188,13 @@ def test_an_operation_that_onnx_does_not_know_is_said(monkeypatch: pytest.Monkey
         return torch.from_numpy(np.zeros(int(args[1][0].sum().item()))), None, None
 
     monkeypatch.setattr(policy.algorithm, "act", act)
-    with pytest.raises(SkillweaveError, match="the policy of 'land' cannot be written as ONNX"):
+    with pytest.raises(PolicyError, match="the policy of 'land' cannot be written as ONNX"):
         agent_graph(policy, False, "the policy of 'land'")
 
 
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[onnx\]"):
+    with pytest.raises(MissingExtra, match=r"skillweave\[onnx\]"):
         agent_graph(agent(*CASES["ppo, normalised"]), False, "it")
 
 

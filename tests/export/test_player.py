@@ -15,9 +15,10 @@ import torch
 from reference_calls import Counter, Left, Walk
 from test_networks import NESTED, agent, one_by_one
 
-from skillweave import PPO, EnvSpec, Hierarchy, Network, SkillweaveError, from_function
+from skillweave import PPO, EnvSpec, Hierarchy, Network, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
+from skillweave.errors import DeclarationError
 
 torch.set_num_threads(1)
 
@@ -55,10 +56,10 @@ def test_parts_of_an_observation_may_come_in_any_order() -> None:
 
 def test_an_observation_of_another_shape_is_refused() -> None:
     policy = agent(PPO(network=Network((8,))), gym.spaces.Box(-1, 1, (3,)), gym.spaces.Discrete(2))
-    with pytest.raises(SkillweaveError, match=r"shape \(2,\), not \(3,\)"):
+    with pytest.raises(DeclarationError, match=r"shape \(2,\), not \(3,\)"):
         Player(policy).act(np.zeros(2))
     policy = agent(PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(2))
-    with pytest.raises(SkillweaveError, match="image"):
+    with pytest.raises(DeclarationError, match="image"):
         Player(policy).act({"inner": (1, np.zeros(2))})
 
 

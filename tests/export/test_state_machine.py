@@ -14,10 +14,11 @@ import torch
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 
-from skillweave import PPO, RNN, Automaton, Network, Reflex, SkillweaveError, tree
+from skillweave import PPO, RNN, Automaton, Network, Reflex, tree
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import PolicyError
 from skillweave.export import states
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
@@ -191,10 +192,10 @@ def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
 
 def test_what_cannot_be_exported_says_what_to_do(tmp_path: Path) -> None:
     policy = trained(skill_set(Counter, Left))
-    with pytest.raises(SkillweaveError, match=r"policy of 'counter'.*memory.*train the skill"):
+    with pytest.raises(PolicyError, match=r"policy of 'counter'.*memory.*train the skill"):
         write_export(tmp_path, policy, "walk")
     chosen = ready(tree.Fallback("free", "left"), skill_set(Left, Free))
-    with pytest.raises(SkillweaveError, match=r"selector is a tree.*Automaton"):
+    with pytest.raises(PolicyError, match=r"selector is a tree.*Automaton"):
         write_export(tmp_path, chosen, "walk")
     assert not list(tmp_path.iterdir())
 
@@ -246,7 +247,7 @@ def test_a_selector_that_samples_in_any_case_samples_when_exported(tmp_path: Pat
     assert told["selector"]["noise"] == [["gumbel", 2]]
     assert told["skills"][0]["policy"]["noise"] == []
     chosen = ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right, greedy_selector=False))
-    with pytest.raises(SkillweaveError, match=r"is an automaton that draws .*greedy_selector"):
+    with pytest.raises(PolicyError, match=r"is an automaton that draws .*greedy_selector"):
         write_export(tmp_path / "other", chosen, "walk")
 
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import PPO, Network, SkillweaveError, register_encoder
+from skillweave import PPO, Network, register_encoder
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.errors import DeclarationError
 from skillweave.networks.encoders import (
     CELL_FEATURES,
     CELL_KINDS,
@@ -162,7 +163,7 @@ def test_numbers_beside_the_grid_are_features_too():
 
 
 def test_observations_without_a_grid_are_refused():
-    with pytest.raises(SkillweaveError, match="reads images of whole numbers"):
+    with pytest.raises(DeclarationError, match="reads images of whole numbers"):
         CellsEncoder(obs_codec(gym.spaces.Box(-1, 1, (3,), np.float32)))
 
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from skillweave import PPO, Hierarchy, Skill, TrainDefaults
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.networks.config import CNN, Network
 
 
@@ -25,7 +25,7 @@ class Upright(Skill):
     ],
 )
 def test_an_architecture_that_cannot_be_is_named_with_what_it_must_be(make, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         make()
 
 

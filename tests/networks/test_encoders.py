@@ -13,7 +13,7 @@ from toys import Echo, learn
 import skillweave
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.networks import encoders
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.encoders import ImageEncoder
@@ -120,7 +120,7 @@ def test_the_usual_network_depends_on_the_size(height, width, chosen, size):
 
 
 def test_an_image_that_is_too_small_is_an_error_that_names_sizes():
-    with pytest.raises(SkillweaveError) as error:
+    with pytest.raises(DeclarationError) as error:
         ImageEncoder(obs_codec(image_space(20, 24)), 0, CNN(), "relu")
     for said in ("(3, 20, 24)", "layer 2 has a kernel of 3", "only 1×1 are left", "CNN.small()"):
         assert said in str(error.value)
@@ -202,7 +202,7 @@ def test_a_registered_encoder_learns_saves_and_loads(name):
 
 @pytest.mark.usefixtures("_halves")
 def test_an_encoder_that_nobody_registered_names_those_that_are():
-    with pytest.raises(SkillweaveError) as error:
+    with pytest.raises(DeclarationError) as error:
         Net("net", obs_codec(image_space()), Network(encoder="wholes"), 2)
     said = "'wholes', which is not registered: call skillweave.register_encoder('wholes', ...)"
     assert said in str(error.value)

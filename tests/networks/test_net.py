@@ -20,7 +20,7 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.networks.net import Net
 from skillweave.networks.qnet import QNet
@@ -204,7 +204,7 @@ def test_images_are_seen_beside_the_numbers():
     ],
 )
 def test_numbers_that_are_not_there_are_named(space, says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         make_algorithm(PPO(network=Network(sees=(3, 1))), space, Discrete(2))
 
 

@@ -27,6 +27,7 @@ from skillweave import named as naming
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
+from skillweave.errors import DeclarationError, RunError
 from skillweave.named import Named, named
 from skillweave.networks.encoders import make_encoder
 from skillweave.networks.own import ModuleEncoder
@@ -340,7 +341,7 @@ def test_a_run_says_that_it_needs_code_and_loads_with_its_declaration(tmp_path, 
     want = run.policy.act({}, obs)[0]
     assert np.array_equal(agent.load(run.path).policy.act({}, obs)[0], want)
     monkeypatch.setattr(naming, "_KNOWN", {})
-    with pytest.raises(SkillweaveError, match=r"test_own:Features', a function of your own.*load"):
+    with pytest.raises(RunError, match=r"test_own:Features', a function of your own.*load"):
         RunDirectory.open(run.path).load_policy("agent")
 
 
@@ -430,7 +431,7 @@ def test_what_is_wrong_with_a_module_is_a_sentence(name):
     factory, says = WRONG[name]
     wrapped = Named(f"test_own:{name.replace(' ', '_')}")
     wrapped.function = factory
-    with pytest.raises(SkillweaveError, match=says) as error:
+    with pytest.raises(DeclarationError, match=says) as error:
         ModuleEncoder(obs_codec(Box(-1.0, 1.0, (4,))), wrapped)
     assert str(error.value).startswith("Network.encoder test_own:")
     assert "\n" not in str(error.value)
@@ -443,9 +444,9 @@ def test_what_is_no_factory_is_a_sentence():
         (functools.partial(Features, 4), r"partial with positional arguments; name them"),
         ("no such encoder", "which is not registered"),
     ):
-        with pytest.raises(SkillweaveError, match=says):
+        with pytest.raises(DeclarationError, match=says):
             make_encoder(Network(encoder=value).encoder, obs_codec(Box(-1.0, 1.0, (4,))))
-    with pytest.raises(SkillweaveError, match="give sees or encoder, not both"):
+    with pytest.raises(DeclarationError, match="give sees or encoder, not both"):
         Network(encoder=Features, sees=(0,))
 
 
@@ -457,7 +458,7 @@ def test_lists_and_dicts_are_taken_for_what_they_say():
     assert Network(cnn={"channels": [4], "kernels": [3], "strides": [1]}).cnn == sw.CNN(
         "plain", (4,), (3,), (1,)
     )
-    with pytest.raises(SkillweaveError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):
+    with pytest.raises(DeclarationError, match=r"PPO\.network: .*'hiden'.*'hidden' meant"):
         PPO(network={"hiden": [8]})
-    with pytest.raises(SkillweaveError, match=r"DQN\.network: Network\.hidden\[0\] is 0"):
+    with pytest.raises(DeclarationError, match=r"DQN\.network: Network\.hidden\[0\] is 0"):
         DQN(network={"hidden": [0]})

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
 
-from skillweave import Automaton, SkillweaveError
+from skillweave import Automaton
 from skillweave.collecting.call_end import CallEnd
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.selectors import LastCall
 from skillweave.types import Step
 
@@ -107,9 +108,7 @@ def test_it_solves_a_chain_of_skills():
 
 def test_an_automaton_whose_skills_may_not_start_says_so():
     policy = hierarchy(Automaton({"all": {"open_door"}}, {}))
-    with pytest.raises(
-        SkillweaveError, match=r"state 'all' none of its skills \(open_door\).*init"
-    ):
+    with pytest.raises(SkillError, match=r"state 'all' none of its skills \(open_door\).*init"):
         story(policy, 0)
     # The others of a state are called instead.
     policy = hierarchy(Automaton({"all": ["open_door", "wait"]}, {}))
@@ -149,7 +148,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_automaton_is_refused(case):
     make, message = WRONG[case]
-    with pytest.raises(SkillweaveError, match=message):
+    with pytest.raises(DeclarationError, match=message):
         make()
 
 
@@ -158,10 +157,10 @@ def test_an_event_that_answers_wrongly_is_named():
         return step.next_obs
 
     automaton = Automaton(STATES, {("search", "free"): won})
-    with pytest.raises(SkillweaveError, match=r"automaton: won\(\) returned shape \(1, 3\)"):
+    with pytest.raises(SkillError, match=r"automaton: won\(\) returned shape \(1, 3\)"):
         story(hierarchy(automaton), 0)
     automaton = Automaton(STATES, {("search", "free"): lambda step: step.info["nothing"]})
-    with pytest.raises(SkillweaveError, match="KeyError: 'nothing'"):
+    with pytest.raises(SkillError, match="KeyError: 'nothing'"):
         story(hierarchy(automaton), 0)
 
 

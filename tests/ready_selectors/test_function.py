@@ -16,7 +16,7 @@ from ready_selectors.chain import (
     story,
 )
 
-from skillweave import SkillweaveError
+from skillweave.errors import SkillError
 
 
 def by_number(obs: Any) -> Any:
@@ -59,7 +59,7 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_choice_is_refused_with_the_functions_name(case):
     function, message = WRONG[case]
-    with pytest.raises(SkillweaveError, match=rf"selector: function <lambda>\(\).*{message}"):
+    with pytest.raises(SkillError, match=rf"selector: function <lambda>\(\).*{message}"):
         story(hierarchy(function), 0)
 
 
@@ -68,7 +68,7 @@ def test_a_function_is_given_what_it_cannot_change():
         obs[:] = 0
         return [0]
 
-    with pytest.raises(SkillweaveError, match="change a copy"):
+    with pytest.raises(SkillError, match="change a copy"):
         story(hierarchy(choose), 0)
-    with pytest.raises(SkillweaveError, match="change a copy"):
+    with pytest.raises(SkillError, match="change a copy"):
         bound(choose).try_out()

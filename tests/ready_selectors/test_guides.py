@@ -27,6 +27,7 @@ from skillweave import (
     evaluate,
     tree,
 )
+from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.runs.directory import RunDirectory
 
 
@@ -298,7 +299,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("says", WRONG)
 def test_a_wrong_declaration_is_told(says):
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         declare(**WRONG[says])
 
 
@@ -307,7 +308,7 @@ def test_a_guide_that_fails_is_told_before_anything_is_trained(tmp_path):
         return np.full(len(obs), 9)
 
     hierarchy = declare(guide=wrong, guide_restrict=False, guide_kl=0.1)
-    with pytest.raises(SkillweaveError, match=r"guide: function wrong\(\) returned 9"):
+    with pytest.raises(SkillError, match=r"guide: function wrong\(\) returned 9"):
         hierarchy.train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
@@ -320,18 +321,16 @@ def test_a_run_with_another_guide_is_refused(whole, tmp_path):
         (declare(learn="together"), "has a guide, but the selector of this hierarchy has no guide"),
         (declare(learn="together", guide=other), "another checksum"),
     ):
-        with pytest.raises(SkillweaveError, match=message):
+        with pytest.raises(RunError, match=message):
             declared.load(path)
-        with pytest.raises(SkillweaveError, match=message):
+        with pytest.raises(RunError, match=message):
             declared.load_weights(weights)
     plain = declare().train(tmp_path / "plain", quiet=True)
-    with pytest.raises(
-        SkillweaveError, match="has no guide, but the selector of this hierarchy has a"
-    ):
+    with pytest.raises(RunError, match="has no guide, but the selector of this hierarchy has a"):
         declare(guide=AUTOMATON).load(plain.path)
 
 
 def test_no_skill_of_a_state_may_start(tmp_path):
     stuck = Automaton({"search": "open", "x": "wait"}, {})
-    with pytest.raises(SkillweaveError, match=r"'search' none of its skills \(open\) may start"):
+    with pytest.raises(SkillError, match=r"'search' none of its skills \(open\) may start"):
         declare(guide=stuck, learn="together").train(tmp_path / "run", quiet=True)

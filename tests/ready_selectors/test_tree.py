@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
-from skillweave import SkillweaveError, tree
+from skillweave import tree
 from skillweave.collecting.call_end import CallEnd
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.selectors import LastCall
 from skillweave.selectors.ready import ready_selector
 from skillweave.selectors.tree_policy import TreeSelector
@@ -123,11 +124,11 @@ def test_a_skill_that_may_not_start_has_failed_at_once():
 
 
 def test_a_tree_that_ends_without_a_skill_says_where():
-    with pytest.raises(SkillweaveError, match=r"tree ended \(FAILURE\).*\[0. 7. 0.\]"):
+    with pytest.raises(SkillError, match=r"tree ended \(FAILURE\).*\[0. 7. 0.\]"):
         chosen(tree.Sequence(flag(0), "a"), [], [(0, 7, 0)])
-    with pytest.raises(SkillweaveError, match=r"tree ended \(SUCCESS\).*Fallback"):
+    with pytest.raises(SkillError, match=r"tree ended \(SUCCESS\).*Fallback"):
         chosen(tree.Fallback(flag(0), "a"), [], [(1, 0, 0)])
-    with pytest.raises(SkillweaveError, match="without a skill that may start"):
+    with pytest.raises(SkillError, match="without a skill that may start"):
         chosen(tree.Sequence("a", "b"), [], masks=[(False, True, True)])
 
 
@@ -149,14 +150,14 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_tree_is_refused(case):
     make, message = WRONG[case]
-    with pytest.raises(SkillweaveError, match=message):
+    with pytest.raises(DeclarationError, match=message):
         make()
 
 
 def test_a_condition_that_answers_wrongly_is_named():
-    with pytest.raises(SkillweaveError, match=r"selector: tree: tall\(\) returned shape \(3,\)"):
+    with pytest.raises(SkillError, match=r"selector: tree: tall\(\) returned shape \(3,\)"):
         chosen(tree.Sequence(tree.Condition(lambda obs: obs[0] > 1, "tall"), "a"), [])
-    with pytest.raises(SkillweaveError, match=r"tall.*yes or no"):
+    with pytest.raises(SkillError, match=r"tall.*yes or no"):
         made(tree.Sequence(tree.Condition(lambda obs: obs[:, 0] + 0.5, "tall"), "a")).try_out()
 
 
@@ -233,7 +234,7 @@ def test_many_environments_at_once_are_each_as_the_definition_says(seed):
         wanted = [plain[i].choose(obs[i], mask[i], ended[i]) for i in rows]
         own = {k: v[rows] for k, v in memory.items()}
         if None in wanted:  # conditions that hold can bring a tree to its end without a skill
-            with pytest.raises(SkillweaveError, match="ended"):
+            with pytest.raises(SkillError, match="ended"):
                 policy.act(own, obs[rows], mask[rows])
             return
         skill, own = policy.act(own, obs[rows], mask[rows])

@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from skillweave import Apart, SkillweaveError, Step, Together, envpool
+from skillweave import Apart, Step, Together, envpool
+from skillweave.errors import DeclarationError, MissingExtra
 from skillweave.recipes import _rooms as world
 from skillweave.recipes import keys_and_doors as rooms
 
@@ -207,13 +208,15 @@ def test_rooms_are_drawn_anew_for_each_episode():
 
 
 def test_rooms_that_are_not_there_are_named_with_those_that_are():
-    with pytest.raises(SkillweaveError, match="no rooms 'cellar'; there are: small, unlock-pickup"):
+    with pytest.raises(
+        DeclarationError, match="no rooms 'cellar'; there are: small, unlock-pickup"
+    ):
         world.spec("cellar")
 
 
 def test_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minigrid", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[minigrid\]"):
+    with pytest.raises(MissingExtra, match=r"skillweave\[minigrid\]"):
         world.Rooms(("Empty-5x5",))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.pay.lander_missions import suite
-from skillweave import Apart, EnvSpec, Selection, SkillweaveError, Step
+from skillweave import Apart, EnvSpec, Selection, Step
+from skillweave.errors import DeclarationError
 from skillweave.recipes import _missions as world
 from skillweave.recipes import lander_missions as missions
 
@@ -76,9 +77,9 @@ def test_what_is_still_to_be_done_stands_in_the_observation():
 
 @pytest.mark.parametrize("legs", [(), ("left",) * 4, ("left", "up")])
 def test_missions_that_there_are_not_are_refused(legs):
-    with pytest.raises(SkillweaveError, match="a mission has 1 to 3 legs of left, right, hover"):
+    with pytest.raises(DeclarationError, match="a mission has 1 to 3 legs of left, right, hover"):
         world.Progress(1, [legs], gusts=False)
-    with pytest.raises(SkillweaveError, match=r"no mission 'moon'; there are: .*tour"):
+    with pytest.raises(DeclarationError, match=r"no mission 'moon'; there are: .*tour"):
         missions.declare("moon")
 
 

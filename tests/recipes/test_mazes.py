@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import SkillweaveError, Step
+from skillweave import Step
+from skillweave.errors import DeclarationError, MissingExtra
 from skillweave.recipes import _mazes as world
 from skillweave.recipes import mazes
 
@@ -124,13 +125,13 @@ def test_the_picture_shows_walls_the_goal_and_the_ball_where_they_are():
 
 
 def test_a_maze_that_there_is_not_is_refused():
-    with pytest.raises(SkillweaveError, match=r"no maze 'moon'; there are: large.*diverse"):
+    with pytest.raises(DeclarationError, match=r"no maze 'moon'; there are: large.*diverse"):
         mazes.declare("moon")
 
 
 def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[robotics\]"):
+    with pytest.raises(MissingExtra, match=r"skillweave\[robotics\]"):
         mazes.declare().train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 

@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave import Apart, SkillweaveError, Step
+from skillweave import Apart, Step
+from skillweave.errors import MissingExtra
 from skillweave.recipes import _arm as world
 from skillweave.recipes import pick_and_place as arm
 
@@ -116,7 +117,7 @@ def test_recovering_is_paid_by_progress_to_the_block():
 
 def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
-    with pytest.raises(SkillweaveError, match=r"skillweave\[robotics\]"):
+    with pytest.raises(MissingExtra, match=r"skillweave\[robotics\]"):
         arm.declare().train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 

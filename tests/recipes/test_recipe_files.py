@@ -14,7 +14,7 @@ import pytest
 from skillweave import recipes
 from skillweave.collecting import shipping
 from skillweave.collecting.shipping import packed
-from skillweave.errors import SkillweaveError
+from skillweave.errors import DeclarationError
 from skillweave.types import Step
 
 RECIPE = """
@@ -93,11 +93,11 @@ def test_two_recipes_with_files_of_one_name_are_refused_and_not_mixed(write: Wri
     second = write("b", pole=RECIPE, beside_rewards=REWARDS, beside_lazily="scale = 2.0\n")
     one = recipes.load(first)
     told = r"b/pole.py imports 'beside_rewards'.*a/beside_rewards.py\). Rename beside_rewards.py"
-    with pytest.raises(SkillweaveError, match=told):
+    with pytest.raises(DeclarationError, match=told):
         recipes.load(second)
     lazily = RECIPE.replace("from beside_rewards import centre", "centre = abs")
     third = write("c", pole=lazily, beside_lazily="scale = 2.0\n")
-    with pytest.raises(SkillweaveError, match=r"imports 'beside_lazily'.*a/beside_lazily.py"):
+    with pytest.raises(DeclarationError, match=r"imports 'beside_lazily'.*a/beside_lazily.py"):
         recipes.load(third)
     assert sys.modules[type(one.skills[0]).__module__].__file__ == first
 
@@ -108,7 +108,7 @@ def test_files_that_one_another_import_are_looked_at_too(write: Write) -> None:
     more = "import beside_rewards\n"
     second = write("b", pole=plain.replace("beside_rewards", "beside_more"), beside_more=more)
     write("b", beside_rewards=REWARDS)
-    with pytest.raises(SkillweaveError, match="imports 'beside_rewards'"):
+    with pytest.raises(DeclarationError, match="imports 'beside_rewards'"):
         recipes.load(second)
 
 
@@ -116,7 +116,7 @@ def test_a_file_named_like_a_package_is_refused_only_where_it_is_imported(write:
     unrelated = RECIPE.replace("from beside_rewards import centre", "centre = abs")
     recipes.load(write("a", pole=unrelated, json="raise ValueError\n"))
     recipe = write("b", pole="import json\n" + unrelated, json="x = 1\n")
-    with pytest.raises(SkillweaveError, match=r"imports 'json': beside it lies json.py"):
+    with pytest.raises(DeclarationError, match=r"imports 'json': beside it lies json.py"):
         recipes.load(recipe)
 
 
@@ -146,7 +146,7 @@ def test_recipes_of_one_name_do_not_replace_one_another(write: Write) -> None:
 )
 def test_an_error_is_one_line_with_file_and_line(write: Write, text: str, says: str) -> None:
     recipe = write("a", bad=text, beside_bad="\n1 / 0\n")
-    with pytest.raises(SkillweaveError, match=says) as caught:
+    with pytest.raises(DeclarationError, match=says) as caught:
         recipes.load(recipe)
     assert str(caught.value).startswith(recipe)
     assert "\n" not in str(caught.value)

@@ -65,9 +65,9 @@ def test_a_directory_of_runs_stands_for_its_runs_in_their_order(
     for name in ("s10", "s9"):
         shutil.copytree(folder / "base", tmp_path / name)
     assert [run.path.name for run in open_runs([tmp_path])] == ["s9", "s10"]
-    with pytest.raises(sw.SkillweaveError, match="holds no run"):
+    with pytest.raises(sw.RunError, match="holds no run"):
         open_runs([folder / "sweep" / "plots"])
-    with pytest.raises(sw.SkillweaveError, match="no runs were given"):
+    with pytest.raises(sw.DeclarationError, match="no runs were given"):
         open_runs([])
 
 
@@ -121,7 +121,7 @@ def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> N
 def test_what_cannot_be_drawn_is_told(
     folder: Path, tmp_path: Path, how: dict[str, object], says: str
 ) -> None:
-    with pytest.raises(sw.SkillweaveError) as error:
+    with pytest.raises(sw.DeclarationError) as error:
         plot_curves(folder / "sweep", tmp_path / "x", **how)  # type: ignore[arg-type]
     assert says in str(error.value)
     assert not list(tmp_path.iterdir())

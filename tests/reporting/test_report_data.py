@@ -14,6 +14,7 @@ from reporting.walkway import CALLS, Moody, Walkway, declare
 
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
+from skillweave.errors import EnvError
 from skillweave.reporting.palette import hex_of
 from skillweave.reporting.report import calls, charts
 from skillweave.reporting.report.charts import scores
@@ -111,7 +112,7 @@ def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
 def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     log = logged(tmp_path, env=Moody)
-    with pytest.raises(SkillweaveError, match="does not repeat itself"):
+    with pytest.raises(EnvError, match="does not repeat itself"):
         make_film(EnvSpec(Moody, engine="sync"), log.episodes, [0])
 
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare
 
-from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill, SkillweaveError
+from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
+from skillweave.errors import DeclarationError
 from skillweave.reporting.report import calls
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.numbers import number, percent, share_interval
@@ -284,7 +285,7 @@ def test_names_come_from_the_spec_the_environment_or_gymnasium() -> None:
 
 @pytest.mark.parametrize("names", ["xy", ["x", 3], ["x", "x"], {"place": "x"}, 5])
 def test_wrong_names_are_refused(names: Any) -> None:
-    with pytest.raises(SkillweaveError, match="obs_names"):
+    with pytest.raises(DeclarationError, match="obs_names"):
         EnvSpec(Walkway, obs_names=names)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from skillweave.envs.make import EnvSpec
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, EnvError, MissingExtra, RunError
 from skillweave.reporting.video import PALETTE, VideoWriter, caption, color_of, render_policy
 from skillweave.training.evaluation import evaluate
 from skillweave.types import Array, Memory, Step
@@ -258,23 +258,23 @@ def test_when_ffmpeg_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read
             for _ in range(3):
                 video.add(np.zeros((600, 600, 3), np.uint8))
 
-    with pytest.raises(SkillweaveError, match="disk full"):
+    with pytest.raises(RunError, match="disk full"):
         write()
     assert path.read_bytes() == b"precious"
     assert {p.name for p in tmp_path.iterdir()} == {"a.mp4", "ffmpeg"}
 
 
 def test_bad_videos_are_named(tmp_path: Path) -> None:
-    with pytest.raises(SkillweaveError, match=r"a\.avi.*\.gif or \.mp4"):
+    with pytest.raises(DeclarationError, match=r"a\.avi.*\.gif or \.mp4"):
         VideoWriter(tmp_path / "a.avi", fps=10)
-    with pytest.raises(SkillweaveError, match="no frames"), VideoWriter(tmp_path / "a.gif", 10):
+    with pytest.raises(RunError, match="no frames"), VideoWriter(tmp_path / "a.gif", 10):
         pass
     frame = np.zeros((8, 8, 3), np.uint8)
     with VideoWriter(tmp_path / "a.gif", fps=10) as video:
         video.add(frame)
-        with pytest.raises(SkillweaveError, match="size changed"):
+        with pytest.raises(EnvError, match="size changed"):
             video.add(frame[:4])
-        with pytest.raises(SkillweaveError, match="uint8"):
+        with pytest.raises(EnvError, match="uint8"):
             video.add(frame / 255)
 
 
@@ -332,7 +332,7 @@ def test_max_steps_fps_and_every(tmp_path: Path) -> None:
     result = render_policy(EnvSpec(Corridor), Walker(), path, max_steps=4, fps=10, every=3)
     assert result["episodes"] == [{"return": 4.0, "length": 4, "cut": True, "skills": {}}]
     assert decode(path)[1] == [300, 300, 1000]
-    with pytest.raises(SkillweaveError, match="at least 1"):
+    with pytest.raises(DeclarationError, match="at least 1"):
         render_policy(EnvSpec(Corridor), Walker(), path, every=0)
 
 
@@ -350,7 +350,7 @@ def test_an_environment_without_frames(tmp_path: Path) -> None:
         def render(self) -> Any:
             return None
 
-    with pytest.raises(SkillweaveError, match="render"):
+    with pytest.raises(EnvError, match="render"):
         render_policy(EnvSpec(Blind), Walker(), tmp_path / "a.gif")
     assert not list(tmp_path.iterdir())
 
@@ -361,7 +361,7 @@ def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
             raise RuntimeError("no light here.")
 
     told = r"NoScreen cannot be filmed: its render.. raised RuntimeError: no light here \(test_vid"
-    with pytest.raises(SkillweaveError, match=told) as caught:
+    with pytest.raises(EnvError, match=told) as caught:
         render_policy(EnvSpec(NoScreen), Walker(), tmp_path / "a.gif")
     assert isinstance(caught.value.__cause__, RuntimeError)
     assert "MuJoCo" not in str(caught.value)

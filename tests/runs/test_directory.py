@@ -20,7 +20,7 @@ from torch import Tensor
 
 from skillweave.algorithms.config import PPO, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
@@ -115,7 +115,7 @@ def test_a_new_run_can_be_opened_and_says_what_made_it(run: RunDirectory) -> Non
 def test_an_existing_run_is_never_overwritten(run: RunDirectory) -> None:
     save(run, 1)
     before = (run.path / "run.json").read_bytes()
-    with pytest.raises(SkillweaveError, match=r"unfinished run, saved at 10 steps") as caught:
+    with pytest.raises(RunError, match=r"unfinished run, saved at 10 steps") as caught:
         RunDirectory.create(run.path, manifest() | {"seed": 8})
     assert f'hierarchy.train("{run.path}", seed=7, resume=True)' in str(caught.value)
     assert (run.path / "run.json").read_bytes() == before
@@ -123,14 +123,14 @@ def test_an_existing_run_is_never_overwritten(run: RunDirectory) -> None:
 
 def test_a_directory_with_other_files_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(SkillweaveError, match="not an empty directory"):
+    with pytest.raises(RunError, match="not an empty directory"):
         RunDirectory.create(tmp_path, manifest())
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_a_file_is_refused_as_a_run(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("")
-    with pytest.raises(SkillweaveError, match="not an empty directory"):
+    with pytest.raises(RunError, match="not an empty directory"):
         RunDirectory.create(tmp_path / "run", manifest())
 
 
@@ -140,7 +140,7 @@ def test_an_empty_directory_is_taken(tmp_path: Path) -> None:
 
 
 def test_opening_a_directory_without_a_run_says_which_file_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(SkillweaveError, match="holds no run") as caught:
+    with pytest.raises(RunError, match="holds no run") as caught:
         RunDirectory.open(tmp_path)
     assert str(tmp_path / "run.json") in str(caught.value)
 
@@ -153,13 +153,13 @@ def test_a_run_without_one_of_its_fields_is_damaged_and_the_field_is_named(
     data = json.loads(path.read_text())
     del data[field]
     path.write_text(json.dumps(data))
-    with pytest.raises(SkillweaveError, match=f"damaged.*'{field}'") as caught:
+    with pytest.raises(RunError, match=f"damaged.*'{field}'") as caught:
         RunDirectory.open(run.path)
     assert str(path) in str(caught.value)
 
 
 def test_an_unknown_stage_is_answered_with_those_there_are(run: RunDirectory) -> None:
-    with pytest.raises(SkillweaveError, match="'ladning'; it has: landing, selector"):
+    with pytest.raises(RunError, match="'ladning'; it has: landing, selector"):
         run.stage("ladning")
 
 
@@ -231,7 +231,7 @@ def test_two_damaged_checkpoints_are_an_error_that_names_both(run: RunDirectory)
     paths = [run.path / f"checkpoint{x}.safetensors" for x in ("", ".previous")]
     for path in paths:
         damage(path)
-    with pytest.raises(SkillweaveError, match="damaged") as caught:
+    with pytest.raises(RunError, match="damaged") as caught:
         run.load_checkpoint(Learnt, "landing")
     assert all(str(p) in str(caught.value) for p in paths)
 
@@ -252,7 +252,7 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
 
     at = {"stage": "landing", "update": 1, "steps": 1} | AT
     run.save_checkpoint(Other(torch.zeros(1)), at)
-    with pytest.raises(SkillweaveError, match="has other fields than this version"):
+    with pytest.raises(RunError, match="has other fields than this version"):
         run.load_checkpoint(Learnt, "landing")
 
 
@@ -266,7 +266,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_two(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(SkillweaveError, match="No space left"):
+    with pytest.raises(RunError, match="No space left"):
         save(run, 3)
     monkeypatch.undo()
     found = run.load_checkpoint(Learnt, "landing")
@@ -301,7 +301,7 @@ def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPo
 
 
 def test_a_policy_of_an_unfinished_stage_says_how_to_finish_it(run: RunDirectory) -> None:
-    with pytest.raises(SkillweaveError, match=r"'landing' is not done .*resume=True\)"):
+    with pytest.raises(RunError, match=r"'landing' is not done .*resume=True\)"):
         run.load_policy("landing")
 
 
@@ -309,7 +309,7 @@ def test_a_damaged_policy_is_named(run: RunDirectory, policy: AgentPolicy) -> No
     run.save_policies("landing", {"landing": policy})
     run.stage("landing")["status"] = "done"
     damage(run.policy_path("landing"))
-    with pytest.raises(SkillweaveError, match="damaged") as caught:
+    with pytest.raises(RunError, match="damaged") as caught:
         run.load_policy("landing")
     assert str(run.policy_path("landing")) in str(caught.value)
 
@@ -319,7 +319,7 @@ def test_a_checkpoint_in_the_place_of_a_policy_is_refused_by_name(run: RunDirect
     run.policy_path("landing").parent.mkdir()
     (run.path / "checkpoint.safetensors").rename(run.policy_path("landing"))
     run.stage("landing")["status"] = "done"
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         run.load_policy("landing")
     assert str(run.policy_path("landing")) in str(caught.value)
 
@@ -375,7 +375,7 @@ def test_a_half_written_last_line_is_left_out(run: RunDirectory, rest: str) -> N
 
 def test_a_damaged_line_in_the_middle_is_an_error_that_names_the_file(run: RunDirectory) -> None:
     (run.path / "metrics.jsonl").write_text('{"update": 1}\n{"upd\n{"update": 3}\n')
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         list(run.metrics())
     assert str(run.path / "metrics.jsonl") in str(caught.value)
 
@@ -384,7 +384,7 @@ def test_a_damaged_line_in_the_middle_is_an_error_that_names_the_file(run: RunDi
 def test_metrics_on_a_full_disk_say_so_and_the_run_can_still_be_closed(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path / "run", manifest())
     (run.path / "metrics.jsonl").symlink_to("/dev/full")
-    with pytest.raises(SkillweaveError, match="No space left") as caught:
+    with pytest.raises(RunError, match="No space left") as caught:
         run.log({"update": 1})
     assert "resume=True)" in str(caught.value)
     run.close()
@@ -446,7 +446,7 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
 )
 def test_a_wrong_field_of_a_manifest_is_named(run: RunDirectory, change: Any, says: str) -> None:
     write_manifest(run, change)
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         RunDirectory.open(run.path)
     assert str(caught.value).startswith(str(run.path / "run.json"))
     assert says in str(caught.value)
@@ -459,17 +459,17 @@ def test_a_manifest_edited_by_hand_is_refused_with_or_without_its_checksum(
     path = run.path / "run.json"
     data = json.loads(path.read_text()) | {"call_steps": 11}
     path.write_text(json.dumps(data))
-    with pytest.raises(SkillweaveError, match="checksum"):
+    with pytest.raises(RunError, match="checksum"):
         RunDirectory.open(run.path)
     del data["sha256"]
     path.write_text(json.dumps(data))
-    with pytest.raises(SkillweaveError, match=r"damaged.*'sha256'"):
+    with pytest.raises(RunError, match=r"damaged.*'sha256'"):
         RunDirectory.open(run.path)
 
 
 def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "run.json")
-    with pytest.raises(SkillweaveError, match="a pipe or a device"):
+    with pytest.raises(RunError, match="a pipe or a device"):
         RunDirectory.open(tmp_path)
 
 
@@ -493,7 +493,7 @@ def test_a_policy_of_another_stage_is_refused(run: RunDirectory, policy: AgentPo
     finished(run, policy, other(policy))
     a, b = run.policy_path("landing"), run.policy_path("selector")
     a.write_bytes(b.read_bytes())
-    with pytest.raises(SkillweaveError, match=r"landing.*holds the policy of stage 'selector'"):
+    with pytest.raises(RunError, match=r"landing.*holds the policy of stage 'selector'"):
         RunDirectory.open(run.path).load_policy("landing")
 
 
@@ -504,7 +504,7 @@ def test_a_policy_of_another_run_is_refused(
     theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
     finished(theirs, other(policy, 2), other(policy, 3))
     run.policy_path("landing").write_bytes(theirs.policy_path("landing").read_bytes())
-    with pytest.raises(SkillweaveError, match="belongs to another run"):
+    with pytest.raises(RunError, match="belongs to another run"):
         run.load_policy("landing")
 
 
@@ -514,7 +514,7 @@ def test_a_policy_that_the_run_did_not_end_with_is_refused(
     finished(run, policy, other(policy))
     before = run.policy_path("landing").read_bytes()
     run.save_policies("landing", {"landing": other(policy, 2)})  # not said in run.json
-    with pytest.raises(SkillweaveError, match="its checksum differs"):
+    with pytest.raises(RunError, match="its checksum differs"):
         RunDirectory.open(run.path).load_policy("landing")
     run.policy_path("landing").write_bytes(before)
     assert RunDirectory.open(run.path).load_policy("landing").source() == policy.source()
@@ -536,7 +536,7 @@ def test_a_checkpoint_of_another_run_is_refused(run: RunDirectory, tmp_path: Pat
     theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
     save(theirs, 1)
     shutil.copy(theirs.path / "checkpoint.safetensors", run.path)
-    with pytest.raises(SkillweaveError, match="belongs to another run"):
+    with pytest.raises(RunError, match="belongs to another run"):
         run.load_checkpoint(Learnt, "landing")
 
 
@@ -546,7 +546,7 @@ def test_a_checkpoint_of_other_shapes_or_types_is_refused_by_tensor(
 ) -> None:
     state = save(run, 1)
     weight = state.weight.T if how == "shape" else state.weight.double()
-    with pytest.raises(SkillweaveError, match="tensor weight should"):
+    with pytest.raises(RunError, match="tensor weight should"):
         run.load_checkpoint(Learnt, "landing", like=Learnt(weight, state.count))
     assert run.load_checkpoint(Learnt, "landing", like=learnt(7)) is not None
 
@@ -569,9 +569,7 @@ def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
 def test_two_may_not_train_a_run_at_once(run: RunDirectory) -> None:
     run.begin()
     second = RunDirectory.open(run.path)  # may be read
-    with pytest.raises(
-        SkillweaveError, match="being trained by another run of this process"
-    ) as caught:
+    with pytest.raises(RunError, match="being trained by another run of this process") as caught:
         second.begin()
     assert str(run.path) in str(caught.value)
     run.close()
@@ -689,7 +687,7 @@ def test_a_run_deleted_while_it_is_trained_is_not_made_again(
     if how == "made again":
         RunDirectory.create(run.path, manifest())
     before = list(run.path.glob("**/*"))
-    with pytest.raises(SkillweaveError, match="was deleted or moved during"):
+    with pytest.raises(RunError, match="was deleted or moved during"):
         write(run, policy)
     assert list(run.path.glob("**/*")) == before
 
@@ -711,7 +709,7 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
         real(source, target)
 
     monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(SkillweaveError, match=r"could not write .*checkpoint"):
+    with pytest.raises(RunError, match=r"could not write .*checkpoint"):
         save(run, 3)
     monkeypatch.undo()
     found = run.load_checkpoint(Learnt, "landing")
@@ -740,5 +738,5 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     assert run.load_checkpoint(Learnt, "landing", schema=Generation) is not None
     run.save_checkpoint(learnt(1), {k: v for k, v in header.items() if k != field})
     (run.path / "checkpoint.previous.safetensors").unlink()
-    with pytest.raises(SkillweaveError, match=f"damaged: no field '{field}'"):
+    with pytest.raises(RunError, match=f"damaged: no field '{field}'"):
         run.load_checkpoint(Learnt, "landing", schema=Generation)

@@ -18,7 +18,7 @@ import safetensors.torch
 import torch
 
 import skillweave
-from skillweave.errors import SkillweaveError
+from skillweave.errors import RunError
 from skillweave.runs import files
 from skillweave.runs.files import (
     SCHEMA,
@@ -84,7 +84,7 @@ def test_a_full_disk_leaves_the_old_file_and_no_temporary_file(
     saved: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
     monkeypatch.setattr(files.os, call, full)
-    with pytest.raises(SkillweaveError, match="No space left") as caught:
+    with pytest.raises(RunError, match="No space left") as caught:
         write_bytes(saved, b"anew")
     monkeypatch.undo()
     assert_intact(saved, caught.value)
@@ -110,7 +110,7 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_write_leaves_the_old_file(
             full()
 
     monkeypatch.setattr(files.os, "fdopen", Filling)
-    with pytest.raises(SkillweaveError, match="No space left") as caught:
+    with pytest.raises(RunError, match="No space left") as caught:
         write_bytes(saved, b"anew")
     monkeypatch.undo()
     assert_intact(saved, caught.value)
@@ -131,7 +131,7 @@ def test_ctrl_c_in_the_middle_of_a_write_stays_ctrl_c_and_leaves_the_old_file(
 
 def test_a_directory_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a directory")
-    with pytest.raises(SkillweaveError, match="could not write") as caught:
+    with pytest.raises(RunError, match="could not write") as caught:
         write_bytes(tmp_path / "file" / "run.json", b"x")
     assert str(tmp_path / "file" / "run.json") in str(caught.value)
 
@@ -216,7 +216,7 @@ DAMAGED_JSON = {
 def test_damaged_json_is_an_error_that_names_the_file(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "run.json"
     path.write_bytes(content)
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         read_json(path)
     assert str(path) in str(caught.value)
 
@@ -226,36 +226,36 @@ def test_an_altered_json_file_is_told_by_its_checksum(tmp_path: Path) -> None:
     write_json(path, {"steps": 12, "sizes": (1, 2)})
     assert read_json(path) == {"schema": SCHEMA, "steps": 12, "sizes": [1, 2]}
     path.write_text(path.read_text().replace("12", "13"))
-    with pytest.raises(SkillweaveError, match=r"checksum.*edited by hand"):
+    with pytest.raises(RunError, match=r"checksum.*edited by hand"):
         read_json(path)
 
 
 def test_a_pipe_in_the_place_of_a_file_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x")
     for read in (read_json, read_tensors):
-        with pytest.raises(SkillweaveError, match="a pipe or a device"):
+        with pytest.raises(RunError, match="a pipe or a device"):
             read(tmp_path / "x")
 
 
 def test_missing_files_are_named(tmp_path: Path) -> None:
     for read in (read_json, read_tensors):
-        with pytest.raises(SkillweaveError, match="does not exist") as caught:
+        with pytest.raises(RunError, match="does not exist") as caught:
             read(tmp_path / "nothing")
         assert str(tmp_path / "nothing") in str(caught.value)
 
 
 def test_a_newer_schema_says_what_to_upgrade(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_text(json.dumps({"schema": SCHEMA + 1}))
-    with pytest.raises(SkillweaveError, match=f"schema {SCHEMA + 1}.*Upgrade"):
+    with pytest.raises(RunError, match=f"schema {SCHEMA + 1}.*Upgrade"):
         read_json(tmp_path / "x.json")
     write_tensors(tmp_path / "x.safetensors", TENSORS, {"schema": SCHEMA + 1})
-    with pytest.raises(SkillweaveError, match=f"schema {SCHEMA + 1}.*Upgrade"):
+    with pytest.raises(RunError, match=f"schema {SCHEMA + 1}.*Upgrade"):
         read_tensors(tmp_path / "x.safetensors")
 
 
 def test_what_json_cannot_hold_is_an_error_that_names_the_file(tmp_path: Path) -> None:
     for value in (float("nan"), object()):
-        with pytest.raises(SkillweaveError) as caught:
+        with pytest.raises(RunError) as caught:
             write_json(tmp_path / "run.json", {"value": value})
         assert str(tmp_path / "run.json") in str(caught.value)
         assert not any(tmp_path.iterdir())
@@ -302,7 +302,7 @@ def test_tensors_of_any_type_have_a_checksum(tmp_path: Path, dtype: torch.dtype)
 def test_a_header_that_is_nested_deep_or_no_object_is_damaged(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.safetensors"
     path.write_bytes(safetensors.torch.save({"x": torch.zeros(2)}, {"skillweave": text}))
-    with pytest.raises(SkillweaveError, match=r"x\.safetensors"):
+    with pytest.raises(RunError, match=r"x\.safetensors"):
         read_tensors(path)
 
 
@@ -316,7 +316,7 @@ def test_a_file_cut_off_anywhere_is_an_error_that_names_it(tensors: Path) -> Non
     whole = tensors.read_bytes()
     for size in range(len(whole)):
         tensors.write_bytes(whole[:size])
-        with pytest.raises(SkillweaveError) as caught:
+        with pytest.raises(RunError) as caught:
             read_tensors(tensors)
         assert str(tensors) in str(caught.value)
 
@@ -328,7 +328,7 @@ def test_a_file_altered_in_any_byte_is_an_error_that_names_it(tensors: Path, fli
         altered = bytearray(whole)
         altered[place] ^= flip
         tensors.write_bytes(altered)
-        with pytest.raises(SkillweaveError) as caught:
+        with pytest.raises(RunError) as caught:
             read_tensors(tensors)
         assert str(tensors) in str(caught.value)
 
@@ -337,7 +337,7 @@ def test_altered_weights_are_told_by_their_checksum(tensors: Path) -> None:
     altered = bytearray(tensors.read_bytes())
     altered[-1] ^= 1
     tensors.write_bytes(altered)
-    with pytest.raises(SkillweaveError, match="checksum"):
+    with pytest.raises(RunError, match="checksum"):
         read_tensors(tensors)
 
 
@@ -357,7 +357,7 @@ def test_a_foreign_safetensors_file_is_an_error_that_names_it(
 ) -> None:
     path = tmp_path / "foreign.safetensors"
     path.write_bytes(safetensors.torch.save({"x": torch.zeros(2)}, metadata))
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         read_tensors(path)
     assert str(path) in str(caught.value)
 

@@ -12,6 +12,7 @@ import pytest
 
 from skillweave import Agent, SkillweaveError
 from skillweave.cli import main
+from skillweave.errors import RunError
 from tests.small_runs import ON, policies
 
 STEPS = 96
@@ -90,7 +91,7 @@ def test_a_run_with_a_link_is_not_trained(runs: Path, tmp_path: Path, mine: Path
         lambda: declared(2 * STEPS).train(run, resume=True, quiet=True),
         lambda: declared().train(run, quiet=True),
     ):
-        with pytest.raises(SkillweaveError) as caught:
+        with pytest.raises(RunError) as caught:
             go_on()
     if name != "run.json.tmp":
         assert f"{run / name} is a link to {mine / target}".rstrip("/") in str(caught.value) or (
@@ -163,7 +164,7 @@ def test_links_of_a_tracker_within_its_own_folder_are_no_links_of_others(runs, t
     declared().train(run, resume=True, quiet=True)
     (run / "wandb" / "latest-run").unlink()
     (run / "wandb" / "latest-run").symlink_to("../..")
-    with pytest.raises(SkillweaveError, match="latest-run is a link to"):
+    with pytest.raises(RunError, match="latest-run is a link to"):
         declared(2 * STEPS).train(run, resume=True, quiet=True)
 
 
@@ -177,7 +178,7 @@ def test_a_pipe_in_a_run_is_refused_instead_of_waited_for(runs, tmp_path, kind, 
         monkeypatch.chdir(run)  # the name of a socket may not be long
         with socket.socket(socket.AF_UNIX) as end:
             end.bind("metrics.jsonl")
-    with pytest.raises(SkillweaveError, match=r"metrics\.jsonl is a pipe or a device"):
+    with pytest.raises(RunError, match=r"metrics\.jsonl is a pipe or a device"):
         declared().resume(run, quiet=True)
 
 

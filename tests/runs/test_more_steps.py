@@ -40,6 +40,7 @@ from skillweave import (
     SkillweaveError,
 )
 from skillweave.cli.main import main
+from skillweave.errors import DeclarationError
 from skillweave.runs import files
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
@@ -269,7 +270,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
         patched.setattr(stage_log.StageLog, "tick", lambda *_: (_ for _ in ()).throw(Stopped))
         with pytest.raises(Stopped):
             agent(512).train(path, resume=True, quiet=True)
-    with pytest.raises(SkillweaveError, match=r"unfinished run, saved at 256 steps of agent"):
+    with pytest.raises(RunError, match=r"unfinished run, saved at 256 steps of agent"):
         agent(512).train(path, quiet=True)
     run = agent(512).resume(path, quiet=True)
     assert stages(run)["agent"]["steps"] == 512
@@ -345,7 +346,7 @@ def test_a_small_replay_buffer_is_kept(
     names = RunDirectory.open(path).final_tensors("agent")
     assert any(".store." in name for name in names) == kept
     if not kept:
-        with pytest.raises(SkillweaveError, match="would learn nothing in 20 more steps"):
+        with pytest.raises(RunError, match="would learn nothing in 20 more steps"):
             agent(276, OFF).train(path, resume=True, quiet=True)
     before = policies(path)
     run = agent(384, OFF).train(path, resume=True, quiet=True)
@@ -373,7 +374,7 @@ def test_a_full_disk_keeps_the_policy_and_says_what_is_not_kept(
     assert not any(".store." in name for name in names)
     assert ("its final state is not kept" in told) == (not names)
     if not names:
-        with pytest.raises(SkillweaveError, match=r"final state.*start_from="):
+        with pytest.raises(RunError, match=r"final state.*start_from="):
             agent(512, OFF).train(path, resume=True, quiet=True)
 
 
@@ -403,7 +404,7 @@ def test_a_policy_takes_the_place_of_final_states_on_a_full_disk(
 def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path) -> None:
     agent(128).train(path, quiet=True)
     shutil.rmtree(path / "final")
-    with pytest.raises(SkillweaveError, match="final state") as caught:
+    with pytest.raises(RunError, match="final state") as caught:
         agent(256).train(path, resume=True, quiet=True)
     line = f'agent.train(start_from="{path}")'
     assert str(caught.value).endswith(line)
@@ -415,7 +416,7 @@ def test_a_damaged_final_state_changes_nothing(path: Path) -> None:
     agent(128).train(path, quiet=True)
     file, before = path / "final/agent.safetensors", (path / "run.json").read_bytes()
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(SkillweaveError, match=r"final/agent\.safetensors is damaged"):
+    with pytest.raises(RunError, match=r"final/agent\.safetensors is damaged"):
         agent(256).train(path, resume=True, quiet=True)
     assert (path / "run.json").read_bytes() == before
     assert agent(128).load(path).evaluate(1, quiet=True)
@@ -521,7 +522,7 @@ def test_a_run_of_another_declaration_is_a_sentence(
 
 
 def test_resume_needs_a_directory() -> None:
-    with pytest.raises(SkillweaveError, match="name its directory"):
+    with pytest.raises(DeclarationError, match="name its directory"):
         declare().train(resume=True)
 
 
@@ -549,7 +550,7 @@ def test_a_run_that_acts_by_data_is_loaded_without_its_declaration(path: Path) -
     assert found.evaluate(2, quiet=True) == run.evaluate(2, quiet=True)
     spec = EnvSpec("CartPole-v1")
     plain = Hierarchy(spec, [Left(), Push()], algorithm=ON, selector=ON, steps=128)
-    with pytest.raises(SkillweaveError, match="was declared in Python") as caught:
+    with pytest.raises(RunError, match="was declared in Python") as caught:
         sw.load(plain.train(path.with_name("other"), quiet=True).path)
     line = f'sw.load("{path.with_name("other")}", hierarchy)'
     assert str(caught.value).endswith(line)
@@ -562,9 +563,9 @@ def test_a_hierarchy_of_data_is_loaded_without_its_declaration(path: Path) -> No
     found = sw.load(path)
     assert [skill.name for skill in found.hierarchy.skills] == ["left"]
     assert found.evaluate(2, quiet=True).returns == run.evaluate(2, quiet=True).returns
-    with pytest.raises(SkillweaveError, match="it must be the Hierarchy or Agent"):
+    with pytest.raises(DeclarationError, match="it must be the Hierarchy or Agent"):
         sw.load(path, run)  # type: ignore[arg-type]
-    with pytest.raises(SkillweaveError, match="was trained with the skills"):
+    with pytest.raises(RunError, match="was trained with the skills"):
         sw.load(path, declare())
 
 
@@ -574,7 +575,7 @@ def test_code_that_a_run_names_is_not_executed(path: Path) -> None:
     declared = declare()
     declared.recipe = str(recipe)
     declared.train(path, quiet=True)
-    with pytest.raises(SkillweaveError, match=r"declared in .*trap\.py, and needs that code"):
+    with pytest.raises(RunError, match=r"declared in .*trap\.py, and needs that code"):
         sw.load(path)
     assert not trap.exists()
 

@@ -15,8 +15,9 @@ import pytest
 from small_runs import ON, Left, StopAt, Stopped, interrupt_at_checkpoint, new_run
 
 import skillweave as sw
-from skillweave import Agent, EnvSpec, Hierarchy, SkillweaveError
+from skillweave import Agent, EnvSpec, Hierarchy
 from skillweave.cli.main import main
+from skillweave.errors import RunError
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.lock import Lock
@@ -96,7 +97,7 @@ def test_train_without_a_directory_makes_one_and_prints_it(capfd) -> None:
 
 
 def test_a_declaration_that_is_wrong_leaves_no_directory() -> None:
-    with pytest.raises(SkillweaveError, match="nowhere holds no run"):
+    with pytest.raises(RunError, match="nowhere holds no run"):
         declare().train(start_from="nowhere")
     assert not Path("runs").exists()
 
@@ -139,7 +140,7 @@ def test_a_file_that_is_not_ours_keeps_all_as_it_is(name: str) -> None:
     file.parent.mkdir(exist_ok=True)
     file.write_text("years of work")
     before = {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()}
-    with pytest.raises(SkillweaveError, match=r"run holds .*nothing there is replaced"):
+    with pytest.raises(RunError, match=r"run holds .*nothing there is replaced"):
         declare().train("run", quiet=True)
     assert {p: p.read_bytes() for p in Path("run").rglob("*") if p.is_file()} == before
 
@@ -149,7 +150,7 @@ def test_links_are_not_followed() -> None:
     Path("elsewhere").mkdir()
     Path("elsewhere/weights.safetensors").write_text("years of work")
     (Path("run") / "starts").symlink_to(Path("elsewhere").absolute())
-    with pytest.raises(SkillweaveError, match="run/starts is a link to"):
+    with pytest.raises(RunError, match="run/starts is a link to"):
         declare().train("run", quiet=True)
     assert Path("elsewhere/weights.safetensors").exists()
 
@@ -158,7 +159,7 @@ def test_links_are_not_followed() -> None:
 def test_a_lock_of_another_program_is_left_alone(content: str) -> None:
     Path("run").mkdir()
     Path("run/other.lock").write_text(content)
-    with pytest.raises(SkillweaveError, match="not an empty directory"):
+    with pytest.raises(RunError, match="not an empty directory"):
         declare().train("run", quiet=True)
     assert [p.name for p in Path("run").iterdir()] == ["other.lock"]
 
@@ -182,7 +183,7 @@ def test_a_living_process_keeps_its_run_and_is_named() -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         for resume in (False, True):
-            with pytest.raises(SkillweaveError, match=f"trained by process {process.pid};"):
+            with pytest.raises(RunError, match=f"trained by process {process.pid};"):
                 declare().train("run", resume=resume, quiet=True)
         process.kill()
     assert Path("run/run.json").read_bytes() == before
@@ -192,7 +193,7 @@ def test_a_living_process_keeps_its_run_and_is_named() -> None:
 def test_a_system_without_locks_replaces_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     dead_run(Path("run"))
     monkeypatch.setattr("skillweave.runs.lock.fcntl", None)
-    with pytest.raises(SkillweaveError, match="has no locks that show whether a process uses it"):
+    with pytest.raises(RunError, match="has no locks that show whether a process uses it"):
         declare().train("run", quiet=True)
 
 
@@ -206,23 +207,23 @@ def test_a_resumable_run_is_kept_and_the_line_is_said(monkeypatch: pytest.Monkey
             declare(640).train("my run", seed=3, checkpoint_every=64, quiet=True)
     line = 'hierarchy.train("my run", seed=3, resume=True)'
     assert str(stop.value).endswith(f"Continue: {line}")
-    with pytest.raises(SkillweaveError, match=re.escape(f"Continue it: {line}")):
+    with pytest.raises(RunError, match=re.escape(f"Continue it: {line}")):
         declare(640).train("my run", quiet=True)
-    with pytest.raises(SkillweaveError, match=r"is not finished.*saved at 64 steps"):
+    with pytest.raises(RunError, match=r"is not finished.*saved at 64 steps"):
         sw.load("my run", declare())
     assert eval(line, {"hierarchy": declare(640)}).info()["stages"][0]["status"] == "done"
 
 
 def test_a_finished_run_is_kept_and_the_lines_are_said() -> None:
     sw.train_agent("CartPole-v1", ON, 64, "run", quiet=True)
-    with pytest.raises(SkillweaveError) as caught:
+    with pytest.raises(RunError) as caught:
         sw.train_agent("CartPole-v1", ON, 64, "run", quiet=True)
     assert 'sw.load("run")' in str(caught.value)
     assert 'train_agent(env, algorithm, steps, "run", resume=True)' in str(caught.value)
-    with pytest.raises(SkillweaveError, match=r'agent\.train\("run", resume=True\)'):
+    with pytest.raises(RunError, match=r'agent\.train\("run", resume=True\)'):
         Agent("CartPole-v1", ON, 64).train("run", quiet=True)
     declare().train("flat", flat=True, quiet=True)
-    with pytest.raises(SkillweaveError, match=r'hierarchy\.train\("flat", resume=True, flat=True'):
+    with pytest.raises(RunError, match=r'hierarchy\.train\("flat", resume=True, flat=True'):
         declare().train("flat", flat=True, quiet=True)
 
 
@@ -255,7 +256,7 @@ def test_no_handle_stays_open_and_the_caller_is_forgotten() -> None:
     main(["train", "nowhere.py"])
     declare().train("run", quiet=True)
     for _ in range(2):
-        with pytest.raises(SkillweaveError, match=r"hierarchy\.train\("):
+        with pytest.raises(RunError, match=r"hierarchy\.train\("):
             declare().train("run", quiet=True)
     if opened:
         assert len(os.listdir("/proc/self/fd")) <= opened + 1

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
 
@@ -27,7 +27,7 @@ def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
 
 def test_an_unknown_tracker_is_answered_with_those_there_are(run: RunDirectory) -> None:
     with pytest.raises(
-        SkillweaveError, match="'tensorbored'; there are: tensorboard, wandb, mlflow"
+        DeclarationError, match="'tensorbored'; there are: tensorboard, wandb, mlflow"
     ):
         make_trackers(("tensorbored",), run)
 

@@ -10,7 +10,8 @@ from typing import Any
 import gymnasium as gym
 import pytest
 
-from skillweave import Agent, SkillweaveError, load
+from skillweave import Agent, load
+from skillweave.errors import RunError
 from tests.small_runs import ON, policies
 
 STEPS = 96
@@ -83,10 +84,10 @@ def test_loading_resuming_and_more_steps(places):
 
 def test_messages_name_the_run_from_where_the_user_is(places):
     agent().train("run", quiet=True)
-    with pytest.raises(SkillweaveError, match=r"^run holds a finished run.*train\(\"run\""):
+    with pytest.raises(RunError, match=r"^run holds a finished run.*train\(\"run\""):
         agent().train("run", quiet=True)
     os.chdir(places / "there")
-    with pytest.raises(SkillweaveError, match=r"here/run holds a finished run.*\"/.*here/run\""):
+    with pytest.raises(RunError, match=r"here/run holds a finished run.*\"/.*here/run\""):
         agent().train(places / "here" / "run", quiet=True)
 
 
@@ -95,6 +96,6 @@ def test_a_working_directory_that_is_gone(places):
     os.chdir("gone")
     shutil.rmtree(places / "here" / "gone")
     for run_dir in ("run", None):
-        with pytest.raises(SkillweaveError, match="is not there any more"):
+        with pytest.raises(RunError, match="is not there any more"):
             agent().train(run_dir, quiet=True)
     agent().train(places / "run", quiet=True).evaluate(1)

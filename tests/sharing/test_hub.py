@@ -14,7 +14,7 @@ from shared_runs import NAME, SMALL, Left, Right, declare, files_of, same_action
 
 import skillweave as sw
 from skillweave.cli import main
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.runs.directory import RunDirectory
 
 pytest.importorskip("huggingface_hub")
@@ -93,12 +93,12 @@ def test_a_hierarchy_that_needs_code_is_given_it(hub: Hub, tmp_path: Path) -> No
     run = hierarchy.train(tmp_path / "run", quiet=True)
     run.push(NAME)
     assert f'sw.from_hub("{NAME}", hierarchy)' in hub.files(NAME)["README.md"].decode()
-    with pytest.raises(SkillweaveError, match=r"declared in Python.*from_hub\(name, hierarchy\)"):
+    with pytest.raises(RunError, match=r"declared in Python.*from_hub\(name, hierarchy\)"):
         sw.from_hub(NAME)
     assert same_actions(sw.from_hub(NAME, declare(Careful())), run)
-    with pytest.raises(SkillweaveError, match="hierarchy is 'lunar-lander'; it must be the Hi"):
+    with pytest.raises(DeclarationError, match="hierarchy is 'lunar-lander'; it must be the Hi"):
         sw.from_hub(NAME, "lunar-lander")
-    with pytest.raises(SkillweaveError, match="trained with the skills careful"):
+    with pytest.raises(RunError, match="trained with the skills careful"):
         sw.from_hub(NAME, declare(Left()))
 
 
@@ -117,9 +117,7 @@ def test_without_a_network_a_run_is_loaded_as_it_was_downloaded(
     go_to(NOWHERE, tmp_path / "cache", monkeypatch)
     assert same_actions(sw.from_hub(NAME), run)
     go_to(NOWHERE, tmp_path / "empty", monkeypatch)
-    with pytest.raises(
-        SkillweaveError, match=r"cannot be reached.*no copy of ada/cart.*ConnectError"
-    ):
+    with pytest.raises(RunError, match=r"cannot be reached.*no copy of ada/cart.*ConnectError"):
         sw.from_hub(NAME)
 
 
@@ -131,7 +129,7 @@ def test_a_file_that_is_not_data_is_refused_before_anything_is_downloaded(
     name: str, run: sw.Run, hub: Hub
 ) -> None:
     hub.make(NAME, {**files_of(run.path), name: b"import os"})
-    with pytest.raises(SkillweaveError, match=f"{NAME} holds '{name}'.*nothing of it is used"):
+    with pytest.raises(RunError, match=f"{NAME} holds '{name}'.*nothing of it is used"):
         sw.from_hub(NAME)
     assert [line for line in hub.asked if "/resolve/" in line] == []
 
@@ -140,20 +138,20 @@ def test_files_of_the_hub_are_checked_like_those_of_any_run(run: sw.Run, hub: Hu
     files = files_of(run.path)
     altered = files["run.json"].replace(b'"call_steps": 5', b'"call_steps": 6')
     hub.make(NAME, files | {"run.json": altered})
-    with pytest.raises(SkillweaveError, match=r"run\.json is damaged.*checksum"):
+    with pytest.raises(RunError, match=r"run\.json is damaged.*checksum"):
         sw.from_hub(NAME)
     swapped = {"policies/left.safetensors": files["policies/right.safetensors"]}
     hub.make("ada/swapped", files | swapped)
-    with pytest.raises(SkillweaveError, match="holds the policy of stage 'right'"):
+    with pytest.raises(RunError, match="holds the policy of stage 'right'"):
         sw.from_hub("ada/swapped")
     hub.make("ada/cut", files | {"policies/left.safetensors": b"\0" * 20})
-    with pytest.raises(SkillweaveError, match="damaged"):
+    with pytest.raises(RunError, match="damaged"):
         sw.from_hub("ada/cut")
 
 
 def test_what_is_no_run_is_said(hub: Hub) -> None:
     hub.make(NAME, {"config.json": b"{}", "model.safetensors": b""})
-    with pytest.raises(SkillweaveError, match="ada/cart holds no run of Skillweave"):
+    with pytest.raises(RunError, match="ada/cart holds no run of Skillweave"):
         sw.from_hub(NAME)
 
 
@@ -164,13 +162,13 @@ def test_wrong_names_private_runs_and_revisions_are_told_with_what_to_do(
     for token in ("good-token", ""):
         monkeypatch.setenv("HF_TOKEN", token)
         for name in ("ada/nothing", "eve/secret"):
-            with pytest.raises(SkillweaveError, match=f"has no {name}, or it is private.*log in"):
+            with pytest.raises(RunError, match=f"has no {name}, or it is private.*log in"):
                 sw.from_hub(name)
     hub.make(NAME, files_of(run.path))
-    with pytest.raises(SkillweaveError, match="ada/cart has no revision 'v2'"):
+    with pytest.raises(RunError, match="ada/cart has no revision 'v2'"):
         sw.from_hub(NAME, revision="v2")
     for wrong in ("cart", "ada/cart/x", "../cart", "ada/", 3, "ada/c art"):
-        with pytest.raises(SkillweaveError, match="write owner/name"):
+        with pytest.raises(DeclarationError, match="write owner/name"):
             sw.from_hub(wrong)
 
 
@@ -183,12 +181,12 @@ def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
     path = run.path / "policies/left.safetensors"
     whole = path.read_bytes()
     path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    with pytest.raises(SkillweaveError, match=r"left\.safetensors is damaged"):
+    with pytest.raises(RunError, match=r"left\.safetensors is damaged"):
         run.push(NAME)
     directory = RunDirectory.open(run.path)
     directory.stage("selector")["status"] = "training"
     directory.save()
-    with pytest.raises(SkillweaveError, match=r"'selector' is not done.*resume=True"):
+    with pytest.raises(RunError, match=r"'selector' is not done.*resume=True"):
         run.push(NAME)
     assert hub.asked == []
 
@@ -198,10 +196,10 @@ def test_who_may_not_write_is_told_what_to_do(
 ) -> None:
     for name in ("eve/new", "eve/old"):
         hub.make("eve/old", files_of(run.path))
-        with pytest.raises(SkillweaveError, match=f"you may not write to {name}"):
+        with pytest.raises(RunError, match=f"you may not write to {name}"):
             run.push(name)
     monkeypatch.setenv("HF_TOKEN", "")
-    with pytest.raises(SkillweaveError, match=r"does not recognise you: log in \(hf auth login\)"):
+    with pytest.raises(RunError, match=r"does not recognise you: log in \(hf auth login\)"):
         run.push(NAME)
 
 
@@ -210,11 +208,11 @@ def test_what_is_something_else_or_public_is_left_alone(run: sw.Run, hub: Hub) -
     hub.make("ada/code", {**files_of(run.path), "train.py": b""})
     for name, why in (("ada/else", "other files"), ("ada/code", "'train.py'")):
         before = hub.files(name)
-        with pytest.raises(SkillweaveError, match=f"{name} holds {why}"):
+        with pytest.raises(RunError, match=f"{name} holds {why}"):
             run.push(name)
         assert hub.files(name) == before
     run.push("ada/open")
-    with pytest.raises(SkillweaveError, match="ada/open is public already"):
+    with pytest.raises(RunError, match="ada/open is public already"):
         run.push("ada/open", private=True)
     run.push("ada/closed", private=True)
     assert hub.repos["ada/closed"].private
@@ -224,7 +222,7 @@ def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> No
     for path, answer in (("/commit/", 500), ("/large/", 501), ("/large/", 403)):
         hub.breaks_at, hub.answer = path, answer
         why = "you may not write" if answer == 403 else f"the answer {answer}; try again later"
-        with pytest.raises(SkillweaveError, match=why):
+        with pytest.raises(RunError, match=why):
             run.push(NAME)
         assert hub.files(NAME) == {}
     hub.breaks_at = ""
@@ -234,7 +232,7 @@ def test_where_the_hub_fails_nothing_is_half_pushed(run: sw.Run, hub: Hub) -> No
 
 def test_no_network_is_told(run: sw.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_to(NOWHERE, tmp_path / "cache", monkeypatch)
-    with pytest.raises(SkillweaveError, match=r"cannot be reached\. Nothing was pushed"):
+    with pytest.raises(RunError, match=r"cannot be reached\. Nothing was pushed"):
         run.push(NAME)
 
 

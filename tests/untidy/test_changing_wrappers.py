@@ -23,7 +23,7 @@ class Own(gym.wrappers.NormalizeObservation):
 )
 def test_they_are_refused_before_anything_is_trained(wrapper, instead, tmp_path):
     spec = sw.EnvSpec("CartPole-v1", wrappers=(wrapper,))
-    with pytest.raises(sw.SkillweaveError, match=instead):
+    with pytest.raises(sw.EnvError, match=instead):
         sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
 

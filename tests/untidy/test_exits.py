@@ -39,7 +39,7 @@ def test_in_action_masks(workers, tmp_path):
             return np.ones(2, bool)
 
     spec = sw.EnvSpec(Masked, engine="sync", workers=workers)
-    with pytest.raises(sw.SkillweaveError) as found:
+    with pytest.raises(sw.EnvError) as found:
         sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
     assert found.match(r"environment 0, step 3 of its episode: action_masks\(\) raised" + WHERE)
 
@@ -77,7 +77,7 @@ def test_in_a_function_that_answers_once(tmp_path):
         return np.ones(len(obs), bool) if later.calls == 1 else leave()
 
     later.calls = 0
-    with pytest.raises(sw.SkillweaveError, match=r"skill 'leaves': initiation\(\)") as found:
+    with pytest.raises(sw.SkillError, match=r"skill 'leaves': initiation\(\)") as found:
         sw.Hierarchy(
             Ramp, [skill(initiation=later), Stay()], algorithm=SMALL, selector=SMALL, steps=64
         ).train(tmp_path / "run", quiet=True)
@@ -108,5 +108,5 @@ def test_in_a_function_of_a_hierarchy(how, tmp_path):
 
 
 def test_in_a_policy_that_is_evaluated():
-    with pytest.raises(sw.SkillweaveError, match=r"raised" + WHERE):
+    with pytest.raises(sw.PolicyError, match=r"raised" + WHERE):
         sw.evaluate(sw.from_function(leave), Ramp, episodes=1)

@@ -86,14 +86,14 @@ def test_a_simulator_of_which_there_can_be_one_works_in_every_mode(learn, tmp_pa
 
 def test_more_than_can_be_made_names_the_setting(tmp_path):
     Counted.allowed = 3
-    with pytest.raises(sw.SkillweaveError, match=r"3 could be made.*num_envs=3"):
+    with pytest.raises(sw.EnvError, match=r"3 could be made.*num_envs=3"):
         hierarchy("together", 8).train(tmp_path / "run", quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 def test_where_two_are_needed_one_is_refused_before_anything_is_trained(tmp_path):
     Counted.allowed = 1
-    with pytest.raises(sw.SkillweaveError, match=r"port 2000 is in use.*leave eval_every out"):
+    with pytest.raises(sw.EnvError, match=r"port 2000 is in use.*leave eval_every out"):
         hierarchy("apart", 1).train(tmp_path / "run", eval_every=200, quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 

@@ -141,7 +141,7 @@ class Doubles(Scores):
 )
 def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, tmp_path):
     spec = telling([1.5, other])
-    with pytest.raises(sw.SkillweaveError) as caught:
+    with pytest.raises(sw.SkillError) as caught:
         sw.Hierarchy(spec, [skill], steps=256, algorithm=SMALL, selector=SMALL).train(
             tmp_path / "run", quiet=True
         )
@@ -152,7 +152,7 @@ def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, 
 
 def test_a_key_that_nobody_gives_is_named(tmp_path):
     spec = telling([ABSENT])
-    with pytest.raises(sw.SkillweaveError, match=r"no environment set this key .*'always'"):
+    with pytest.raises(sw.SkillError, match=r"no environment set this key .*'always'"):
         sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(
             tmp_path / "run", quiet=True
         )

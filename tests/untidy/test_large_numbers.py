@@ -44,7 +44,7 @@ def train(first, dtype, parts, path, quiet=True):
 
 @pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
 def test_numbers_beyond_float32_are_refused(parts, tmp_path):
-    with pytest.raises(sw.SkillweaveError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
+    with pytest.raises(sw.EnvError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
         train(1e300, np.float64, parts, tmp_path / "run")
 
 
