@@ -1,7 +1,4 @@
-"""ONNX graphs of foreign networks, with the inputs and outputs of ``graphs``.
-
-Stands alone because each kind of foreign policy is converted in its own way.
-"""
+"""Graphs of foreign networks, like those of trained agents: apart, as they are no agents."""
 
 from __future__ import annotations
 
@@ -23,70 +20,12 @@ from skillweave.spaces.packing import parts
 from skillweave.types import Array
 
 
-def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
-    """Return the graph of a user's module; inputs and outputs as in ``agent_graph``.
-
-    Raises:
-        PolicyError: it cannot be written as ONNX; the message begins with ``where``.
-    """
-    space = policy.observation_space
-    choices = _choices(policy)
-    noise = _noise(policy, sampled)
-    given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
-    if choices:
-        given["mask"] = torch.ones(1, choices, **BOOL)
-    given |= {f"noise.{i}": torch.zeros(1, n, **FLOAT) for i, (_, n) in enumerate(noise)}
-    module = _Module(policy, bool(choices)).eval()
-    return Graph(traced(module, given, ["action"], where), choices, noise=noise)
-
-
-def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
-    """Return the graph around an ONNX file; inputs and outputs as in ``agent_graph``.
-
-    The file's own nodes stay as they are. Nodes before them convert an observation to the input;
-    nodes after them convert the output to an action, as ``skills.outputs.decoded`` does.
-    """
-    import onnx
-    from onnx import helper
-
-    model = onnx.compose.add_prefix(onnx.load_from_string(policy.data), "own.")
-    weights = {w.name for w in model.graph.initializer}
-    source = next(i for i in model.graph.input if i.name not in weights)
-    output = next(o for o in model.graph.output if o.name == f"own.{policy.output}")
-    choices = _choices(policy)
-    noise = _noise(policy, sampled)
-    obs = policy.observation_space
-    space = policy.action_space
-    dtype = _onnx_type
-    nodes = _Nodes(model.graph)
-    seen = helper.make_node("Cast", ["obs"], [source.name], to=source.type.tensor_type.elem_type)
-    real = output.type.tensor_type.elem_type in _REAL
-    action = nodes.action(output.name, space, real, bool(choices), bool(noise))
-    given = [("obs", dtype(obs_dtype(obs)), [1, *obs.shape])]
-    given += [("mask", dtype(np.bool_), [1, choices])] * bool(choices)
-    given += [(f"noise.{i}", dtype(np.float32), [1, n]) for i, (_, n) in enumerate(noise)]
-    graph = helper.make_graph(
-        [seen, *model.graph.node, *nodes.added],
-        "policy",
-        [helper.make_tensor_value_info(*x) for x in given],
-        [helper.make_tensor_value_info(action, dtype(space.dtype), [1, *(space.shape or ())])],
-        model.graph.initializer,
-    )
-    whole = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
-    whole.ir_version = model.ir_version
-    return Graph(whole.SerializeToString(deterministic=True), choices, noise=noise)
-
-
-# A user's module
-
-
 class _Module(nn.Module):
     """A user's module on one observation, as ``TorchPolicy`` runs it."""
 
     def __init__(self, policy: TorchPolicy, masked: bool) -> None:
         super().__init__()
-        self.module = policy.module
-        self.masked = masked
+        self.module, self.masked = policy.module, masked
         self.spaces = policy.observation_space, policy.action_space
 
     def forward(self, *given: Tensor) -> Tensor:
@@ -128,7 +67,55 @@ def _decoded(
     return (best.reshape(shape) + torch.from_numpy(_start(space))).to(dtype)
 
 
-# An ONNX file
+def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
+    """Return the graph of a user's module; inputs and outputs as in ``agent_graph``.
+
+    Raises:
+        PolicyError: it cannot be written as ONNX; the message begins with ``where``.
+    """
+    space = policy.observation_space
+    choices = _choices(policy)
+    noise = _noise(policy, sampled)
+    given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
+    if choices:
+        given["mask"] = torch.ones(1, choices, **BOOL)
+    given |= {f"noise.{i}": torch.zeros(1, n, **FLOAT) for i, (_, n) in enumerate(noise)}
+    module = _Module(policy, bool(choices)).eval()
+    return Graph(traced(module, given, ["action"], where), choices, noise=noise)
+
+
+def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
+    """Return the graph around an ONNX file; inputs and outputs as in ``agent_graph``.
+
+    The file's own nodes stay as they are. Nodes before them convert an observation to the input;
+    nodes after them convert the output to an action, as ``skills.outputs.decoded`` does.
+    """
+    import onnx
+    from onnx import helper
+
+    model = onnx.compose.add_prefix(onnx.load_from_string(policy.data), "own.")
+    weights = {w.name for w in model.graph.initializer}
+    source = next(i for i in model.graph.input if i.name not in weights)
+    output = next(o for o in model.graph.output if o.name == f"own.{policy.output}")
+    choices, noise = _choices(policy), _noise(policy, sampled)
+    obs, space, dtype = policy.observation_space, policy.action_space, _onnx_type
+    nodes = _Nodes(model.graph)
+    seen = helper.make_node("Cast", ["obs"], [source.name], to=source.type.tensor_type.elem_type)
+    real = output.type.tensor_type.elem_type in _REAL
+    action = nodes.action(output.name, space, real, bool(choices), bool(noise))
+    given = [("obs", dtype(obs_dtype(obs)), [1, *obs.shape])]
+    given += [("mask", dtype(np.bool_), [1, choices])] * bool(choices)
+    given += [(f"noise.{i}", dtype(np.float32), [1, n]) for i, (_, n) in enumerate(noise)]
+    graph = helper.make_graph(
+        [seen, *model.graph.node, *nodes.added],
+        "policy",
+        [helper.make_tensor_value_info(*x) for x in given],
+        [helper.make_tensor_value_info(action, dtype(space.dtype), [1, *(space.shape or ())])],
+        model.graph.initializer,
+    )
+    whole = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
+    whole.ir_version = model.ir_version
+    return Graph(whole.SerializeToString(deterministic=True), choices, noise=noise)
 
 
 _REAL = (1, 10, 11, 16)  # ONNX's numbers of float32, float16, float64 and bfloat16
@@ -144,8 +131,7 @@ class _Nodes:
     """Operations behind a file's own ones."""
 
     def __init__(self, graph: Any) -> None:
-        self.graph = graph
-        self.added = list[Any]()
+        self.graph, self.added = graph, list[Any]()
 
     def then(self, kind: str, *given: str | Array, out: str = "", **attributes: Any) -> str:
         """Add one operation on results of others and constants; return the name of its result."""
@@ -182,8 +168,7 @@ class _Nodes:
             return self.then("Greater", x, np.zeros(1, np.float32))
         if masked:
             x = self.then("Where", "mask", x, np.full((1, 1), -np.inf, np.float32))
-        best = []
-        first = 0
+        best, first = [], 0
         for n in action_codec(space).parts:
             part = self.then("Gather", x, np.arange(first, first + n), axis=1)
             best.append(self.then("ArgMax", part, axis=1, keepdims=1))
@@ -192,16 +177,13 @@ class _Nodes:
         return self.then("Add", joined, _start(space).reshape(1, -1))
 
 
-# Both
-
-
 def _start(space: Any) -> Array:
     """Return the first choice of each part, in the shape of an action."""
     return np.asarray(space.start, np.int64)
 
 
 def _choices(policy: Any) -> int:
-    """Return the width of the mask; 0: no mask."""
+    """Return the width of the mask; 0: there is none."""
     space = policy.action_space
     return 0 if isinstance(space, Box | MultiBinary) else action_codec(space).size
 

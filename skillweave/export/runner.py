@@ -30,14 +30,12 @@ class Runner:
         self.entry = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
         if needs := {k: v for k, v in self.entry["code"].items() if k not in self.code}:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
-        self.dtype = np.dtype(self.entry["dtype"])
-        self.root = self.made(self.entry["policy"])
+        self.dtype, self.root = np.dtype(self.entry["dtype"]), self.made(self.entry["policy"])
         self.reset()
 
     def reset(self) -> None:
         """Start a new episode."""
-        self.before = dict[str, Any]()
-        self.elapsed = 0
+        self.before, self.elapsed = dict[str, Any](), 0
         self.root.reset()
 
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
@@ -71,7 +69,7 @@ class Runner:
         kinds = (_Code, _Network, _Hierarchy, _Function, _Automaton)
         return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
-    def holds(self, name: str, about: Any) -> bool:
+    def asks(self, name: str, about: Any) -> bool:
         """Return the result of code on an observation or a step."""
         return bool(np.asarray(self.code[name](about))[0])
 
@@ -87,8 +85,7 @@ class _Code:  # a skill that is a function of observations; and what all parts h
     why = RUNNING  # no call of it has ended
 
     def __init__(self, runner: Runner, entry: Any) -> None:
-        self.runner = runner
-        self.entry = entry
+        self.runner, self.entry = runner, entry
 
     def reset(self) -> None: ...
     def observe(self, elapsed: int, timed_out: bool) -> None: ...
@@ -136,22 +133,19 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.critic = entry["critic"] and runner.made(entry["critic"])
 
     def reset(self) -> None:
-        self.skill = -1
-        self.why = EPISODE
-        self.succeeded = False
+        self.skill, self.why, self.succeeded = -1, EPISODE, False
         self.selector.reset()
         self.guide.reset()
 
     def may_start(self) -> Any:
-        holds = self.runner.holds
+        asks = self.runner.asks
         obs = self.runner.obs
         code = [s["initiation"] for s in self.skills]
-        may = [name is None or holds(name, obs) for name in code]
+        may = [name is None or asks(name, obs) for name in code]
         return may & np.array([policy.may_start().any() for policy in self.policies])
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        lengths = self.entry["lengths"] or [np.inf]
-        runner = self.runner
+        lengths, runner = self.entry["lengths"] or [np.inf], self.runner
         if self.why != RUNNING:
             may = self.guide.allowed(self.may_start()[None], self).repeat(len(lengths))
             if not may.any():
@@ -160,12 +154,10 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             if skill != self.skill:
                 self.policies[skill].reset()
             self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
-            self.skill = skill
-            self.elapsed = 0
-            self.why = RUNNING
+            self.skill, self.elapsed, self.why = skill, 0, RUNNING
         action = self.policies[self.skill].act(mask)
         for condition, code, fixed in self.entry["reflexes"]:
-            if runner.holds(condition, runner.obs):
+            if runner.asks(condition, runner.obs):
                 action = runner.action(fixed if code is None else runner.code[code](runner.obs)[0])
         return action
 
@@ -177,7 +169,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         (below := self.policies[self.skill]).observe(*when)
         stuck = below.why != RUNNING and not below.may_start().any()
         self.why = LIMIT if stuck or self.elapsed >= self.limit else RUNNING
-        if entry["termination"] and runner.holds(entry["termination"], runner.step(*when)):
+        if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
             worth = self.critic.act(None)
@@ -185,10 +177,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]
             self.why = INTERRUPTED if may.any() and any(gain > margin) else RUNNING
-        judge = entry["success"]
-        self.succeeded = self.why == OWN
+        judge, self.succeeded = entry["success"], self.why == OWN
         if judge and self.why != RUNNING:
-            self.succeeded = runner.holds(judge, runner.step(*when))
+            self.succeeded = runner.asks(judge, runner.step(*when))
         self.selector.watch(self, elapsed, timed_out)
         self.guide.watch(self, elapsed, timed_out)
 
@@ -215,11 +206,10 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
         return mask[0] & np.isin(np.arange(mask.shape[1]), self.entry["skills"][self.state])
 
     def watch(self, last: Any, *when: Any) -> None:
-        holds = self.runner.holds
-        step = self.runner.step
+        asks, step = self.runner.asks, self.runner.step
         ended = {"success": last.succeeded, "failure": not last.succeeded}
         for origin, target, event, code in self.entry["transitions"]:
             over = last.why != RUNNING and ended.get(event)
-            if self.state == origin and (holds(code, step(*when)) if code else over):
+            if self.state == origin and (asks(code, step(*when)) if code else over):
                 self.state = target
                 return

@@ -71,7 +71,7 @@ class States:
                 "ONNX: train the skill, or give it an ONNX file"
             )
         what = "observations (1, ...) to actions (1, ...)"
-        return {"kind": "Code", "code": self._code(f"{name}.policy", acts, what)}
+        return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills = policy.skills
@@ -109,7 +109,7 @@ class States:
         def method(name: str, what: str) -> str | None:
             if not skill.defines(name):
                 return None
-            return self._code(f"{prefix}{skill.name}.{name}", getattr(skill, name), what)
+            return self._asks(f"{prefix}{skill.name}.{name}", getattr(skill, name), what)
 
         return {
             "name": skill.name,
@@ -126,10 +126,10 @@ class States:
         code = None
         fixed = None
         what = "observations (1, ...) to (1,) bool"
-        condition = self._code(f"{name}.condition", reflex.condition, what)
+        condition = self._asks(f"{name}.condition", reflex.condition, what)
         if callable(reflex.action):
             what = "observations (1, ...) to actions (1, ...)"
-            code = self._code(f"{name}.action", reflex.action, what)
+            code = self._asks(f"{name}.action", reflex.action, what)
         else:
             fixed = reflex.fixed(self.space).tolist()
         return [condition, code, fixed]
@@ -160,7 +160,7 @@ class States:
                 what = f"observations (1, ...){last} to skills (1,)"
                 return {
                     "kind": "Function",
-                    "code": self._code(name, selector.function, what),
+                    "code": self._asks(name, selector.function, what),
                     "names": list(selector.skills),
                     "asks_last": selector.takes_last_call,
                 }
@@ -180,7 +180,7 @@ class States:
             if callable(event):
                 ends = ""
                 what = "a Step to (1,) bool"
-                code = self._code(f"{name}.{function_name(event)}", event, what)
+                code = self._asks(f"{name}.{function_name(event)}", event, what)
             transitions.append([origin, target, ends, code])
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
         start = selector.state_names.index(selector.start_state)
@@ -191,7 +191,7 @@ class States:
             "transitions": transitions,
         }
 
-    def _code(self, name: str, function: Any, what: str) -> str:
+    def _asks(self, name: str, function: Any, what: str) -> str:
         """Return the runner's name of a function; a second function of a name gets a number."""
         names = [name, *(f"{name}#{i}" for i in range(2, 1000))]
         free = next(n for n in names if self.functions.get(n, function) == function)
