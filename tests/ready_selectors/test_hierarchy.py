@@ -23,7 +23,6 @@ from ready_selectors.chain import (
 from skillweave import PPO, Automaton, Hierarchy, LastCall, SkillweaveError, tree
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides, list_settings
-from skillweave.errors import DeclarationError, RunError
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 
@@ -127,17 +126,17 @@ OTHERS = {
 def test_a_run_of_another_selector_is_refused(case, trained, tmp_path):
     selector, message = OTHERS[case]
     other = declare(selector, Learnt())
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(SkillweaveError, match=message):
         other.load(trained.path)
-    with pytest.raises(RunError, match=message):
+    with pytest.raises(SkillweaveError, match=message):
         other.load_weights(trained.save_weights(tmp_path / "weights.safetensors"))
 
 
 def test_a_run_of_a_trained_selector_is_refused_where_it_is_ready(tmp_path):
     trained = declare(SMALL, selector_steps=32).train(tmp_path / "run", quiet=True)
-    with pytest.raises(RunError, match=r"has a trained selector, but this .* a ready one"):
+    with pytest.raises(SkillweaveError, match=r"has a trained selector, but this .* a ready one"):
         declare(by_rule).load(trained.path)
-    with pytest.raises(RunError, match=r"has a trained selector, but this .* a ready one"):
+    with pytest.raises(SkillweaveError, match=r"has a trained selector, but this .* a ready one"):
         declare(by_rule).load_weights(trained.save_weights(tmp_path / "weights.safetensors"))
 
 
@@ -147,7 +146,7 @@ def test_a_ready_selector_takes_no_steps():
     assert ready.plain_agent().steps == 64
     assert declare(SMALL, Learnt(), selector_steps=1000).total_steps == 1064
     assert not ready.is_data
-    with pytest.raises(DeclarationError, match=r"no part of this hierarchy is trained.*set steps"):
+    with pytest.raises(SkillweaveError, match=r"no part of this hierarchy is trained.*set steps"):
         declare(by_rule).plain_agent()
     assert declare(by_rule, steps=50).plain_agent().steps == 50
 
@@ -186,7 +185,7 @@ def test_its_source_as_a_skill_of_another_run_is_that_of_all_below_it(tmp_path):
 def test_settings_of_the_selector_on_the_command_line():
     declaration = declare(by_rule)
     assert not any(name.startswith("selector.") for name in list_settings(declaration))
-    with pytest.raises(DeclarationError, match=r"selector.gamma: the selector is ready.*=PPO"):
+    with pytest.raises(SkillweaveError, match=r"selector.gamma: the selector is ready.*=PPO"):
         apply_overrides(declaration, ["selector.gamma=0.5"])
     apply_overrides(declaration, ["selector=PPO", "selector.gamma=0.5"])
     assert declaration.selector.gamma == 0.5

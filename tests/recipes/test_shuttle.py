@@ -10,8 +10,7 @@ import pytest
 
 from benchmarks.pay.shuttle import POINTS
 from benchmarks.pay.shuttle import suite as shuttle_suite
-from skillweave import Step
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave import SkillweaveError, Step
 from skillweave.hierarchy import training
 from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
@@ -82,7 +81,7 @@ def test_one_step_passes_one_point_at_most():
 
 @pytest.mark.parametrize("points", [(2.0,), (1.0, 1.0), (1.0, 2.0, 3.0, 4.0), (1.0, 2.0, 2.0)])
 def test_points_that_make_no_patrol_are_refused(points):
-    with pytest.raises(DeclarationError, match="a patrol has 2 to 3 points"):
+    with pytest.raises(SkillweaveError, match="a patrol has 2 to 3 points"):
         cheetah.Patrol(Runner([]), points)
 
 
@@ -110,7 +109,7 @@ def test_skills_are_paid_for_speed_less_effort_and_for_the_end_of_a_leg():
 
 def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(MissingExtra, match=r"skillweave\[mujoco\]"):
+    with pytest.raises(SkillweaveError, match=r"skillweave\[mujoco\]"):
         shuttle.declare().train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
