@@ -34,6 +34,7 @@ BASE = {
     "reading",
     "experience",
     "shapes",
+    "paths",
 }
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
 LEARNING |= {"collecting", "selectors"}
@@ -47,6 +48,7 @@ ROOMS: dict[str, set[str]] = {
     "errors": {"terminal", "tracebacks"},
     "types": set(),
     "shapes": set(),
+    "paths": set(),
     "messages": {"errors", "types", "tracebacks"},
     "notices": set(),
     "signals": set(),
