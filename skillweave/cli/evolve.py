@@ -11,7 +11,6 @@ from skillweave.cli.overrides import replaced
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.schedule import stages_of
 
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
 
@@ -32,7 +31,7 @@ def parse_evolve(
     if flat:
         stages = declaration.plain_agent().stages()
     else:
-        stages = stages_of(apart_to_evolve(declaration)[0])
+        stages = apart_to_evolve(declaration)[0].stages()
     names = [p.name for p in stages]
     shared = list[tuple[str, str, str]]()
     by_stage = {name: list[tuple[str, str, str]]() for name in names}

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from skillweave.algorithms.config import named_config
+from skillweave.algorithms.config import AlgorithmConfig, named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
@@ -125,7 +125,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
             values[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm
             values |= _flatten(f"skills.{skill.name}.", config)
-    trained = declaration.ready_selector is None
+    trained = isinstance(declaration.selector, AlgorithmConfig)
     return values | (_flatten("selector.", declaration.selector) if trained else {})
 
 
