@@ -40,7 +40,7 @@ from skillweave import (
 )
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.api.adoption import differences
+from skillweave.api.applying import differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING

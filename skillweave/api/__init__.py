@@ -14,7 +14,7 @@ import numpy as np
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api.adoption import (
+from skillweave.api.applying import (
     Trained,
     apply_manifest,
     check_run,

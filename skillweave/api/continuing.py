@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skillweave.api.adoption import apply_manifest, check_run, differences
+from skillweave.api.applying import apply_manifest, check_run, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.hierarchy.declaration import Declaration

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skillweave.api.adoption import Trained
+from skillweave.api.applying import Trained
 from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.starting import Directories, starts
 from skillweave.collecting.cluster import Ray
