@@ -220,7 +220,8 @@ class Hierarchy(Declaration):
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
 
     def __repr__(self) -> str:
-        return hierarchy_line(type(self).__name__, roles_of(self))
+        names = [skill.name for skill in self.skills]
+        return hierarchy_line(type(self).__name__, names, self.spec.name)
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration, for notebooks."""

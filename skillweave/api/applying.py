@@ -172,7 +172,8 @@ def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
     """Raise a RunError where a run was trained in another environment.
 
     Args:
-        what: ``spec`` is of: an agent, or a hierarchy.
+        spec: the declared environment.
+        what: the word for what is declared on it: agent or hierarchy.
     """
     theirs, their_kwargs = run.manifest["env"], run.manifest["env_kwargs"]
     mine, my_kwargs = spec.name, spec.json_kwargs

@@ -17,10 +17,9 @@ from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
 
 
-def hierarchy_line(kind: str, roles: Roles) -> str:
-    """Return the ``repr`` of a hierarchy; ``kind``: the name of its class."""
-    names = ", ".join(roles.outermost.names)
-    return printable(f"<{kind} of {names} on {roles.spec.name}>")
+def hierarchy_line(kind: str, skills: Iterable[str], env: str) -> str:
+    """Return the ``repr`` of a hierarchy, from the names of its class, skills and environment."""
+    return printable(f"<{kind} of {', '.join(skills)} on {env}>")
 
 
 def agent_line(declared: PlainAgent) -> str:

@@ -96,7 +96,7 @@ class Declaration(Nestable):
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
     _caller: ClassVar[Caller] = "hierarchy"
-    """The name of it in messages with lines of Python."""
+    """The entry point in lines of Python that messages print."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
 
@@ -123,21 +123,21 @@ class Declaration(Nestable):
     def _level(self, path: str, as_skill: Skill | None) -> Level:
         """Return the settings of this hierarchy, without those of hierarchies below."""
         return Level(
-            path,
-            as_skill,
-            self.spec,
-            {join(path, skill.name): skill for skill in self.skills},
-            self.call_steps,
-            self.steps,
-            self.learn,
-            self.algorithm,
-            self.selector,
-            tuple(self.reflexes),
-            self.apart,
-            self.together,
-            self.selection,
-            self.guide,
-            self.train_defaults.flat,
+            path=path,
+            as_skill=as_skill,
+            spec=self.spec,
+            skills={join(path, skill.name): skill for skill in self.skills},
+            call_steps=self.call_steps,
+            steps=self.steps,
+            learn=self.learn,
+            algorithm=self.algorithm,
+            selector=self.selector,
+            reflexes=tuple(self.reflexes),
+            apart=self.apart,
+            together=self.together,
+            selection=self.selection,
+            guide=self.guide,
+            flat=self.train_defaults.flat,
         )
 
     @property

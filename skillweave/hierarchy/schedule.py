@@ -36,22 +36,23 @@ SELECTOR_SHARES = 2
 def budgets_of(roles: Roles) -> dict[str, int]:
     """Return the training steps of each stage, by its path, in the order of training."""
     totals = {"": roles.outermost.steps or DEFAULT_STEPS}
-    shares: dict[str, float] = {}
-    for path, level in roles.levels.items():
-        if path not in totals:
-            continue  # it has no stages of its own
-        apart = totals[path]
-        if roles.learns_together(level):
-            apart //= 2
-        shares[path] = apart / max(1, _shares(roles, path))
-        inner = [x for x in level.skills if x in roles.levels]
-        for below in inner if roles.learns_apart(level) else ():
-            part = round(shares[path] * _shares(roles, below))
-            totals[below] = roles.levels[below].steps or part or DEFAULT_STEPS
     budgets: dict[str, int] = {}
+    for path, level in roles.levels.items():
+        if path in totals and roles.learns_apart(level):
+            share = _share(roles, level, totals[path])
+            for inner in level.skills:
+                if inner in roles.levels:
+                    part = round(share * _shares(roles, inner))
+                    totals[inner] = roles.levels[inner].steps or part or DEFAULT_STEPS
     for level in roles.trained:
-        budgets |= _level_budgets(roles, level, totals[level.path], shares[level.path])
+        budgets |= _level_budgets(roles, level, totals[level.path])
     return budgets
+
+
+def _share(roles: Roles, level: Level, total: int) -> float:
+    """Return the training steps of a skill that learns apart and sets none, of a level's total."""
+    apart = total // 2 if roles.learns_together(level) else total
+    return apart / max(1, _shares(roles, level.path))
 
 
 def _shares(roles: Roles, level: str) -> int:
@@ -60,15 +61,15 @@ def _shares(roles: Roles, level: str) -> int:
     return sum(SELECTOR_SHARES if role.kind == "selector" else 1 for role in learners)
 
 
-def _level_budgets(roles: Roles, level: Level, total: int, share: float) -> dict[str, int]:
+def _level_budgets(roles: Roles, level: Level, total: int) -> dict[str, int]:
     """Return the training steps of the stages of one level.
 
     Args:
         total: its training steps in all, those of levels below included.
-        share: the steps of a skill that learns apart and sets none.
     """
     budgets: dict[str, int] = {}
     if roles.learns_apart(level):
+        share = _share(roles, level, total)
         for path, skill in level.skills.items():
             if roles[path].config is not None:
                 budgets[path] = skill.steps or level.apart.skill_steps or max(1, round(share))
@@ -119,8 +120,7 @@ def _together(roles: Roles, level: Level, budget: int) -> Stage:
     settings = level.together
 
     def learning_task(policies: Policies) -> JointTask:
-        skills = learning_set(roles, level, policies)
-        return _joint_task(roles, level, skills)
+        return _joint_task(roles, level, learning_set(roles, level, policies))
 
     ready = level.ready_selector is not None
     config = level.algorithm if ready else _with_epsilon(level.selector, settings)

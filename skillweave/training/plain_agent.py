@@ -44,7 +44,7 @@ class PlainAgent:
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
     _caller: ClassVar[Caller] = "agent"
-    """The name of it in messages with lines of Python."""
+    """The entry point in lines of Python that messages print."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
 
