@@ -1,4 +1,4 @@
-"""Checks of a declared hierarchy's fields; the messages name the skill and the field."""
+"""Checks of a declared hierarchy: its skills, the settings of each level, and nesting."""
 
 from __future__ import annotations
 
