@@ -15,6 +15,7 @@ from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
+from skillweave.training.role import agent_role
 
 
 def train_bare(
@@ -25,7 +26,7 @@ def train_bare(
     on_tick: Callable[[Tick, Stack], None],
 ) -> Stack:
     """Train an agent; ``on_tick`` is called with every report."""
-    learning_task = skill_task(spec)
+    learning_task = skill_task(agent_role(spec))
     algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
     stack = Stack(algorithm, algorithm.init([seeds / "member" / 0]))
     learner = learner_of(stack, config.num_envs, seeds)

@@ -323,12 +323,14 @@ def costs(given: argparse.Namespace) -> dict[str, Any]:
     from skillweave.seeding import Seeds
     from skillweave.training.learner import RolloutLearner, Stack
     from skillweave.training.learning_task import skill_task
+    from skillweave.training.role import agent_role
     from skillweave.training.trainer import _collector
 
     found: dict[str, Any] = {}
     for name, env in (("CartPole", lambda: gym.make("CartPole-v1")), ("MiniGrid", grid)):
         each, rows, count = 16, 128, 2
-        learning_task, config = skill_task(EnvSpec(env, engine="sync")), small(count, each, rows)
+        learning_task = skill_task(agent_role(EnvSpec(env, engine="sync")))
+        config = small(count, each, rows)
         algorithm = make_algorithm(
             config, learning_task.observation_space, learning_task.action_space
         )

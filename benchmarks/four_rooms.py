@@ -59,11 +59,11 @@ from skillweave.collecting.group import Collectors
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.experience import Batch
+from skillweave.hierarchy.roles import CALL
 from skillweave.seeding import Seeds
 from skillweave.skills import ready_policy
 from skillweave.training.episodes import Episodes
 from skillweave.training.learner import Stack
-from skillweave.training.learning_task import CALL
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
 from skillweave.types import Array

@@ -33,6 +33,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, join, split
 from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
+from skillweave.training.role import agent_role
 
 LANDER = EnvSpec("LunarLander-v3")
 SPACES = LANDER.make().observation_space, LANDER.make().action_space
@@ -42,7 +43,7 @@ AGILERL = Path(__file__).with_name("agilerl_population.py")
 
 def speed(members: int, config: PPO, steps: int, seed: int) -> float:
     """Return steps/s of a population's training, all members' steps counted."""
-    population = Population.fresh(config, Evolution(), skill_task(LANDER), Seeds(seed))
+    population = Population.fresh(config, Evolution(), skill_task(agent_role(LANDER)), Seeds(seed))
     population.members = population.members[:members]
     started = time.perf_counter()
     population.train(steps // members, steps // members, Seeds(seed), lambda steps, metrics: None)

@@ -30,6 +30,7 @@ from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import train
 from skillweave.training.replay_learner import learner_of
+from skillweave.training.role import agent_role
 
 ROOT = Path(skillweave.__file__).parent
 PAGE = Path(__file__).parents[1] / "docs" / "one-gradient.md"
@@ -41,7 +42,7 @@ ROUNDS: dict[str, tuple[str, Any]] = {
 
 def one_round(env: str, config: Any, steps: int) -> Callable[[], None]:
     """Return a function that collects and learns, everything made before."""
-    learning_task = skill_task(EnvSpec(env, engine="sync"))
+    learning_task = skill_task(agent_role(EnvSpec(env, engine="sync")))
     algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
     stack = Stack(algorithm, algorithm.init([Seeds(0)]))
     learner = learner_of(stack, config.num_envs, Seeds(0))

@@ -36,6 +36,7 @@ from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.suite import Seldom, Shaped
 from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, SkillweaveError, Step
+from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.training import manifest
 
 EPSILONS = {"epsilon": 0.1, "epsilon_final": 0.0}
@@ -90,7 +91,9 @@ def limit_ends(task: Task, steps: int, **how: Any) -> Hierarchy:
     usual = together(task, steps, **how)
     if usual.learn != "together":
         raise SkillweaveError("limit ends: skills that learn apart have no calls that end it")
-    calls = usual.skill_set(())
+    level = roles_of(usual).outermost
+    untrained: dict[str, Any] = dict.fromkeys(level.skills)
+    calls = level.skill_set(untrained)
     for i, skill in enumerate(usual.skills):
         if (limit := calls.limit(i)) is not None:
             skill.__class__ = _ended_after(limit, type(skill))

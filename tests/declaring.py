@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.grouped import grouped
-from skillweave import Guide, Together
+from skillweave import Guide, Hierarchy, Together
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.hierarchy.roles import roles_of
 
 
 def plainly(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -23,3 +25,9 @@ def plainly(settings: Mapping[str, Any]) -> dict[str, Any]:
     if found.get("guide") is not None:
         found["guide"] = Guide(found["guide"], **guide)
     return grouped(found)
+
+
+def skills_with(declared: Hierarchy, policies: Sequence[Any]) -> SkillSet:
+    """Return all skills of a hierarchy with these policies, in their order."""
+    level = roles_of(declared).outermost
+    return level.skill_set(dict(zip(level.skills, policies, strict=True)))

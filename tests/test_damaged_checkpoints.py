@@ -109,7 +109,7 @@ CASES = [
     ("together", "collector.0.kept.player.elapsed", "negative"),
     ("together", "collector.0.kept.player.limit", "far too large"),
     ("together", "collector.0.open.obs", "missing"),
-    ("together", "counts", "negative"),
+    ("together", "counts.left", "negative"),
     ("together", "loop.report", "negative"),
     ("together", "loop.report", "doubles"),
     ("together", "loop.report", "empty"),

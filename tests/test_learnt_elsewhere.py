@@ -87,7 +87,7 @@ def test_a_policy_that_comes_later_takes_the_place_of_a_training():
     later.policy = right
     for skill in (Ready(), later):
         declared = declare(skill)
-        assert not declared.any_skill_learns
+        assert [stage.kind for stage in declared.stages()] == ["selector"]
         declared.scale(0.5)
         declared.validate()
 
@@ -118,7 +118,7 @@ def test_a_policy_and_settings_of_training_on_one_object_are_refused_in_any_orde
         declare(Ready())
     skill = Ready()
     skill.algorithm = None
-    assert not declare(skill).any_skill_learns
+    assert [stage.kind for stage in declare(skill).stages()] == ["selector"]
 
 
 def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):

@@ -37,8 +37,7 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.envs.make import make_engine
-from skillweave.hierarchy import training
-from skillweave.hierarchy.nesting import every_hierarchy, every_skill
+from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
@@ -74,7 +73,7 @@ def declare(inner=None, **how):
 
 def test_selectors_of_all_levels_have_the_floor_of_learning_together():
     told = Together(epsilon=0.8, epsilon_final=0.2, epsilon_fraction=0.3, task_weight=0.0)
-    (stage,) = training.stages_of(declare(learn="together", together=told))
+    (stage,) = declare(learn="together", together=told).stages()
     for config in (stage.config, stage.beside["inner/selector"]):
         assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.8, 0.2, 0.3)
 
@@ -227,7 +226,7 @@ def test_a_run_stopped_at_a_tick_ends_as_if_it_had_not_been(tmp_path, whole, kin
 def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, kind):
     whole.assert_loads(kind, tmp_path / "weights")
     run, _ = whole(kind)
-    paths = [name for name, _ in every_skill(run.hierarchy.skills)]
+    paths = list(roles_of(run.hierarchy).skills)
     assert list(run.evaluate(3).skills) == paths
 
 
@@ -381,9 +380,7 @@ def test_a_run_without_code_is_loaded_from_its_own_record(tmp_path, capsys):
     assert not run.info()["needs_recipe"]
     again = Hierarchy.from_manifest(run.info()).load(run.path)
     assert again.evaluate(3).returns == run.evaluate(3).returns
-    assert [name for name, _ in every_skill(again.hierarchy.skills)] == [
-        "task", "inner", "inner/short", "inner/task",
-    ]  # fmt: skip
+    assert list(roles_of(again.hierarchy).skills) == ["task", "inner", "inner/short", "inner/task"]
     assert main(["evaluate", str(run.path), "--episodes", "2"]) == 0
     assert "inner/short" in capsys.readouterr().out
 
@@ -520,14 +517,15 @@ def stage(name, kept):
 )
 def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
     run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
-    found = resolve_greedy(declare(), run)
-    assert tuple(own.selection.greedy_skills for _, own in every_hierarchy(found)) == greedy
-    said = resolve_greedy(declare(inside(greedy_skills=False), greedy_skills=True), run)
-    assert [own.selection.greedy_skills for _, own in every_hierarchy(said)] == [True, False]
+    found = resolve_greedy(roles_of(declare()), run).levels.values()
+    assert tuple(level.selection.greedy_skills for level in found) == greedy
+    declared = declare(inside(greedy_skills=False), greedy_skills=True)
+    said = resolve_greedy(roles_of(declared), run).levels.values()
+    assert [level.selection.greedy_skills for level in said] == [True, False]
 
 
 def test_critics_learn_what_deciding_is_worth_at_every_level_where_calls_are_cut():
-    (stage,) = training.stages_of(KINDS["interrupted"]())
+    (stage,) = KINDS["interrupted"]().stages()
     critics = {k: c for k, c in stage.beside.items() if k.endswith("skill_critic")}
     assert len(critics) == 2
     assert all(critic.deciding for critic in critics.values())

@@ -32,6 +32,7 @@ from skillweave import DQN, SAC, TD3, Hierarchy, Network, recipes
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
+from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.learning_task import LearningTask
@@ -304,7 +305,7 @@ def test_a_run_whose_skills_have_rewards_of_their_own_is_not_resumed_without_the
     text = RECIPE.replace(', engine="ENGINE"', "").replace("def initiation", "def _unused")
     text = text.replace("def termination", "def _neither").replace("    reflexes=", "    # ")
     recipe.write_text(text)
-    assert recipes.load(str(recipe)).is_data
+    assert roles_of(recipes.load(str(recipe))).is_data
     run = stopped_run(recipes.load(str(recipe)), tmp_path / "run", 3)
     assert main(["resume", str(run.path), "--quiet", "--evaluate", "0"]) == 1
     assert "--recipe" in capsys.readouterr().err

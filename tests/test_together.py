@@ -40,7 +40,7 @@ from skillweave import (
 )
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.api.adoption import describe_differences
+from skillweave.api.applying import differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING
@@ -347,8 +347,10 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
     run = new_run(declare(learn=learn), tmp_path / "run")
     assert run.manifest["greedy_skills"] is said
     run.manifest["greedy_skills"] = True
-    assert describe_differences(declare(learn=learn), run) == ""
-    told = describe_differences(declare(learn=learn, greedy_skills=False), run)
+    seed = run.manifest["seed"]
+    assert differences(training.manifest(declare(learn=learn), seed=seed), run) == ""
+    other = declare(learn=learn, greedy_skills=False)
+    told = differences(training.manifest(other, seed=seed), run)
     assert "greedy_skills is yes (declared now: no)" in told
     run.close()
 
@@ -356,7 +358,7 @@ def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn
 def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
     for how in ({}, {"selector": replace(ON, epsilon=0.7)}):
         told = Together(epsilon_fraction=0.3, task_weight=0.0)
-        (stage,) = training.stages_of(declare(interrupt=True, together=told, **how))
+        (stage,) = declare(interrupt=True, together=told, **how).stages()
         critic = stage.beside["skill_critic"]
         for name in ("epsilon", "epsilon_final", "epsilon_fraction"):
             assert getattr(critic, name) == getattr(stage.config, name)
@@ -367,11 +369,11 @@ def test_the_critic_knows_how_many_calls_the_selector_draws_by_lot():
 def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
     alone = declare(selector=replace(ON, **{name: 0.5}))
     with pytest.raises(SkillweaveError, match=rf"set together\.{name}, or selector\.epsilon, too"):
-        training.stages_of(alone)
-    (stage,) = training.stages_of(declare(selector=replace(ON, epsilon=0.7, **{name: 0.5})))
+        alone.stages()
+    (stage,) = declare(selector=replace(ON, epsilon=0.7, **{name: 0.5})).stages()
     assert getattr(stage.config, name) == 0.5
     assert stage.config.epsilon == 0.7
-    training.stages_of(declare(learn="apart", selector=replace(ON, **{name: 0.5})))
+    declare(learn="apart", selector=replace(ON, **{name: 0.5})).stages()
 
 
 @pytest.mark.parametrize("make", [Together, SkillCritic])
@@ -382,15 +384,15 @@ def test_a_floor_falls_over_a_share_of_the_budget(make):
 
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():
     for learn in ("together", "apart", "apart, then together"):
-        *_, stage = training.stages_of(declare(learn=learn, interrupt=True))
+        *_, stage = declare(learn=learn, interrupt=True).stages()
         assert stage.beside["skill_critic"].deciding
-    (stage,) = training.stages_of(declare(together=Together(task_weight=0.5)))
+    (stage,) = declare(together=Together(task_weight=0.5)).stages()
     assert not stage.beside["skill_critic"].deciding
 
 
 def test_the_critic_divides_advantages_by_as_much_as_the_selector_does():
     selector = replace(ON, min_advantage_std=7.0)
-    (stage,) = training.stages_of(declare(interrupt=True, selector=selector))
+    (stage,) = declare(interrupt=True, selector=selector).stages()
     assert stage.beside["skill_critic"].min_advantage_std == 7.0
 
 

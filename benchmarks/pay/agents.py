@@ -110,7 +110,8 @@ class Bench:
     def _as_learnt(self, hierarchy: Hierarchy) -> Hierarchy:
         """Let skills be greedy, or sample, as on the first task, if neither the suite sets it nor a
         stage in which they go on learning finds it out."""
-        if hierarchy.selection.greedy_skills is None and not hierarchy.learns_together:
+        together = any(stage.kind == "together" for stage in hierarchy.stages())
+        if hierarchy.selection.greedy_skills is None and not together:
             regroup(hierarchy, greedy_skills=self._source_policy().skills.greedy)
         return hierarchy
 

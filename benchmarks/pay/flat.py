@@ -5,7 +5,7 @@ All are evaluated on the task's own reward while they train, whatever they learn
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.starts import begin_with, keep_starts, learnt_in
 from skillweave.training.learning_task import skill_task
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage
 from skillweave.training.stage_run import StageRun
 from skillweave.training.trainer import OneAgent
@@ -33,10 +34,8 @@ class Flat(Agent):
 
     def stages(self) -> list[Stage]:
         """Return its only stage."""
-        spec, skill = self.spec, self.learns
-        return [
-            Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_task(spec, skill))
-        ]
+        role = replace(agent_role(self.spec), skill=self.learns)
+        return [Stage("agent", "agent", self.algorithm, self.steps, lambda _: skill_task(role))]
 
     def run(self, path: Path, seed: int) -> Run:
         """Train it, or finish what was begun there."""
@@ -69,7 +68,7 @@ class _FlatLearner(OneAgent):
         """Make the environments and the agent."""
         fresh, manifest = super().open(), self.stage.run.manifest
         self.evaluation = PeriodicEvaluation(
-            skill_task(self._flat.spec),
+            skill_task(agent_role(self._flat.spec)),
             self.stage.seeds,
             manifest["eval_every"],
             manifest["eval_episodes"],

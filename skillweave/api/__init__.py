@@ -14,21 +14,24 @@ import numpy as np
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.api.adoption import (
+from skillweave.api.applying import (
     Trained,
     apply_manifest,
     check_run,
-    describe_differences,
+    differences,
     load_policy,
     spec_of,
 )
 from skillweave.api.hub import push_run
 from skillweave.api.notebook_tables import (
+    agent_facts,
     agent_html,
     agent_line,
+    hierarchy_facts,
     hierarchy_html,
     hierarchy_line,
     run_html,
+    skills_table,
 )
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
@@ -42,12 +45,19 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.plan import Evolve
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy import training
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import below, copied, every_skill
+from skillweave.hierarchy.assembly import parts_of
+from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
-from skillweave.hierarchy.schedule import stages_of
-from skillweave.hierarchy.weights import open_weights, read_agent, read_weights, write_weights
+from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.hierarchy.weights import (
+    open_weights,
+    read_agent,
+    read_weights,
+    write_agent,
+    write_weights,
+)
 from skillweave.messages import as_path, shown_path, whole_number
+from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -63,7 +73,7 @@ from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
-from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.training.plain_agent import PlainAgent
 from skillweave.types import Memory, Policy
 
 
@@ -145,7 +155,9 @@ class Agent(PlainAgent):
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         check_run(self, run)
-        note = describe_differences(self, run, self.recipe)
+        # A recipe's settings are not compared: the command line may have changed them.
+        compared = not self.recorded and self.recipe is None
+        note = differences(self.manifest(run.manifest["seed"]), run) if compared else ""
         return run_of(go_on(self, run, quiet, evolve, cluster, note, callback))
 
     @checked_names
@@ -208,11 +220,12 @@ class Hierarchy(Declaration):
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
 
     def __repr__(self) -> str:
-        return hierarchy_line(self)
+        names = [skill.name for skill in self.skills]
+        return hierarchy_line(type(self).__name__, names, self.spec.name)
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration, for notebooks."""
-        return hierarchy_html(self)
+        return hierarchy_html(roles_of(self), recorded=self.recorded)
 
     @checked_names
     def train(
@@ -339,7 +352,10 @@ class Hierarchy(Declaration):
         self.validate()
         run = RunDirectory.open(as_path(run_dir, "run_dir"))
         declared = apply_manifest(self, run)
-        note = describe_differences(self, run, self.recipe)
+        note = ""
+        if not self.recorded and self.recipe is None:  # the command line may change a recipe
+            seed, flat = run.manifest["seed"], run.manifest["kind"] == "agent"
+            note = differences(training.manifest(self, seed=seed, flat=flat), run)
         return run_of(go_on(declared, run, quiet, evolve, cluster, note, callback))
 
     @checked_names
@@ -359,10 +375,13 @@ class Hierarchy(Declaration):
         """Load this hierarchy with the weights in the file ``path`` (see ``Run.save_weights``)."""
         self.validate()
         path = as_path(path, "path")
-        declared = copied(self)  # the file sets how skills are called
-        policy = read_weights(declared, path)
-        plain = isinstance(policy, AgentPolicy)
-        return Run(self.plain_agent() if plain else declared, path, policy)
+        tensors, header = open_weights(path)
+        if header["kind"] == "agent":
+            agent = read_agent(self.spec, tensors, header, path)
+            return Run(self.plain_agent(), path, agent)
+        # The file sets how skills are called.
+        roles, policy = read_weights(roles_of(self), tensors, header, path)
+        return Run(with_roles(self, roles), path, policy)
 
     @staticmethod
     @checked_names
@@ -373,26 +392,24 @@ class Hierarchy(Declaration):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """Return the hierarchy of a run's ``manifest``, without the user's code."""
-        entries = {s["name"]: s for s in manifest["skills"]}
-        return cls._recorded(spec_of(manifest), manifest, entries)
-
-    @classmethod
-    def _recorded(
-        cls, spec: EnvSpec, manifest: dict[str, Any], entries: dict[str, dict[str, Any]]
-    ) -> Hierarchy:
-        """Return a run's hierarchy, or one below it, from the entries of its skills by path."""
-        skills = []
-        for name, entry in entries.items():
-            if "/" in name:
-                continue
+        spec = spec_of(manifest)
+        skills: dict[str, list[Skill]] = {}  # by the path of their level
+        for entry in reversed(manifest["skills"]):  # the skills of a hierarchy follow it
+            path = entry["name"]
             attributes: dict[str, Any] = {
                 k: entry[k] for k in ("max_steps", "call_steps") if k in entry
             }
-            attributes["name"] = name
+            attributes["name"] = name_of(path)
             if "hierarchy" in entry:
-                attributes["policy"] = cls._recorded(spec, entry["hierarchy"], below(entries, name))
-            skills.append(type(name, (RecordedSkill,), attributes)())
-        hierarchy = cls(spec, skills, call_steps=calls_from_json(manifest))
+                attributes["policy"] = cls._recorded(spec, entry["hierarchy"], skills.pop(path))
+            skill = type(attributes["name"], (RecordedSkill,), attributes)()
+            skills.setdefault(level_of(path), []).insert(0, skill)
+        return cls._recorded(spec, manifest, skills[""])
+
+    @classmethod
+    def _recorded(cls, spec: EnvSpec, entry: dict[str, Any], skills: list[Skill]) -> Hierarchy:
+        """Return a run's hierarchy, or one below it, from its entry and its skills."""
+        hierarchy = cls(spec, skills, call_steps=calls_from_json(entry))
         hierarchy.recorded = True
         return hierarchy
 
@@ -415,7 +432,11 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration and the stages, for notebooks."""
-        return run_html(self.path, self.declaration)
+        if isinstance(self.declaration, PlainAgent):
+            return run_html(self.path, agent_facts(self.declaration))
+        roles = roles_of(self.declaration)
+        known = hierarchy_facts(roles, recorded=self.declaration.recorded)
+        return run_html(self.path, known, skills_table(roles))
 
     @property
     def hierarchy(self) -> Hierarchy:
@@ -524,7 +545,7 @@ class Run:
         must_be_own(path.parent)
         seed = whole_number(seed, "seed", 0)
         plain = isinstance(self.declaration, PlainAgent)
-        skills = () if plain else self.hierarchy.skills
+        roles = None if plain else roles_of(self.hierarchy)
         film = render_policy(
             self.declaration.spec,
             policy,
@@ -532,7 +553,7 @@ class Run:
             episodes=episodes,
             seed=seed,
             deterministic=deterministic,
-            label=_labels_of(policy, skills, skill),
+            label=_labels_of(policy, roles, skill),
             max_steps=max_steps,
             rng=np.random.default_rng(seed),
             quiet=quiet,
@@ -657,7 +678,11 @@ class Run:
         """
         path = as_path(path, "path")
         must_be_own(path.parent)
-        write_weights(path, self.declaration, self.policy)
+        if isinstance(self.policy, AgentPolicy):
+            write_agent(path, self.declaration.spec, self.policy)
+            return path
+        assert isinstance(self.policy, HierarchyPolicy)
+        write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
         return path
 
     @checked_names
@@ -713,23 +738,18 @@ class Run:
         """Return the number of environments in training; None: nothing was trained."""
         if self.path.is_dir():
             return RunDirectory.open(self.path).num_envs
-        declared = self.declaration
-        stages = declared.stages() if isinstance(declared, PlainAgent) else stages_of(declared)
+        stages = self.declaration.stages()
         return max((stage.config.num_envs for stage in stages), default=None)
 
     def _policy(self, skill: str | None) -> Policy:
         if skill is None:
             return self.policy
-        policy = self.policy
-        if not isinstance(policy, HierarchyPolicy):
+        if not isinstance(self.policy, HierarchyPolicy):
             raise DeclarationError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)
-        *nodes, name = skill.split("/")
-        for node in nodes:
-            below = policy.skills.policies[policy.labels.index(node)]
-            assert isinstance(below, HierarchyPolicy)
-            policy = below
-        return SkillAlone(policy.skills, name, skill)
+        level = parts_of(roles_of(self.hierarchy), self.policy)[level_of(skill)]
+        assert isinstance(level, HierarchyPolicy)
+        return SkillAlone(level.skills, name_of(skill), skill)
 
 
 OneRun = str | Path | Run
@@ -762,25 +782,26 @@ def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
 
 
 def _labels_of(
-    policy: Policy, skills: Sequence[Skill], alone: str | None
+    policy: Policy, roles: Roles | None, alone: str | None
 ) -> Callable[[Memory], tuple[str, RGB]]:
     """Return a function from a policy's memory to the acting skill's name and colour.
 
     Args:
-        skills: of the hierarchy that acts; none: a plain agent.
+        roles: of the hierarchy that acts; None: a plain agent acts.
         alone: the skill that acts alone.
     """
-    colors = {name: color_of(i, s.color) for i, (name, s) in enumerate(every_skill(skills))}
+    skills = {} if roles is None else roles.skills
+    colors = {path: color_of(i, s.color) for i, (path, s) in enumerate(skills.items())}
 
     def label(memory: Memory) -> tuple[str, RGB]:
-        if not skills:
-            return AGENT, color_of(len(colors), None)
+        if roles is None:
+            return AGENT, color_of(0, None)
         acting = policy.policy if isinstance(policy, SkillAlone) else policy
         below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
-        name = "/".join(filter(None, (alone, below)))
+        name = join(alone or "", below or "")
         known = name
         while known not in colors:  # a run that is a ready skill has skills of its own
-            known = known.rpartition("/")[0]
+            known = level_of(known)
         return name, colors[known]
 
     return label

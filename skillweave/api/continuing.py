@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skillweave.api.adoption import apply_manifest, check_run, differences
+from skillweave.api.applying import apply_manifest, check_run, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
-from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.paths import decides, is_below, level_of
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import decides
 
 D = TypeVar("D", bound=Declaration | PlainAgent)
 
@@ -48,9 +47,14 @@ def prepared(
     Raises:
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
-    _check_same(declared, content, run)
+    check_run(declared, run)
+    _check_same(content, run)
     declared = apply_manifest(declared, run)
-    budgets = _budgets(declared, content, run, evolve)
+    stages = content["stages"]
+    if run.manifest["kind"] == "hierarchy":
+        # As the run learns, apart or together: it may be declared otherwise now.
+        stages = [stage.entry() for stage in declared.stages()]
+    budgets = _budgets(stages, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
     if tuple(track) != tuple(run.manifest.get("track", ())):
         known = ", ".join(run.manifest.get("track", ())) or "none"
@@ -70,11 +74,8 @@ def prepared(
     return declared, "; ".join(filter(None, sentences))
 
 
-def _check_same(
-    declared: Declaration | PlainAgent, content: Mapping[str, Any], run: RunDirectory
-) -> None:
-    """Raise a RunError where a run is one of another declaration."""
-    check_run(declared, run)
+def _check_same(content: Mapping[str, Any], run: RunDirectory) -> None:
+    """Raise a RunError where a run is of another kind, recipe or seed than ``content``."""
     manifest = run.manifest
     if content["kind"] != manifest["kind"]:
         flat = "--flat" if from_command_line() else "flat=True"
@@ -97,15 +98,13 @@ def _check_same(
         )
 
 
-def _budgets(
-    declared: Declaration | PlainAgent, content: dict[str, Any], run: RunDirectory, evolve: Evolve
-) -> dict[str, int]:
-    """Return the budgets of a run's stages as they are declared now, where both have the stage."""
-    stages: list[dict[str, Any]] = content["stages"]
+def _budgets(stages: list[dict[str, Any]], run: RunDirectory, evolve: Evolve) -> dict[str, int]:
+    """Return the budgets of a run's stages as they are declared now, where both have the stage.
+
+    Args:
+        stages: the entries of the stages that are declared now.
+    """
     if run.manifest["kind"] == "hierarchy":
-        assert isinstance(declared, Declaration)
-        # As the run learns, apart or together: it may be declared otherwise now.
-        stages = training.manifest(declared, seed=content["seed"])["stages"]
         names = {stage["name"] for stage in stages}
         if not isinstance(evolve, Mapping) or set(evolve) <= names:
             plan(stages, evolve)
@@ -233,16 +232,15 @@ def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any
     """Return a sentence on each selector that stays as it is while its skills continue."""
     sentences = []
     for at, entry in enumerate(stages):
-        node = entry["name"].rpartition("/")[0]
+        level = level_of(entry["name"])
         if entry["status"] != "done" or entry in grown or not decides(str(entry["decides"])):
             continue
-        within = f"{node}/" if node else ""
         skills = [
             name
             for other in stages[:at]
             if other in grown
             for name in other["learns"]
-            if name.startswith(within)
+            if is_below(name, level)
         ]
         if skills:
             sentences.append(

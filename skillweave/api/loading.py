@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.api import Agent, Hierarchy, Run, run_of
-from skillweave.api.adoption import load_policy
+from skillweave.api.applying import load_policy
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, begun
 from skillweave.arguments import checked_names

@@ -6,8 +6,10 @@ from skillweave.api import Hierarchy, Run
 from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
+from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.roles import roles_of
 from skillweave.messages import short, whole_number
 from skillweave.seeding import Seeds, global_generators
 
@@ -40,14 +42,15 @@ def make_options_env(
             raise DeclarationError("this is the run of a plain agent: it has no skills to call")
         skills, spec = hierarchy.policy.skills, hierarchy.hierarchy.spec
     else:
-        ready, spec = hierarchy.ready_policies(), hierarchy.spec
-        lacking = [s.name for s in hierarchy.skills if s.name not in ready]
+        roles = roles_of(hierarchy)
+        ready, spec = ready_policies(roles), roles.spec
+        lacking = [path for path in roles.outermost.skills if path not in ready]
         if lacking:
             raise DeclarationError(
                 f"skill {lacking[0]!r} has no policy: train the hierarchy and give its run, or "
                 "declare the skill with a policy"
             )
-        skills = hierarchy.skill_set([ready[s.name] for s in hierarchy.skills])
+        skills = roles.outermost.skill_set(ready)
     with global_generators(Seeds(seed) / "options"):
         engine = make_engine(spec, num_envs)
     return OptionsEnv(engine, skills, float(gamma), seed)

@@ -11,9 +11,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skillweave.api.adoption import Trained, caller_of
+from skillweave.api.applying import Trained
 from skillweave.api.continuing import prepared, to_continue
-from skillweave.api.starting import Directories, Spaces, starts
+from skillweave.api.starting import Directories, starts
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.collecting.start_methods import runs_again, why_no_processes
@@ -21,11 +21,12 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
 from skillweave.hierarchy import training
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import copied, every_hierarchy
+from skillweave.hierarchy.declaration import Declaration, with_roles
+from skillweave.hierarchy.roles import Level, roles_of
 from skillweave.messages import absolute, as_path, short, shown_path
 from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
+from skillweave.paths import AGENT
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
@@ -38,7 +39,8 @@ from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import Callback, TrainCallback, check_callback
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import CRITIC, assign_workers, check_replay, check_stages, workers_of
+from skillweave.training.role import Role, agent_role
+from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
@@ -91,21 +93,25 @@ def begin(
     if isinstance(track, str) or not isinstance(track, Sequence):
         raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
     track = tuple(track)
-    with _surroundings(), called_by(caller_of(declared)), ExitStack() as stack:
+    with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
-        spaces = _plan(declared, content, evolve, cluster)
+        roles = _plan(declared, content, evolve, cluster)
         if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
             declared, sentences = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
             return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
-        learnt, origin = starts(declared, content, start_from, spaces)
+        learnt, origin = starts(content, start_from, roles)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(track, None)  # a missing extra is reported before anything is written
         if cluster is not None:
             cluster.check()
         content = content | {"track": track}
         if run_dir is None:
-            run_dir = make_numbered(_run_name(declared, content), place)
+            name, flat = declared.spec.name, False
+            if isinstance(declared, Declaration):
+                flat = content["kind"] == "agent"
+                name = name if declared.name == Declaration.name else declared.name
+            run_dir = make_numbered(_run_name(content["recipe"], name, flat), place)
             note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
             stack.callback(_remove_if_empty, run_dir)
         run = RunDirectory.create(run_dir, content, partial(keep_starts, learnt=learnt), hold=True)
@@ -121,13 +127,16 @@ def _kept_by_populations(content: dict[str, Any]) -> str:
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
-def _run_name(declared: Declaration | PlainAgent, content: Mapping[str, Any]) -> str:
-    """Return the stem of a numbered directory: the recipe, the hierarchy, or the environment."""
-    flat = isinstance(declared, Declaration) and content["kind"] == "agent"
-    name = "" if content["recipe"] is None else Path(content["recipe"]).stem
-    if not name and isinstance(declared, Declaration) and declared.name != Declaration.name:
-        name = declared.name
-    return (name or declared.spec.name) + ("-flat" if flat else "")
+def _run_name(recipe: str | None, name: str, flat: bool) -> str:
+    """Return the stem of a numbered directory.
+
+    Args:
+        recipe: the declaration's place; its name comes first.
+        name: of the hierarchy, or of the environment.
+        flat: the flat baseline of a hierarchy is trained.
+    """
+    stem = "" if recipe is None else Path(recipe).stem
+    return (stem or name) + ("-flat" if flat else "")
 
 
 def _remove_if_empty(path: Path) -> None:
@@ -157,9 +166,9 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
 def _plan(
     declared: Declaration | PlainAgent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
-) -> Spaces:
-    """Check everything, and complete the entries of a manifest's stages; return the spaces."""
-    observation_space, action_space = declared.check_spaces()
+) -> Mapping[str, Role]:
+    """Check everything, and complete the entries of a manifest's stages; return the roles."""
+    declared.check_spaces()
     plan(content["stages"], evolve)
     check_several(content["stages"], declared.spec)
     check_stages(content["stages"], content["eval_every"], content["keep"])
@@ -170,17 +179,16 @@ def _plan(
     assign_workers(content["stages"], spec, declared)
     if cluster is None and any(stage["workers"] > 1 for stage in content["stages"]):
         _must_not_run_again(spec)
+    roles: Mapping[str, Role] = {AGENT: agent_role(declared.spec)}
+    if content["kind"] == "hierarchy":
+        assert isinstance(declared, Declaration)
+        roles = roles_of(declared).by_path
     for stage in content["stages"]:
-        acts: Any = action_space
-        if stage["decides"] in stage["learns"] and isinstance(declared, Declaration):
-            acts = declared.chooses_from(stage["decides"], action_space)
-        check_replay(stage, observation_space, acts)
-        for name, config in stage.get("algorithms", {}).items():
-            if not name.endswith(CRITIC):  # it has no replay
-                assert isinstance(declared, Declaration)
-                acts = declared.chooses_from(name, action_space)
-                check_replay(stage | {"algorithm": config}, observation_space, acts)
-    return observation_space, action_space
+        for path in stage["learns"]:
+            config = stage.get("algorithms", {}).get(path, stage["algorithm"])
+            if roles[path].kind != "critic":  # it has no replay
+                check_replay(stage | {"algorithm": config}, roles[path])
+    return roles
 
 
 @contextmanager
@@ -214,7 +222,7 @@ def go_on(
         _may_train()
     must_be_own(run.path)
     with _surroundings(), ExitStack() as stack:
-        stack.enter_context(called_by(caller_of(declared)))
+        stack.enter_context(called_by(declared._caller))
         stack.callback(run.close)
         run.begin()
         notices = stack.enter_context(collected_notices())
@@ -255,13 +263,19 @@ def evolving(declared: H, evolve: Evolve) -> tuple[H, str]:
 
 def apart_to_evolve(declared: H) -> tuple[H, str]:
     """Return a copy of a hierarchy that learns apart, and a sentence about it."""
-    copy = copied(declared)
-    changed = [h for _, h in every_hierarchy(copy) if h.learns_together and h.learn == "together"]
+    roles = roles_of(declared)
+    changed = [
+        path
+        for path, level in roles.levels.items()
+        if level.learn == "together" and roles.learns_together(level)
+    ]
     if not changed:
         return declared, ""
-    for hierarchy in changed:
-        hierarchy.learn = "apart"
-    return copy, (
+
+    def apart(level: Level) -> Level:
+        return replace(level, learn="apart") if level.path in changed else level
+
+    return with_roles(declared, roles.changed(apart)), (
         "Skills and selector cannot evolve together yet, so they learn apart here; "
         "learn='apart' in the declaration ends this message."
     )

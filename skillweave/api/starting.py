@@ -6,34 +6,33 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError, RunError
-from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, close_matches, short
+from skillweave.paths import AGENT
 from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
 from skillweave.spaces import same_space
-from skillweave.training.plain_agent import AGENT, PlainAgent
+from skillweave.training.role import Role
 
 Directory = str | Path
 Directories = Directory | Mapping[str, Directory] | None
 """The directory of a run to start from, or such directories by the learners' names."""
-Spaces = tuple[gym.Space[Any], gym.Space[Any]]
-"""Of observations and of actions."""
 
 
 def starts(
-    declared: Declaration | PlainAgent,
     content: dict[str, Any],
     start_from: Directories,
-    spaces: Spaces,
+    roles: Mapping[str, Role],
 ) -> tuple[dict[str, Learnt], str]:
     """Return the policies that learners start from, by name, and a sentence about them.
 
     The manifest then holds the start of each learner.
+
+    Args:
+        content: the manifest of the new run.
+        roles: of its learners, by path.
     """
     if start_from is None:
         return {}, ""
@@ -46,14 +45,13 @@ def starts(
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
     started = begin_with(content["stages"], learnt, where)
-    observation_space, action_space = spaces
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
             config = stage.get("algorithms", {}).get(name, stage["algorithm"])
-            acts: Any = action_space
-            if isinstance(declared, Declaration) and content["kind"] == "hierarchy":
-                acts = declared.chooses_from(name, action_space)
-            algorithm = make_algorithm(config_from_json(config), observation_space, acts)
+            role = roles[name]
+            algorithm = make_algorithm(
+                config_from_json(config), role.observation_space, role.action_space
+            )
             chooses = chosen_from(content, name)
             _check_start(name, algorithm, chooses, learnt[name], places[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import importlib
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from skillweave import recipes
@@ -307,7 +307,7 @@ def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
 def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
     """Copy a run from the hub; return its new place as JSON and for people."""
     _no_bars()
-    name = check_name(command.name).partition("/")[2]
+    name = PurePosixPath(check_name(command.name)).name
     path = pull_run(command.name, command.out or _free_path(Path("runs") / name), command.revision)
     return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
 

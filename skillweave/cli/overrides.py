@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from skillweave.algorithms.config import named_config
+from skillweave.algorithms.config import AlgorithmConfig, named_config
 from skillweave.algorithms.schedules import Linear
 from skillweave.api.running import apart_to_evolve
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.schedule import stages_of
 from skillweave.settings import annotations_of, described, options_of
 from skillweave.skills import Skill
 
@@ -104,7 +103,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
             values[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm
             values |= _flatten(f"skills.{skill.name}.", config)
-    trained = declaration.ready_selector is None
+    trained = isinstance(declaration.selector, AlgorithmConfig)
     return values | (_flatten("selector.", declaration.selector) if trained else {})
 
 
@@ -154,7 +153,7 @@ def parse_evolve(
     if flat:
         stages = declaration.plain_agent().stages()
     else:
-        stages = stages_of(apart_to_evolve(declaration)[0])
+        stages = apart_to_evolve(declaration)[0].stages()
     names = [p.name for p in stages]
     shared = list[tuple[str, str, str]]()
     by_stage = {name: list[tuple[str, str, str]]() for name in names}

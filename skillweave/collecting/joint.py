@@ -12,12 +12,13 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, raw_columns, seen_by, terminated_in_call
-from skillweave.collecting.levels import CRITIC, SELECTOR, Level, NestedLevel, with_learners
+from skillweave.collecting.levels import Level, NestedLevel, with_learners
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.writer import BatchWriter
 from skillweave.envs.engine import Engine, RawStep
 from skillweave.errors import DeclarationError
 from skillweave.experience import Batch
+from skillweave.paths import CRITIC, SELECTOR, name_of
 from skillweave.skills import Skill
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step
@@ -77,8 +78,8 @@ class JointCollector(DecisionCollector):
 
     def _part(self, path: str) -> Batch:
         """Return what was collected for a learner."""
-        node, _, name = path.rpartition("/")
-        level = next(x for x in self.root.all() if x.path == (f"{node}/" if node else ""))
+        name = name_of(path)
+        level = next(x for x in self.root.all() if x.path == path.removesuffix(name))
         assert self._rows is not None
         if name == CRITIC:
             return self._rows.of_critic(level.path)

@@ -16,13 +16,9 @@ from skillweave.collecting.pending_calls import Decisions, PendingCalls
 from skillweave.collecting.player import LearnerActor, Player
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.experience import Batch
+from skillweave.paths import CRITIC, SELECTOR
 from skillweave.skills import Skill
 from skillweave.types import Array, Memory, Policy, unprefixed
-
-SELECTOR = "selector"
-"""What a selector is named, after the names of the hierarchies that it is in."""
-CRITIC = "skill_critic"
-"""What a critic of skills is named, in the same way."""
 
 
 @dataclass(frozen=True)

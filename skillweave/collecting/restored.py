@@ -10,6 +10,7 @@ import numpy as np
 
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.player import Player
+from skillweave.paths import join, level_of, name_of
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
 
@@ -68,11 +69,10 @@ def opened(
     """
     found, codec = {}, obs_codec(observation_space)
     for name, value in open_calls.items():
-        prefix, _, what = name.rpartition("/")  # of a hierarchy below: "inner/obs"
-        if what == "obs":
+        if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
             found[name] = value.copy().view(obs.dtype).reshape(obs.shape)
             # Where no call has begun yet, nothing was written.
-            begun = kept[f"{prefix}/tau" if prefix else "tau"] > 0
+            begun = kept[join(level_of(name), "tau")] > 0
             codec.check(to_tensor(found[name][begun]))
             continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 
@@ -46,12 +45,6 @@ class SkillSet:
     def choices(self) -> int:
         """The number of choices: the first skill with each length, then the next skill."""
         return len(self.skills) * max(1, len(self.lengths))
-
-    @property
-    def usual_steps(self) -> int | None:
-        """Environment steps of a call, about; None: nothing says how long it lasts."""
-        lengths = self.lengths
-        return round(sum(lengths) / len(lengths)) if lengths else cast(Any, self.call_steps)
 
     def mask(self, obs: Array, age: Array | None = None) -> Array | None:
         """Return the allowed choices, (n, choices) bool; None: all, everywhere.

@@ -1,4 +1,4 @@
-"""Assembly of a hierarchy's policy from the policies of its selector and skills."""
+"""Assembly of a hierarchy's policy from the policies of its parts, by path; and its parts."""
 
 from __future__ import annotations
 
@@ -7,49 +7,68 @@ from typing import Any
 
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import learning_guide, restricting_guide
-from skillweave.hierarchy.nesting import below, inner_of
+from skillweave.hierarchy.fitting import learning_guide, restricting_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
-from skillweave.skills import Skill
-from skillweave.training.stage import CRITIC, SELECTOR
+from skillweave.hierarchy.roles import Level, Roles
 from skillweave.types import Policy
 
 
-def assembled(declared: Declaration, policies: Mapping[str, Policy]) -> HierarchyPolicy:
-    """Return the policy of a hierarchy from policies by path."""
-    skills = declared.skill_set([policy_of(s, policies) for s in declared.skills])
-    if declared.together.interrupt:
-        skills = with_interruption(skills, policies[CRITIC], declared.together.margin)
-    guide = restricting_guide(declared, policies[SELECTOR].observation_space)
-    return HierarchyPolicy(policies[SELECTOR], skills, guide)
+def assembled(roles: Roles, policies: Mapping[str, Policy], path: str = "") -> HierarchyPolicy:
+    """Return the policy of a level from policies by path."""
+    whole: dict[str, Any] = dict(policies)
+    for level in reversed(roles.levels_from(path)):
+        skills = level.skill_set({p: whole[p] for p in level.skills})
+        if level.together.interrupt:
+            skills = with_interruption(skills, whole[level.critic_path], level.together.margin)
+        selector = whole[level.selector_path]
+        guide = restricting_guide(level, selector.observation_space)
+        whole[level.path] = HierarchyPolicy(selector, skills, guide)
+    policy: HierarchyPolicy = whole[path]
+    return policy
 
 
-def policy_of(skill: Skill, policies: Mapping[str, Policy]) -> Policy:
-    """Return a skill's policy; assembled where the skill is a hierarchy."""
-    inner = inner_of(skill)
-    return policies[skill.name] if inner is None else assembled(inner, below(policies, skill.name))
+def policy_at(roles: Roles, policies: Mapping[str, Policy], path: str) -> Policy:
+    """Return the policy of the skill at ``path``; assembled where the skill is a hierarchy."""
+    return assembled(roles, policies, path) if path in roles.levels else policies[path]
 
 
-def can_act(skill: Skill, policies: Mapping[str, Policy]) -> bool:
-    """Return True if a skill, or every part of a hierarchy, has a policy already."""
-    if (inner := inner_of(skill)) is None:
-        return skill.name in policies
-    inside = below(policies, skill.name)
-    needed = [SELECTOR, *([CRITIC] if inner.together.interrupt else [])]
-    return all(name in inside for name in needed) and all(can_act(s, inside) for s in inner.skills)
+def can_act(roles: Roles, path: str, policies: Mapping[str, Policy]) -> bool:
+    """Return True if the skill at ``path``, or every part of a hierarchy, has a policy already."""
+    if path not in roles.levels:
+        return path in policies
+    parts = [
+        role.path
+        for role in roles.below(path)
+        if role.path not in roles.levels and (role.kind != "critic" or role.margin is not None)
+    ]
+    return all(part in policies for part in parts)
 
 
-def learning_set(declared: Declaration, policies: Mapping[str, Policy]) -> SkillSet:
-    """Return the skills for learning together: without a policy where a skill learns."""
+def parts_of(roles: Roles, policy: HierarchyPolicy) -> dict[str, Policy]:
+    """Return the policies of all parts of a hierarchy's policy, and the policy itself, by path."""
+    parts: dict[str, Policy] = {"": policy}
+    for level in roles.levels.values():
+        whole = parts[level.path]
+        assert isinstance(whole, HierarchyPolicy)
+        parts[level.selector_path] = whole.selector
+        interruption = whole.skills.interruption
+        if interruption is not None and interruption.critic is not None:
+            parts[level.critic_path] = interruption.critic
+        by_name = dict(zip(whole.labels, whole.skills.policies, strict=True))
+        parts |= {path: by_name[skill.name] for path, skill in level.skills.items()}
+    return parts
 
-    def ready_part(skill: Skill) -> Any:
-        if skill.policy is None:
-            return None
-        if (inner := inner_of(skill)) is None:
-            return policies[skill.name]
-        inside = below(policies, skill.name)
-        selector = inside[SELECTOR] if inner.ready_selector is not None else None
-        return UntrainedHierarchy(learning_set(inner, inside), selector, learning_guide(inner))
 
-    return declared.skill_set([ready_part(s) for s in declared.skills])
+def learning_set(roles: Roles, level: Level, policies: Mapping[str, Policy]) -> SkillSet:
+    """Return the skills of a level for learning together: without a policy where one learns."""
+    parts: dict[str, Any] = {
+        role.path: None if role.config is not None else policies[role.path]
+        for role in roles.below(level.path)
+        if role.kind == "skill" and role.path not in roles.levels
+    }
+    _, *inside = roles.levels_from(level.path)
+    for inner in reversed(inside):
+        selector = policies[inner.selector_path] if inner.ready_selector is not None else None
+        guide = learning_guide(roles, inner)
+        parts[inner.path] = UntrainedHierarchy(inner.skill_set(parts), selector, guide)
+    return level.skill_set(parts)

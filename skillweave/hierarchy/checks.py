@@ -1,14 +1,19 @@
-"""Checks of a declared hierarchy's fields; the messages name the skill and the field."""
+"""Checks of a declared hierarchy: its skills, the settings of each level, and nesting."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
-from skillweave.algorithms.config import AlgorithmSettings
+from skillweave.algorithms.config import PPO, AlgorithmSettings
 from skillweave.collecting.lengths import Lengths
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.hierarchy.nesting import Nestable, inner_of
+from skillweave.hierarchy.roles import Level, Nestable, Roles
+from skillweave.hierarchy.settings import Guide
 from skillweave.messages import short
+from skillweave.paths import name_of
+from skillweave.selectors import Automaton
 from skillweave.settings import fitted
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.training.stage import Target, target_of
@@ -32,7 +37,8 @@ def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ..
         skill.validate()
         fitted(AlgorithmSettings | None, skill.algorithm, f"skill {skill.name!r}: algorithm")
         check_target(skill)
-        if inner_of(skill) is None and ready_policy(skill) is not None:  # raises if it cannot act
+        inside = isinstance(skill.policy, Nestable)
+        if not inside and ready_policy(skill) is not None:  # raises if it cannot act
             _check_untrained(skill)
     names = [s.name for s in skills]
     for name in names:
@@ -103,16 +109,116 @@ def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
     return tuple(reflexes)
 
 
-def check_calls(call_steps: int | Lengths | None, skills: Sequence[Skill]) -> None:
-    """Raise a DeclarationError where calls of skills would never end."""
-    if call_steps is not None:
+def check_level(level: Level) -> None:
+    """Raise a DeclarationError where the settings of a hierarchy do not fit together."""
+    _check_selection(level)
+    _check_calls(level)
+
+
+def _check_selection(level: Level) -> None:
+    """Raise a DeclarationError where selector, guide and way of learning do not fit together."""
+    if level.ready_selector is None:
+        if level.guide is not None:
+            _check_guide(level, level.guide)
         return
-    for skill in skills:
+    refused = {
+        "selection.target_return is given": level.selection.target_return is not None,
+        "together.interrupt is True": level.together.interrupt,
+        "call_steps are Lengths": isinstance(level.call_steps, Lengths),
+        "a guide is given": level.guide is not None,
+    }
+    for setting, is_set in refused.items():
+        if is_set:
+            raise DeclarationError(f"{setting}, but the selector is ready: it does not learn")
+
+
+def _check_guide(level: Level, guide: Guide) -> None:
+    """Raise a DeclarationError where a guide could not guide."""
+    _ = level.ready_guide  # raises if one of its skills does not exist
+    learns_by = type(level.selector).__name__
+    if guide.target_kl is not None and not isinstance(level.selector, PPO):
+        raise DeclarationError(
+            f"the guide's target_kl is {guide.target_kl:g}, but the selector learns by "
+            f"{learns_by}: only PPO can be kept near a guide"
+        )
+    if not guide.restrict or isinstance(guide.selector, Automaton):
+        pass
+    elif not isinstance(level.call_steps, Lengths):
+        raise DeclarationError(
+            "the guide names one skill at each decision, so a selector that it restricts has "
+            "nothing to choose: write Guide(..., restrict=False, target_kl=0.1), or let the "
+            "selector choose lengths, or give an Automaton whose states have several skills"
+        )
+    elif not isinstance(level.selector, PPO):
+        raise DeclarationError(
+            f"a selector that learns by {learns_by} needs the "
+            "skills allowed next, which a function or a tree returns only at decisions: give an "
+            "Automaton, or use PPO"
+        )
+    if guide.restrict and level.together.interrupt:
+        raise DeclarationError(
+            "together.interrupt is True, but the guide restricts which skill may be called "
+            "instead: give one of them"
+        )
+
+
+def _check_calls(level: Level) -> None:
+    """Raise a DeclarationError where calls of skills would never end."""
+    if level.call_steps is not None:
+        return
+    for skill in level.skills.values():
         if not (skill.max_steps or skill.call_steps or skill.defines("termination")):
             raise DeclarationError(
                 f"call_steps is None, but skill {skill.name!r} never ends by itself: give it "
                 "max_steps or termination()"
             )
+
+
+_ELSEWHERE = {
+    "algorithm": "selector=",
+    "steps": "steps=",
+    "target_return": "selection=Selection(target_return=...)",
+    "target_success": "selection=Selection(target_return=...)",
+}
+"""Attributes of a skill that a hierarchy sets itself, and the argument that sets them."""
+
+
+def check_nested(roles: Roles) -> None:
+    """Raise a DeclarationError where a hierarchy cannot be a skill of another one.
+
+    Afterwards messages call every skill by its path.
+    """
+    for path, level in roles.levels.items():
+        if path:
+            _check_same_env(name_of(path), level.spec, roles.spec)
+    for path, skill in roles.skills.items():
+        skill._path = path
+        if path not in roles.levels:
+            continue
+        if isinstance(getattr(type(skill), "policy", None), property):
+            raise DeclarationError(
+                f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
+                "attribute"
+            )
+        for field, where in _ELSEWHERE.items():
+            if getattr(skill, field) is not None:
+                raise DeclarationError(
+                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give the "
+                    f"hierarchy {where}"
+                )
+
+
+def _check_same_env(name: str, spec: EnvSpec, other: EnvSpec) -> None:
+    """Raise a DeclarationError where the hierarchy ``name`` is on another environment."""
+    # The outermost hierarchy sets the number of processes for all.
+    if replace(spec, workers=None) == replace(other, workers=None):
+        return
+    same = spec.name == other.name
+    mine, theirs = (short(x) if same else x.name for x in (spec, other))
+    raise DeclarationError(
+        f"{name}: this hierarchy is a skill of another one, so both act in the same "
+        f"environment; but it is declared on {mine}, and the other on {theirs}"
+    )
 
 
 def check_target(skill: Skill) -> Target | None:

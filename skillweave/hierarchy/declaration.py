@@ -2,44 +2,40 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
-
-import gymnasium as gym
+from dataclasses import dataclass, field, replace
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
 from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.errors import DeclarationError
-from skillweave.hierarchy.budgets import budgets_of, scale_budgets
-from skillweave.hierarchy.checks import check_calls, checked_reflexes, checked_skills
-from skillweave.hierarchy.fitting import check_settings, fitted_policies, fitted_selectors
-from skillweave.hierarchy.guidance import check_selection
-from skillweave.hierarchy.nesting import (
-    Nestable,
-    check_ends,
+from skillweave.hierarchy.checks import (
+    check_level,
     check_nested,
-    every_skill,
-    inner_hierarchies,
-    inner_of,
+    checked_reflexes,
+    checked_skills,
 )
+from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_selectors
+from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
+from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
 from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
-from skillweave.selectors import ReadySelector, ready_selector
+from skillweave.paths import AGENT, CRITIC, SELECTOR, join
+from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
 from skillweave.skills import Reflex, Skill
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import EnvValue, check_env
 from skillweave.training.defaults import TrainDefaults
-from skillweave.training.plain_agent import AGENT, PlainAgent
-from skillweave.training.stage import CRITIC, SELECTOR, TOGETHER, Together
-from skillweave.types import Policy
+from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.stage import TOGETHER, Stage, Together
 
+D = TypeVar("D", bound="Declaration")
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
 CallSteps = Annotated[
@@ -99,6 +95,8 @@ class Declaration(Nestable):
     """Values for arguments of ``train`` that its caller leaves out."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
+    _caller: ClassVar[Caller] = "hierarchy"
+    """The entry point in lines of Python that messages print."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
 
@@ -115,32 +113,37 @@ class Declaration(Nestable):
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
         check_fields(self)
-        check_selection(self)
-        check_calls(self.call_steps, self.skills)
-        check_ends(self)
-        for _, inner in inner_hierarchies(self.skills):
-            inner.validate()
-        check_nested(self)  # last: messages then call every skill by its path
+        check_level(self._level("", None))
+        hierarchies_of(self)  # raises where one contains itself
+        for skill in self.skills:
+            if isinstance(skill.policy, Declaration):
+                skill.policy.validate()
+        check_nested(roles_of(self))  # last: messages then call every skill by its path
+
+    def _level(self, path: str, as_skill: Skill | None) -> Level:
+        """Return the settings of this hierarchy, without those of hierarchies below."""
+        return Level(
+            path=path,
+            as_skill=as_skill,
+            spec=self.spec,
+            skills={join(path, skill.name): skill for skill in self.skills},
+            call_steps=self.call_steps,
+            steps=self.steps,
+            learn=self.learn,
+            algorithm=self.algorithm,
+            selector=self.selector,
+            reflexes=tuple(self.reflexes),
+            apart=self.apart,
+            together=self.together,
+            selection=self.selection,
+            guide=self.guide,
+            flat=self.train_defaults.flat,
+        )
 
     @property
     def spec(self) -> EnvSpec:
         """The environment, fully specified."""
         return spec_of(self)
-
-    @property
-    def is_data(self) -> bool:
-        """True if acting needs none of the user's Python code, so a saved run is complete."""
-        code = any(s.defines("termination") or s.defines("initiation") for s in self.skills)
-        plain = (inner.is_data if (inner := inner_of(s)) else s.policy is None for s in self.skills)
-        ready = self.ready_selector is not None or not all(plain)
-        functions = bool(self.reflexes) or self.guide is not None
-        return not code and not ready and not functions and self.spec.is_data
-
-    @property
-    def trains_from_data(self) -> bool:
-        """True if training, too, needs none of the user's Python code."""
-        code = any(s.defines(m) for _, s in every_skill(self.skills) for m in s.methods)
-        return self.is_data and self.spec.engine == "auto" and not code
 
     def skill(self, name: str) -> Skill:
         """Return the skill of this ``name``, or path.
@@ -148,56 +151,23 @@ class Declaration(Nestable):
         Raises:
             DeclarationError: no skill has that name; the message lists the names.
         """
-        skills = dict(every_skill(self.skills))
+        skills = roles_of(self).skills
         if not isinstance(name, str) or name not in skills:
             raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(skills)}")
         return skills[name]
 
+    def stages(self) -> list[Stage]:
+        """Return all stages of training, in their order."""
+        return stages_of(roles_of(self))
+
     def budgets(self) -> dict[str, int]:
         """Return the training steps of each stage, by its path."""
-        return budgets_of(self)
-
-    @property
-    def choices(self) -> int:
-        """Number of a selector's choices: skills, times lengths if these are chosen, too."""
-        lengths = self.call_steps.steps if isinstance(self.call_steps, Lengths) else (0,)
-        return len(self.skills) * len(lengths)
-
-    def chooses_from(self, path: str, actions: gym.Space[Any]) -> gym.Space[Any]:
-        """Return the action space of a selector, critic or skill at ``path``.
-
-        Args:
-            actions: the environment's action space, on which skills act.
-        """
-        node, _, name = path.rpartition("/")
-        if name not in (SELECTOR, CRITIC):
-            return actions
-        inner = inner_of(self.skill(node)) if node else self
-        assert inner is not None
-        return gym.spaces.Discrete(inner.choices if name == SELECTOR else len(inner.skills))
+        return budgets_of(roles_of(self))
 
     @property
     def total_steps(self) -> int:
         """All training steps of skills and selector: the flat baseline's budget."""
         return sum(self.budgets().values())
-
-    @property
-    def any_skill_learns(self) -> bool:
-        """True if a skill learns, or a part of a skill that is a hierarchy."""
-        hierarchies = (inner_of(s) for s in self.skills)
-        return any(s.policy is None for s in self.skills) or any(
-            h is not None and (h.ready_selector is None or h.any_skill_learns) for h in hierarchies
-        )
-
-    @property
-    def learns_apart(self) -> bool:
-        """True if a stage trains a skill or the selector apart."""
-        return self.learn != "together" or not self.any_skill_learns
-
-    @property
-    def learns_together(self) -> bool:
-        """True if a stage trains all together."""
-        return self.learn != "apart" and self.any_skill_learns
 
     def scale(self, factor: float) -> None:
         """Multiply every training budget by ``factor``, in place.
@@ -207,7 +177,21 @@ class Declaration(Nestable):
         """
         if not 0.0 < factor < float("inf"):
             raise DeclarationError(f"scale is {factor}; it must be positive and finite")
-        scale_budgets(self, factor)
+        for path, hierarchy in hierarchies_of(self).items():
+            for skill in hierarchy.skills:
+                if skill.policy is None:
+                    skill.steps = _scaled(skill.steps, factor)
+            # A hierarchy below without its own total shares the outer one.
+            steps = hierarchy.steps or (None if path else DEFAULT_STEPS)
+            hierarchy.steps = _scaled(steps, factor)
+            hierarchy.apart = replace(
+                hierarchy.apart,
+                skill_steps=_scaled(hierarchy.apart.skill_steps, factor),
+                selector_steps=_scaled(hierarchy.apart.selector_steps, factor),
+            )
+            hierarchy.together = replace(
+                hierarchy.together, steps=_scaled(hierarchy.together.steps, factor)
+            )
 
     def plain_agent(self, algorithm: AlgorithmConfig | None = None) -> PlainAgent:
         """Return the flat baseline: one agent on the task itself, without skills and reflexes.
@@ -225,20 +209,6 @@ class Declaration(Nestable):
         config = algorithm or self.train_defaults.flat or seeing_all(self.algorithm)
         return PlainAgent(self.env, config, steps, train_defaults=self.train_defaults)
 
-    def skill_set(
-        self, policies: Sequence[Policy], skills: Sequence[Skill] | None = None
-    ) -> SkillSet:
-        """Return the ``skills`` (None: all) with their ``policies``, ready to be called."""
-        return SkillSet(
-            tuple(self.skills if skills is None else skills),
-            tuple(policies),
-            tuple(self.reflexes),
-            self.call_steps,
-            self.selection.greedy_skills is not False,
-            self.selection.call_cost,
-            greedy_selector=self.selection.greedy_selector is not False,
-        )
-
     def check_spaces(self) -> Spaces:
         """Make the environment once, and return its spaces.
 
@@ -248,25 +218,35 @@ class Declaration(Nestable):
         spaces = self.spec.read_spaces()
         obs_codec(spaces.observation)
         action_codec(spaces.action)
-        check_settings(self, spaces)
-        fitted_policies(self, spaces)
-        fitted_selectors(self, spaces.observation)
+        roles = roles_of(self)
+        check_settings(roles)
+        ready_policies(roles)
+        ready_selectors(roles)
         return spaces
 
-    @property
-    def ready_selector(self) -> ReadySelector | None:
-        """The ready selector; None: the selector is trained."""
-        return ready_selector(self.selector, tuple(s.name for s in self.skills))
 
-    def ready_selectors(self) -> dict[str, Policy]:
-        """Return the ready selectors, by path, on the environment's observations."""
-        hierarchies = (self, *(inner_of(s) for _, s in every_skill(self.skills)))
-        if all(h is None or h.ready_selector is None for h in hierarchies):
-            return {}
-        return fitted_selectors(self, self.spec.spaces.observation)
+def _scaled(steps: int | None, factor: float) -> int | None:
+    return None if steps is None else max(1, round(steps * factor))
 
-    def ready_policies(self) -> dict[str, Policy]:
-        """Return the ready policies of skills, by path, on the environment's spaces."""
-        if all(s.policy is None for s in self.skills):
-            return {}
-        return fitted_policies(self, self.spec.spaces)
+
+def with_roles(declared: D, roles: Roles) -> D:
+    """Return a copy of a hierarchy and of those below it, with the settings of a table of it.
+
+    The skills are copies, too.
+    """
+    copies: dict[str, D] = {}
+    for path, hierarchy in reversed(hierarchies_of(declared).items()):
+        level = roles.levels[path]
+        skills = {skill_path: copy.copy(skill) for skill_path, skill in level.skills.items()}
+        for skill_path, skill in skills.items():
+            if skill_path in copies:
+                skill.policy = copies[skill_path]
+        copies[path] = whole = copy.copy(hierarchy)
+        whole.skills = tuple(skills.values())
+        whole.call_steps = level.call_steps
+        whole.learn = level.learn
+        whole.apart = level.apart
+        whole.together = level.together
+        whole.selection = level.selection
+        whole.guide = level.guide
+    return copies[""]

@@ -1,80 +1,113 @@
-"""Checks and conversions that fit a declared hierarchy to its environment."""
+"""Fit a hierarchy to its environment: algorithms, reflexes, and all that is ready to act."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any, cast
 
 import gymnasium as gym
 
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
-from skillweave.envs.make import Spaces
-from skillweave.hierarchy.guidance import fitted_guide
-from skillweave.hierarchy.nesting import every_skill, inner_hierarchies, inner_of
-from skillweave.skills import path_of, ready_policy
+from skillweave.collecting.guide import ActiveGuide
+from skillweave.hierarchy.roles import Level, Roles
+from skillweave.paths import join
+from skillweave.selectors import ReadySelector
+from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted
 from skillweave.training.checks import check_rollout
-from skillweave.training.stage import SELECTOR
+from skillweave.training.role import Role
 from skillweave.types import Policy
 
-if TYPE_CHECKING:
-    from skillweave.hierarchy.declaration import Declaration
+
+def check_settings(roles: Roles) -> None:
+    """Raise a DeclarationError where algorithms, reflexes or guides do not fit the environment."""
+    for level in roles.levels.values():
+        for path in level.skills:
+            _check_learner(roles[path], f"skill {path!r}: ")
+        _check_learner(roles[level.selector_path], f"{level.selector_path}: ")
+        spaces = roles.spec.spaces
+        if level.flat is not None:
+            check_spaces(level.flat, spaces.action, "flat: ")
+            read_by(level.flat, spaces.observation, "flat: ")
+        of_skills = (skill.algorithm for skill in level.skills.values())
+        for config in (level.algorithm, level.selector, level.flat, *of_skills):
+            if isinstance(config, AlgorithmConfig):
+                check_rollout(config, spaces.observation)
+        for reflex in level.reflexes:
+            reflex.check(spaces.action)
+        if level.guide is not None:
+            learning_guide(roles, level)
 
 
-def check_settings(declared: Declaration, spaces: Spaces, path: str = "") -> None:
-    """Raise a DeclarationError where algorithms or reflexes do not fit an environment.
+def _check_learner(role: Role, where: str) -> None:
+    """Raise a DeclarationError where the algorithm of a role does not fit its spaces."""
+    if role.config is not None:
+        check_spaces(role.config, role.action_space, where)
+        read_by(role.config, role.observation_space, where)
 
-    Args:
-        path: of the hierarchy, ``inner/`` for example.
+
+def ready_policies(roles: Roles) -> dict[str, Policy]:
+    """Return the ready policies of skills, by path, fitted to their spaces.
+
+    Raises:
+        PolicyError: a policy does not fit.
     """
-    space = spaces.action
-    for skill in declared.skills:
-        if skill.policy is None:
-            config = skill.algorithm or declared.algorithm
-            where = f"skill {path_of(skill)!r}: "
-            check_spaces(config, space, where)
-            read_by(config, spaces.observation, where)
-    if isinstance(declared.selector, AlgorithmConfig):
-        choices = gym.spaces.Discrete(declared.choices)
-        check_spaces(declared.selector, choices, f"{path}{SELECTOR}: ")
-        read_by(declared.selector, spaces.observation, f"{path}{SELECTOR}: ")
-    if declared.train_defaults.flat is not None:
-        check_spaces(declared.train_defaults.flat, space, "flat: ")
-        read_by(declared.train_defaults.flat, spaces.observation, "flat: ")
-    of_skills = (s.algorithm for s in declared.skills)
-    for config in (
-        declared.algorithm,
-        declared.selector,
-        declared.train_defaults.flat,
-        *of_skills,
-    ):
-        if isinstance(config, AlgorithmConfig):
-            check_rollout(config, spaces.observation)
-    for reflex in declared.reflexes:
-        reflex.check(space)
-    fitted_guide(declared, spaces.observation, path)
-    for skill, inner in inner_hierarchies(declared.skills):
-        check_settings(inner, spaces, f"{path}{skill.name}/")
+    policies: dict[str, Policy] = {}
+    for path, skill in roles.skills.items():
+        if path not in roles.levels and (policy := ready_policy(skill)) is not None:
+            policies[path] = _fitted(policy, roles[path], f"skill {path!r}")
+    return policies
 
 
-def fitted_policies(declared: Declaration, spaces: Spaces) -> dict[str, Policy]:
-    """Return the ready policies of skills, by path, on the environment's spaces."""
+def ready_selectors(roles: Roles) -> dict[str, Policy]:
+    """Return the ready selectors, by path, fitted to their spaces.
+
+    Raises:
+        PolicyError: a selector does not fit, or fails.
+    """
     return {
-        path: fitted(policy, *spaces, f"skill {path!r}", declared.spec.name)
-        for path, skill in every_skill(declared.skills)
-        if inner_of(skill) is None and (policy := ready_policy(skill)) is not None
+        level.selector_path: _fitted(ready, roles[level.selector_path], level.selector_path)
+        for level in roles.levels.values()
+        if (ready := level.ready_selector) is not None
     }
 
 
-def fitted_selectors(
-    declared: Declaration, observation_space: gym.Space[Any], path: str = ""
-) -> dict[str, Policy]:
-    """Return the ready selectors, by path, on these observations."""
-    selectors: dict[str, Policy] = {}
-    if (ready := declared.ready_selector) is not None:
-        choices = gym.spaces.Discrete(len(declared.skills))
-        name = path + SELECTOR
-        selectors[name] = fitted(ready, observation_space, choices, name, declared.spec.name)
-    for skill, inner in inner_hierarchies(declared.skills):
-        selectors |= fitted_selectors(inner, observation_space, f"{path}{skill.name}/")
-    return selectors
+def _fitted(policy: Policy, role: Role, who: str) -> Policy:
+    return fitted(policy, role.observation_space, role.action_space, who, role.spec.name)
+
+
+def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:
+    """Return the guide of a selector that learns, on these observations; None: it has none.
+
+    Raises:
+        SkillError: the guide fails on these observations.
+    """
+    if level.guide is None or (guide := level.ready_guide) is None:
+        return None
+    choices, who = gym.spaces.Discrete(len(level.skills)), join(level.path, "guide")
+    selector = fitted(guide, observation_space, choices, who, level.spec.name)
+    tells = level.guide.target_kl is not None
+    return ActiveGuide(cast(ReadySelector, selector), level.guide.restrict, tells)
+
+
+def restricting_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:
+    """Return the guide that restricts a selector after its training; None: it has none."""
+    guide = fitted_guide(level, observation_space)
+    return replace(guide, tells=False) if guide is not None and guide.restricts else None
+
+
+def learning_guide(roles: Roles, level: Level) -> ActiveGuide | None:
+    """Return the guide of a selector that learns; None: it has none."""
+    if level.guide is None:
+        return None
+    return fitted_guide(level, roles[level.selector_path].observation_space)
+
+
+def active_guide(roles: Roles, level: Level) -> ActiveGuide | None:
+    """Return the selector that guides the learning one or decides in its place; None: no guide."""
+    if (ready := level.ready_selector) is None:
+        return learning_guide(roles, level)
+    role = roles[level.selector_path]
+    selector = _fitted(ready, role, role.path)
+    return ActiveGuide(cast(ReadySelector, selector), decides=True)

@@ -1,4 +1,7 @@
-"""A hierarchy's schedule: every skill apart, then the selector; or all together; or both."""
+"""A hierarchy's schedule: every skill apart, then the selector; or all together; or both.
+
+Also the budgets of its stages: a hierarchy's total, split by its way of learning.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,14 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
+from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError
-from skillweave.hierarchy.assembly import can_act, learning_set, policy_of
+from skillweave.hierarchy.assembly import can_act, learning_set, policy_at
 from skillweave.hierarchy.checks import check_target
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import active_guide
-from skillweave.hierarchy.nesting import below, every_hierarchy, inner_hierarchies, inner_of
+from skillweave.hierarchy.fitting import active_guide
+from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
-from skillweave.skills import Skill
+from skillweave.paths import SELECTOR, decides, join
 from skillweave.training.learning_task import (
     JointTask,
     LearningTask,
@@ -22,163 +25,173 @@ from skillweave.training.learning_task import (
     selector_task,
     skill_task,
 )
-from skillweave.training.stage import (
-    CRITIC,
-    SELECTOR,
-    TOGETHER,
-    Policies,
-    Stage,
-    Together,
-    decides,
-    target_of,
-)
+from skillweave.training.stage import TOGETHER, Policies, Stage, Together, target_of
+
+DEFAULT_STEPS = 1_000_000
+"""Training steps of a hierarchy that sets none."""
+SELECTOR_SHARES = 2
+"""Shares of the steps that a selector takes apart, where a skill takes one."""
 
 
-def stages_of(
-    declaration: Declaration,
-    as_skill: Skill | None = None,
-    budgets: Mapping[str, int] | None = None,
-) -> list[Stage]:
-    """Return all stages in their order: hierarchies below, skills, selector, all together.
+def budgets_of(roles: Roles) -> dict[str, int]:
+    """Return the training steps of each stage, by its path, in the order of training."""
+    totals = {"": roles.outermost.steps or DEFAULT_STEPS}
+    budgets: dict[str, int] = {}
+    for path, level in roles.levels.items():
+        if path in totals and roles.learns_apart(level):
+            share = _share(roles, level, totals[path])
+            for inner in level.skills:
+                if inner in roles.levels:
+                    part = round(share * _shares(roles, inner))
+                    totals[inner] = roles.levels[inner].steps or part or DEFAULT_STEPS
+    for level in roles.trained:
+        budgets |= _level_budgets(roles, level, totals[level.path])
+    return budgets
+
+
+def _share(roles: Roles, level: Level, total: int) -> float:
+    """Return the training steps of a skill that learns apart and sets none, of a level's total."""
+    apart = total // 2 if roles.learns_together(level) else total
+    return apart / max(1, _shares(roles, level.path))
+
+
+def _shares(roles: Roles, level: str) -> int:
+    """Return the shares of all in a level: one for each skill that learns, two for a selector."""
+    learners = [role for role in roles.below(level) if role.config is not None]
+    return sum(SELECTOR_SHARES if role.kind == "selector" else 1 for role in learners)
+
+
+def _level_budgets(roles: Roles, level: Level, total: int) -> dict[str, int]:
+    """Return the training steps of the stages of one level.
 
     Args:
-        as_skill: the hierarchy as a skill of another one; None: it is the outermost.
-        budgets: training steps by stage; None: the hierarchy's own.
+        total: its training steps in all, those of levels below included.
     """
-    budgets = declaration.budgets() if budgets is None else budgets
-    of_inner: list[Stage] = []
-    if declaration.learns_apart:
-        for skill, inner in inner_hierarchies(declaration.skills):
-            stages = stages_of(inner, skill, below(budgets, skill.name))
-            of_inner += [stage.inside(skill.name) for stage in stages]
-    return of_inner + own_stages(declaration, as_skill, budgets)
+    budgets: dict[str, int] = {}
+    if roles.learns_apart(level):
+        share = _share(roles, level, total)
+        for path, skill in level.skills.items():
+            if roles[path].config is not None:
+                budgets[path] = skill.steps or level.apart.skill_steps or max(1, round(share))
+        if roles[level.selector_path].config is not None:
+            part = round(SELECTOR_SHARES * share)
+            budgets[level.selector_path] = level.apart.selector_steps or max(1, part)
+    if roles.learns_together(level):
+        part = total - total // 2 if roles.learns_apart(level) else total
+        budgets[join(level.path, TOGETHER)] = level.together.steps or part
+    return budgets
 
 
-def own_stages(
-    declaration: Declaration,
-    as_skill: Skill | None = None,
-    budgets: Mapping[str, int] | None = None,
-) -> list[Stage]:
-    """Return the stages of a hierarchy without the stages of hierarchies below."""
-    budgets = declaration.budgets() if budgets is None else budgets
-    apart = _apart(declaration, as_skill, budgets) if declaration.learns_apart else []
-    if not declaration.learns_together:
+def stages_of(roles: Roles) -> list[Stage]:
+    """Return all stages in their order: hierarchies below, skills, selector, all together."""
+    budgets = budgets_of(roles)
+    return [stage for level in roles.trained for stage in level_stages(roles, level, budgets)]
+
+
+def level_stages(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list[Stage]:
+    """Return the stages of a level, without those of levels below.
+
+    Args:
+        budgets: training steps by stage.
+    """
+    apart = _apart(roles, level, budgets) if roles.learns_apart(level) else []
+    if not roles.learns_together(level):
         return apart
-    together = _together(declaration, as_skill, budgets[TOGETHER])
-    if as_skill is None or _plays_alone(declaration):  # else its episodes cannot be evaluated
-        left_open = any(open_choices(declaration))
+    together = _together(roles, level, budgets[join(level.path, TOGETHER)])
+    # The episodes of a hierarchy that cannot play alone cannot be evaluated.
+    if level.as_skill is None or _plays_alone(roles, level):
+        left_open = any(open_choices(roles, level))
         together = replace(together, compared=bool(apart), greedy_judged=left_open)
     return [*apart, together]
 
 
-def open_choices(declaration: Declaration) -> tuple[bool, bool]:
+def open_choices(roles: Roles, level: Level) -> tuple[bool, bool]:
     """Return two flags: skills, and trained selectors, are undeclared as greedy or sampling."""
-    hierarchies = [hierarchy for _, hierarchy in every_hierarchy(declaration)]
-    trained = any(h.ready_selector is None for h in hierarchies)
+    levels = roles.levels_from(level.path)
+    trained = any(x.ready_selector is None for x in levels)
     return (
-        any(h.selection.greedy_skills is None for h in hierarchies),
-        trained and any(h.selection.greedy_selector is None for h in hierarchies),
+        any(x.selection.greedy_skills is None for x in levels),
+        trained and any(x.selection.greedy_selector is None for x in levels),
     )
 
 
-def _together(declaration: Declaration, as_skill: Skill | None, budget: int) -> Stage:
-    """Return the stage in which skills and selectors learn from the same steps."""
-    settings = declaration.together
+def _together(roles: Roles, level: Level, budget: int) -> Stage:
+    """Return the stage in which skills and selectors of a level learn from the same steps."""
+    settings = level.together
 
     def learning_task(policies: Policies) -> JointTask:
-        return joint_task(
-            declaration.spec,
-            learning_set(declaration, policies),
-            active_guide(declaration),
-            as_skill,
-            _margins(declaration),
-            _guide_kl(declaration),
-        )
+        return _joint_task(roles, level, learning_set(roles, level, policies))
 
-    ready = declaration.ready_selector is not None
-    config = declaration.algorithm if ready else _with_epsilon(declaration.selector, settings)
-    others = _learners(declaration, settings)
-    task_weights = _task_weights(declaration)
+    ready = level.ready_selector is not None
+    config = level.algorithm if ready else _with_epsilon(level.selector, settings)
+    beside = _beside_selector(roles, level)
+    task_weights = _task_weights(roles, level)
     follows_task = any(
-        task_weights.get(name, settings.task_weight)
-        for name, algorithm in others.items()
-        if isinstance(algorithm, OnPolicy) and not decides(name)
+        task_weights.get(path, settings.task_weight)
+        for path, algorithm in beside.items()
+        if isinstance(algorithm, OnPolicy) and not decides(path)
     )
     if settings.interrupt or follows_task:
-        others |= _critic(config, settings.interrupt)
+        beside[level.critic_path] = _critic(config, settings.interrupt)
     return Stage(
-        TOGETHER,
+        join(level.path, TOGETHER),
         "together",
         config,
         budget,
         learning_task,
-        target=target_of(declaration.selection.target_return, None, TOGETHER),
-        beside=others,
+        target=target_of(level.selection.target_return, None, TOGETHER),
+        beside=beside,
         together=settings,
         task_weights=task_weights,
         ready=ready,
-        guide_kl=None if declaration.guide is None else declaration.guide.target_kl,
+        guide_kl=roles[level.selector_path].guide_kl,
+        level=level.path,
     )
 
 
-def _plays_alone(declaration: Declaration) -> bool:
-    """Return True if a hierarchy can play whole episodes: a skill may start everywhere."""
-    for skill in declaration.skills:
-        inner = inner_of(skill)
-        if not skill.defines("initiation") and (inner is None or _plays_alone(inner)):
-            return True
-    return False
+def _joint_task(roles: Roles, level: Level, skills: SkillSet) -> JointTask:
+    """Return the task in which the selector of a level calls ``skills``, which may learn, too."""
+    below = {role.path: role for role in roles.below(level.path)}
+    guide = active_guide(roles, level)
+    return joint_task(level.selector_path, below, skills, guide, level.as_skill)
 
 
-def _learners(declaration: Declaration, settings: Together) -> dict[str, AlgorithmConfig]:
-    """Return the algorithms of all learners below the selector, by path, without its critic."""
-    learners: dict[str, AlgorithmConfig] = {}
-    for skill in declaration.skills:
-        if skill.policy is None:
-            learners[skill.name] = skill.algorithm or declaration.algorithm
-        if (inner := inner_of(skill)) is None:
+def _plays_alone(roles: Roles, level: Level) -> bool:
+    """Return True if a level can play whole episodes: one of its skills may start everywhere."""
+    return any(
+        not any(skill.defines("initiation") for skill in roles.skills_to(role.path, level.path))
+        for role in roles.below(level.path)
+        if role.kind == "skill" and role.path not in roles.levels
+    )
+
+
+def _beside_selector(roles: Roles, level: Level) -> dict[str, AlgorithmConfig]:
+    """Return the algorithms of all who learn beside the selector of a level, without its critic."""
+    settings = level.together
+    configs: dict[str, AlgorithmConfig] = {}
+    for role in roles.below(level.path):
+        if role.path in (level.selector_path, level.critic_path):
             continue
-        inside = _learners(inner, settings)
-        decider: Any = inner.algorithm
-        if isinstance(inner.selector, AlgorithmConfig):
-            inside[SELECTOR] = decider = _with_epsilon(inner.selector, settings)
-        inside |= _critic(decider, deciding=True) if inner.together.interrupt else {}
-        learners |= {f"{skill.name}/{name}": config for name, config in inside.items()}
-    return learners
+        if role.kind == "critic" and role.margin is not None:
+            inner = roles.levels[role.level]
+            decider = configs.get(inner.selector_path, inner.algorithm)
+            configs[role.path] = _critic(decider, deciding=True)
+        elif role.config is not None:
+            selects = role.kind == "selector"
+            configs[role.path] = _with_epsilon(role.config, settings) if selects else role.config
+    return configs
 
 
-def _task_weights(declaration: Declaration, inherited: float | None = None) -> dict[str, float]:
+def _task_weights(roles: Roles, level: Level) -> dict[str, float]:
     """Return the task's weight of skills that set one, or are in a hierarchy that does, by path."""
     weights: dict[str, float] = {}
-    for skill in declaration.skills:
-        weight = inherited if skill.task_weight is None else skill.task_weight
-        if (inner := inner_of(skill)) is not None:
-            below_it = _task_weights(inner, weight)
-            weights |= {f"{skill.name}/{name}": value for name, value in below_it.items()}
-        elif weight is not None and skill.policy is None:
-            weights[skill.name] = weight
+    for role in roles.below(level.path):
+        if role.kind == "skill" and role.config is not None:
+            way = reversed(roles.skills_to(role.path, level.path))
+            weight = next((s.task_weight for s in way if s.task_weight is not None), None)
+            if weight is not None:
+                weights[role.path] = weight
     return weights
-
-
-def _margins(declaration: Declaration) -> dict[str, float]:
-    """Return the margins of interruption in hierarchies below, by the paths of their critics."""
-    margins: dict[str, float] = {}
-    for skill, inner in inner_hierarchies(declaration.skills):
-        settings = inner.together
-        inside = ({CRITIC: settings.margin} if settings.interrupt else {}) | _margins(inner)
-        margins |= {f"{skill.name}/{name}": margin for name, margin in inside.items()}
-    return margins
-
-
-def _guide_kl(declaration: Declaration) -> dict[str, float]:
-    """Return the target KL of guides in hierarchies below, by the paths of their selectors."""
-    targets: dict[str, float] = {}
-    for skill, inner in inner_hierarchies(declaration.skills):
-        inside = _guide_kl(inner)
-        if inner.guide is not None and inner.guide.target_kl is not None:
-            inside[SELECTOR] = inner.guide.target_kl
-        targets |= {f"{skill.name}/{name}": kl for name, kl in inside.items()}
-    return targets
 
 
 def _with_epsilon(config: Any, settings: Together) -> Any:
@@ -197,7 +210,7 @@ def _with_epsilon(config: Any, settings: Together) -> Any:
     return replace(config, **{name: getattr(settings, name) for name in ("epsilon", *decay)})
 
 
-def _critic(selector: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
+def _critic(selector: Any, deciding: bool) -> SkillCritic:
     """Return the critic of skills; it observes and discounts like ``selector``'s settings."""
     shared = {f: getattr(selector, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(selector, PPO):
@@ -216,57 +229,62 @@ def _critic(selector: Any, deciding: bool) -> dict[str, AlgorithmConfig]:
         shared["network"] = replace(shared["network"], rnn=None)
     elif isinstance(network := getattr(selector, "network", None), Network):
         shared["network"] = Network(planes=network.planes)
-    return {CRITIC: SkillCritic(**shared, normalize_obs=selector.normalize_obs, deciding=deciding)}
+    return SkillCritic(**shared, normalize_obs=selector.normalize_obs, deciding=deciding)
 
 
-def _apart(
-    declaration: Declaration, as_skill: Skill | None, budgets: Mapping[str, int]
-) -> list[Stage]:
+def _apart(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list[Stage]:
     """Return the stages of skills that train, each apart, then of the selector if it does."""
-    apart = declaration.apart
+    stages = [
+        _skill_stage(roles, level, path, budgets[path])
+        for path in level.skills
+        if roles[path].config is not None
+    ]
+    if (config := roles[level.selector_path].config) is None:
+        return stages
+    return [*stages, _selector_stage(roles, level, config, budgets[level.selector_path])]
 
-    def skill_stage(skill: Skill) -> Stage:
-        config = skill.algorithm or declaration.algorithm
-        target = check_target(skill)
 
-        def learning_task(policies: Policies) -> LearningTask:
-            others = [s for s in declaration.skills if can_act(s, policies)]
-            callable_skills = declaration.skill_set(
-                [policy_of(s, policies) for s in others], others
-            )
-            return skill_task(
-                declaration.spec,
-                skill,
-                declaration.reflexes,
-                callable_skills if others else None,
-                apart.start_calls or 0,
-                apart.search_steps,
-                apart.episode_calls,
-            )
+def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
+    """Return the stage in which one skill of a level trains."""
+    role, apart = roles[path], level.apart
+    assert role.config is not None
 
-        return Stage(skill.name, "skill", config, budgets[skill.name], learning_task, target)
+    def learning_task(policies: Policies) -> LearningTask:
+        others = {
+            p: policy_at(roles, policies, p) for p in level.skills if can_act(roles, p, policies)
+        }
+        return skill_task(
+            role,
+            level.reflexes,
+            level.skill_set(others) if others else None,
+            apart.start_calls or 0,
+            apart.search_steps,
+            apart.episode_calls,
+        )
 
-    def selector_calls(policies: Policies) -> LearningTask:
-        skills = declaration.skill_set([policy_of(s, policies) for s in declaration.skills])
-        guide = active_guide(declaration)
-        if declaration.together.interrupt:
-            return joint_task(declaration.spec, skills, guide, as_skill)
-        return selector_task(declaration.spec, skills, guide, as_skill)
+    target = check_target(level.skills[path])
+    return Stage(path, "skill", role.config, budget, learning_task, target, level=level.path)
 
-    skill_stages = [skill_stage(s) for s in declaration.skills if s.policy is None]
-    if not isinstance(config := declaration.selector, AlgorithmConfig):
-        return skill_stages
-    selector = Stage(
-        SELECTOR,
+
+def _selector_stage(roles: Roles, level: Level, config: AlgorithmConfig, budget: int) -> Stage:
+    """Return the stage in which the selector of a level trains over ready skills."""
+    role, interrupts = roles[level.selector_path], level.together.interrupt
+
+    def learning_task(policies: Policies) -> LearningTask:
+        skills = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
+        if interrupts:
+            return _joint_task(roles, level, skills)
+        return selector_task(role, skills, active_guide(roles, level), level.as_skill)
+
+    return Stage(
+        role.path,
         "selector",
         config,
-        budgets[SELECTOR],
-        selector_calls,
-        target_of(declaration.selection.target_return, None, SELECTOR),
-        guide_kl=None if declaration.guide is None else declaration.guide.target_kl,
+        budget,
+        learning_task,
+        target_of(level.selection.target_return, None, SELECTOR),
+        beside={level.critic_path: _critic(config, deciding=True)} if interrupts else {},
+        together=level.together if interrupts else None,
+        guide_kl=role.guide_kl,
+        level=level.path,
     )
-    if declaration.together.interrupt:
-        selector = replace(
-            selector, beside=_critic(config, deciding=True), together=declaration.together
-        )
-    return [*skill_stages, selector]

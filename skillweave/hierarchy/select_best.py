@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from skillweave.hierarchy.assembly import assembled
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.nesting import below, copied, every_hierarchy
+from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
+from skillweave.paths import join, levels_to
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.kept import SAMPLING, kept_words, to_be_judged
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -37,21 +37,18 @@ users expect a greedy one."""
 
 
 def select_best(
-    declaration: Declaration,
+    roles: Roles,
+    level: Level,
     run: RunDirectory,
     listeners: tuple[Listener, ...],
     before: Policies,
     after: Policies,
-    nodes: tuple[str, ...] = (),
 ) -> Policies:
-    """Return the best of a hierarchy's policies before and after learning together.
+    """Return the best of the policies before and after a level has learnt together.
 
     The run records the choice.
-
-    Args:
-        nodes: the names on the way to the hierarchy, where it is a skill of another one.
     """
-    entry = run.stage("/".join((*nodes, TOGETHER)))
+    entry = run.stage(join(level.path, TOGETHER))
     if "kept" not in entry and to_be_judged(entry):
         episodes = _episodes(entry)
         for listener in listeners:
@@ -59,7 +56,7 @@ def select_best(
                 f"{entry['name']}: playing {episodes} episodes of each kind, to decide whether "
                 "skills and selector should be greedy"
             )
-        scores = _scores(declaration, run, before, after, nodes, episodes)
+        scores = _scores(roles, level, run, before, after, episodes)
         means = {name: score.mean for name, score in scores.items()}
         entry["kept"] = means | {"episodes": episodes, "kept": _best(scores)}
         entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
@@ -78,25 +75,24 @@ def _episodes(entry: Mapping[str, Any]) -> int:
 
 
 def _scores(
-    declaration: Declaration,
+    roles: Roles,
+    level: Level,
     run: RunDirectory,
     before: Policies,
     after: Policies,
-    nodes: tuple[str, ...],
     episodes: int,
 ) -> dict[str, Evaluation]:
     """Return the evaluations of all candidates, by name."""
-    entry = run.stage("/".join((*nodes, TOGETHER)))
-    spec, seed = declaration.spec, SEEDS + int(run.manifest["seed"])
+    entry = run.stage(join(level.path, TOGETHER))
+    spec, seed = roles.spec, SEEDS + int(run.manifest["seed"])
     num_envs = entry["algorithm"]["num_envs"]
     max_steps = None
     if not entry["final"].get("length"):
         # No episode has ended, so no policy has learnt from longer ones than these.
         max_steps = max(1, entry["steps"] // num_envs)
-    trained = _inside(after, nodes)
 
-    def score(hierarchy: Declaration, policies: Policies) -> Evaluation:
-        policy = assembled(hierarchy, policies)
+    def score(decided: Roles, policies: Policies) -> Evaluation:
+        policy = assembled(decided, policies, level.path)
         return evaluate(
             policy,
             spec,
@@ -108,10 +104,10 @@ def _scores(
         )
 
     def sampling(name: str) -> Evaluation:
-        return score(with_sampling(declaration, *SAMPLING[name]), trained)
+        return score(with_sampling(roles, *SAMPLING[name]), after)
 
     scores = {"greedy": sampling("greedy")}
-    skills_open, selector_open = open_choices(declaration)
+    skills_open, selector_open = open_choices(roles, level)
     if entry["greedy_judged"] and skills_open:
         scores["skills_sample"] = sampling("skills_sample")
     if entry["greedy_judged"] and selector_open:
@@ -119,7 +115,7 @@ def _scores(
         name = "selector_samples" if better == "greedy" else "both_sample"
         scores[name] = sampling(name)
     if entry["compared"]:
-        scores["before"] = score(resolve_greedy(declaration, run, nodes), _inside(before, nodes))
+        scores["before"] = score(resolve_greedy(roles, run), before)
     return scores
 
 
@@ -135,44 +131,36 @@ def _best(scores: Mapping[str, Evaluation]) -> str:
     return best
 
 
-def resolve_greedy(
-    declaration: Declaration, run: RunDirectory, nodes: tuple[str, ...] = ()
-) -> Declaration:
-    """Return a copy with every choice of greedy or sampling set as the run records it.
-
-    Args:
-        nodes: the names on the way to the hierarchy, where it is a skill of another one.
-    """
-    whole = copied(declaration)
-    for path, hierarchy in every_hierarchy(whole):
-        names = (*nodes, *(path.split("/") if path else ()))
-        _set_sampling(hierarchy, *_sampling(run, names))
-    return whole
+def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:
+    """Return the table with every choice of greedy or sampling set as the run records it."""
+    return roles.changed(lambda level: _with_sampling(level, *_sampling(run, level.path)))
 
 
-def with_sampling(declaration: Declaration, skills: bool, selector: bool) -> Declaration:
-    """Return a copy whose ``skills`` and ``selector`` sample wherever it leaves that open."""
-    whole = copied(declaration)
-    for _, hierarchy in every_hierarchy(whole):
-        _set_sampling(hierarchy, skills, selector)
-    return whole
+def with_sampling(roles: Roles, skills: bool, selector: bool) -> Roles:
+    """Return the table whose ``skills`` and ``selector`` sample wherever this leaves it open."""
+    return roles.changed(lambda level: _with_sampling(level, skills, selector))
 
 
-def _set_sampling(declared: Declaration, skills: bool, selector: bool) -> None:
-    """Set whether skills and selector sample, where a hierarchy leaves that open; in place."""
-    choice = declared.selection
-    declared.selection = replace(
+def _with_sampling(level: Level, skills: bool, selector: bool) -> Level:
+    """Set whether skills and selector sample, where a level leaves that open."""
+    choice = level.selection
+    decided = replace(
         choice,
         greedy_skills=not skills if choice.greedy_skills is None else choice.greedy_skills,
         greedy_selector=not selector if choice.greedy_selector is None else choice.greedy_selector,
     )
+    return replace(level, selection=decided)
 
 
-def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
-    """Return two flags, skills and selector sample, by the latest stage in which all learnt."""
+def _sampling(run: RunDirectory, path: str) -> tuple[bool, bool]:
+    """Return two flags, skills and selector sample, by the outermost stage in which all learnt.
+
+    Args:
+        path: of a level, which may have learnt together with the levels above it.
+    """
     stages: dict[str, Mapping[str, Any]] = {s["name"]: s for s in run.manifest["stages"]}
-    for depth in range(len(names) + 1):
-        entry = stages.get("/".join((*names[:depth], TOGETHER)))
+    for above in levels_to(path):
+        entry = stages.get(join(above, TOGETHER))
         if entry is None or entry["status"] != "done":
             continue
         if "kept" not in entry:
@@ -182,10 +170,3 @@ def _sampling(run: RunDirectory, names: tuple[str, ...]) -> tuple[bool, bool]:
         if (choice := entry["kept"]["kept"]) != "before":
             return SAMPLING[choice]
     return False, False
-
-
-def _inside(policies: Policies, nodes: tuple[str, ...]) -> Policies:
-    """Return the policies of a hierarchy below, by the rest of their paths."""
-    for name in nodes:
-        policies = below(policies, name)
-    return policies

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,108 +16,88 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
-from skillweave.hierarchy.assembly import assembled
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import check_guided, ready_guide
-from skillweave.hierarchy.nesting import every_hierarchy, every_skill, inner_of
+from skillweave.hierarchy.assembly import assembled, parts_of
+from skillweave.hierarchy.fitting import ready_policies, ready_selectors
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.roles import Level, Roles
 from skillweave.messages import short
+from skillweave.paths import AGENT, below, join
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.selectors import ReadySelector
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.spaces import same_space
-from skillweave.training.plain_agent import AGENT, PlainAgent
-from skillweave.training.stage import CRITIC, SELECTOR
 from skillweave.types import Policy
 
 
-def write_weights(path: Path, declaration: Declaration | PlainAgent, policy: Policy) -> None:
-    """Write the weights of skills and selector, or of a plain agent.
+def write_agent(path: Path, spec: EnvSpec, policy: AgentPolicy) -> None:
+    """Write the weights of a plain agent on the environment ``spec``."""
+    weights, description = policy.to_file()
+    write_tensors(path, weights, description | _place(spec))
+
+
+def write_weights(
+    path: Path, roles: Roles, policy: HierarchyPolicy, recipe: str | None = None
+) -> None:
+    """Write the weights of skills and selectors.
 
     Ready policies are written in as far as a run copies them.
+
+    Args:
+        roles: of the policy.
+        recipe: the place of the declaration.
     """
-    place = {"env": declaration.spec.name, "env_kwargs": declaration.spec.json_kwargs}
-    if isinstance(policy, AgentPolicy):
-        weights, description = policy.to_file()
-        write_tensors(path, weights, description | place)
-        return
-    assert isinstance(policy, HierarchyPolicy)
-    assert isinstance(declaration, Declaration)
     tensors: dict[str, Tensor] = {}
-    parts: dict[str, Any] = {}
+    trained: dict[str, Any] = {}
     ready: dict[str, Any] = {}
-    for name, trained, part in _parts_of(declaration, policy):
-        if trained:
+    levels: dict[str, Any] = {}
+    for name, part in parts_of(roles, policy).items():
+        if name in roles.levels:
+            assert isinstance(part, HierarchyPolicy)
+            levels[name] = _calls_header(roles.levels[name], part)
+            continue
+        role = roles[name]
+        if role.config is not None or role.kind == "critic":
             assert isinstance(part, AgentPolicy)
-            weights, parts[name] = part.to_file()
-            tensors |= {f"{name}/{k}": v for k, v in weights.items()}
+            weights, trained[name] = part.to_file()
+            tensors |= {join(name, k): v for k, v in weights.items()}
             continue
         ready[name] = source_of(part)
         if isinstance(part, Foreign) and (content := part.content()) is not None:
-            tensors[f"{name}/content"] = torch.tensor(
+            tensors[join(name, "content")] = torch.tensor(
                 np.frombuffer(content, np.uint8), device="cpu"
             )
-    hierarchies = dict(_hierarchies_of(declaration, policy))
     header = {
         "kind": "hierarchy",
-        "recipe": getattr(declaration, "recipe", None),
-        **place,
-        "skills": [name for name, _ in every_skill(declaration.skills)],
-        **hierarchies.pop(""),
-        "hierarchies": hierarchies,
-        "parts": parts,
+        "recipe": recipe,
+        **_place(roles.spec),
+        "skills": list(roles.skills),
+        **levels.pop(""),
+        "hierarchies": levels,
+        "parts": trained,
         "ready": ready,
     }
     write_tensors(path, tensors, header)
 
 
-def _parts_of(
-    declaration: Declaration, policy: HierarchyPolicy, path: str = ""
-) -> Iterator[tuple[str, bool, Policy]]:
-    """Yield all policies of a hierarchy as (path, trained in it, policy)."""
-    trained = not isinstance(policy.selector, ReadySelector)
-    yield path + SELECTOR, trained, policy.selector
-    interruption = policy.skills.interruption
-    if interruption is not None and interruption.critic is not None:
-        yield path + CRITIC, True, interruption.critic
-    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
-        inner = inner_of(skill)
-        if inner is None:
-            yield path + skill.name, skill.policy is None, of_skill
-        else:
-            assert isinstance(of_skill, HierarchyPolicy)
-            yield from _parts_of(inner, of_skill, f"{path}{skill.name}/")
+def _place(spec: EnvSpec) -> dict[str, Any]:
+    """Return the header entries of an environment."""
+    return {"env": spec.name, "env_kwargs": spec.json_kwargs}
 
 
-def _hierarchies_of(
-    declaration: Declaration, policy: HierarchyPolicy, path: str = ""
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the headers of a hierarchy and of those below it, by path."""
-    yield path, _calls_header(declaration, policy)
-    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
-        if (inner := inner_of(skill)) is not None:
-            assert isinstance(of_skill, HierarchyPolicy)
-            yield from _hierarchies_of(inner, of_skill, f"{path}/{skill.name}".removeprefix("/"))
+def _calls_header(level: Level, policy: HierarchyPolicy) -> dict[str, Any]:
+    """Return the header entries of a level's way to call its skills.
 
-
-def _calls_header(declaration: Declaration, policy: HierarchyPolicy) -> dict[str, Any]:
-    """Return the header entries of a hierarchy's way to call its skills."""
-    guide = _restricting(declaration)
+    Its policy records whether these are greedy, where the level leaves it open.
+    """
+    guide = level.restricting_guide
     return {
-        **calls_to_json(declaration.call_steps),
-        "interrupt": declaration.together.margin if declaration.together.interrupt else None,
+        **calls_to_json(level.call_steps),
+        "interrupt": level.together.margin if level.together.interrupt else None,
         "greedy_skills": policy.skills.greedy,
         "greedy_selector": policy.skills.greedy_selector,
         **({} if guide is None else {"guide": source_of(guide)}),
     }
-
-
-def _restricting(declaration: Declaration) -> ReadySelector | None:
-    """Return the guide that restricts the selector; None: it has none."""
-    guide = declaration.guide
-    return ready_guide(declaration) if guide is not None and guide.restrict else None
 
 
 class InnerHeader(TypedDict):
@@ -186,84 +165,81 @@ def read_agent(
     return AgentPolicy.from_file(tensors, header, str(path))
 
 
-def read_weights(declaration: Declaration, path: Path) -> HierarchyPolicy | AgentPolicy:
-    """Return the policy that ``write_weights`` wrote; apply the file's call settings.
+def read_weights(
+    roles: Roles, tensors: dict[str, Tensor], header: dict[str, Any], path: Path
+) -> tuple[Roles, HierarchyPolicy]:
+    """Return a hierarchy's policy, and its roles with the file's call settings.
+
+    Args:
+        roles: as declared.
+        tensors, header: what ``open_weights`` read from ``path``.
 
     Raises:
         RunError: the file is damaged, or belongs to other skills or another environment.
     """
-    tensors, header = open_weights(path)
-    if header["kind"] == "agent":
-        return read_agent(declaration.spec, tensors, header, path)
-    skills = dict(every_skill(declaration.skills))
-    names = list(skills)
-    inner = {name for name, _ in every_hierarchy(declaration) if name}
-    inner_headers = header["hierarchies"]
+    levels = {"": header, **header["hierarchies"]}
     if (
-        header["skills"] != names
-        or header["env"] != declaration.spec.name
-        or set(inner_headers) != inner
+        header["skills"] != list(roles.skills)
+        or header["env"] != roles.spec.name
+        or set(levels) != set(roles.levels)
     ):
         recorded_skills = ", ".join(header["skills"])
         raise RunError(
             f"{path} is of skills {recorded_skills[:300]} on {header['env'][:100]}, but the "
-            f"hierarchy has {', '.join(names)} on {declaration.spec.name}"
+            f"hierarchy has {', '.join(roles.skills)} on {roles.spec.name}"
         )
+    roles = roles.changed(lambda level: with_calls(level, levels[level.path]))
+    policies = _ready_parts(roles, tensors, header, path)
+    for level in roles.levels.values():
+        where = f"{path}: {level.path}" if level.path else str(path)
+        is_ready = level.ready_selector is not None
+        check_selector(is_ready, level.selector_path in header["ready"], where)
+        _check_guide(level, levels[level.path].get("guide"), where)
+    for name, role in roles.by_path.items():
+        if role.config is not None or role.margin is not None:
+            if name not in header["parts"]:
+                raise RunError(f"{path} holds no weights of {name!r}")
+            weights = below(tensors, name)
+            policies[name] = AgentPolicy.from_file(
+                weights, header["parts"][name], f"{path} ({name})"
+            )
+    policy = assembled(roles, policies)
+    check_parts(roles, policy, str(path))
+    return roles, policy
 
-    def part(name: str) -> AgentPolicy:
-        weights = {k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(f"{name}/")}
-        if name not in header["parts"]:
-            raise RunError(f"{path} holds no weights of {name!r}")
-        return AgentPolicy.from_file(weights, header["parts"][name], f"{path} ({name})")
 
-    def copied(name: str) -> bytes | None:
-        content = tensors.get(f"{name}/content")
-        return None if content is None else content.contiguous().numpy().tobytes()
+def _ready_parts(
+    roles: Roles, tensors: Mapping[str, Tensor], header: Mapping[str, Any], path: Path
+) -> dict[str, Policy]:
+    """Return the ready policies and selectors as they were when the file was written, by path."""
 
-    policies: dict[str, Policy] = {}
-    ready = declaration.ready_policies()
+    def content(name: str) -> bytes | None:
+        copied = tensors.get(join(name, "content"))
+        return None if copied is None else copied.contiguous().numpy().tobytes()
+
     recorded = header["ready"]
-    for name, policy in ready.items():
-        read = partial(copied, name)
+    policies: dict[str, Policy] = {}
+    for name, policy in ready_policies(roles).items():
         where = f"{path}: skill {name!r}"
-        policies[name] = as_recorded(policy, recorded.get(name), read, where)
-    for name, hierarchy in every_hierarchy(declaration):
-        node = f"{name}/" if name else ""
-        where = f"{path}: {name}" if name else str(path)
-        entry = inner_headers[name] if name else header
-        adopt_calls(hierarchy, entry)
-        check_selector(hierarchy.ready_selector is not None, node + SELECTOR in recorded, where)
-        for other in [SELECTOR, *([CRITIC] if hierarchy.together.interrupt else [])]:
-            if node + other not in recorded:
-                policies[node + other] = part(node + other)
-        _check_guide(hierarchy, entry.get("guide"), where)
-    for name, policy in declaration.ready_selectors().items():
-        policies[name] = as_recorded(policy, recorded[name], lambda: None, f"{path}: the {name}")
-    for name, skill in skills.items():
-        if skill.policy is None:
-            policies[name] = part(name)
-    whole = assembled(declaration, policies)
-    check_parts(declaration, whole, str(path))
-    return whole
+        policies[name] = as_recorded(policy, recorded.get(name), partial(content, name), where)
+    for name, policy in ready_selectors(roles).items():
+        where = f"{path}: the {name}"
+        policies[name] = as_recorded(policy, recorded.get(name), lambda: None, where)
+    return policies
 
 
-def _check_guide(declaration: Declaration, source: dict[str, Any] | None, where: str) -> None:
-    """Raise a RunError where the selector was trained under another guide."""
-    guide = _restricting(declaration)
-    check_guided(guide is not None, source is not None, where)
-    if guide is not None:
-        as_recorded(guide, source, lambda: None, f"{where}: the guide")
-
-
-def adopt_calls(declaration: Declaration, entry: Mapping[str, Any]) -> None:
-    """Apply a recorded way to call skills to a hierarchy."""
-    declaration.call_steps = calls_from_json(entry)
-    kinds = {name: entry[name] for name in ("greedy_skills", "greedy_selector")}
-    declaration.selection = replace(declaration.selection, **kinds)
+def with_calls(level: Level, entry: Mapping[str, Any]) -> Level:
+    """Return a level that calls its skills as a file records it."""
     margin = entry.get("interrupt")
-    declaration.together = replace(declaration.together, interrupt=margin is not None)
+    together = replace(level.together, interrupt=margin is not None)
     if margin is not None:
-        declaration.together = replace(declaration.together, margin=margin)
+        together = replace(together, margin=margin)
+    selection = replace(
+        level.selection,
+        greedy_skills=entry["greedy_skills"],
+        greedy_selector=entry["greedy_selector"],
+    )
+    return replace(level, call_steps=calls_from_json(entry), together=together, selection=selection)
 
 
 def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
@@ -276,35 +252,41 @@ def check_selector(is_ready: bool, recorded: bool, where: str) -> None:
         )
 
 
-def check_parts(declaration: Declaration, policy: HierarchyPolicy, where: str) -> None:
+def _check_guide(level: Level, source: dict[str, Any] | None, where: str) -> None:
+    """Raise a RunError where the selector was trained under another guide."""
+    guide = level.restricting_guide
+    check_guided(guide is not None, source is not None, where)
+    if guide is not None:
+        as_recorded(guide, source, lambda: None, f"{where}: the guide")
+
+
+def check_guided(is_guided: bool, recorded: bool, where: str) -> None:
+    """Raise a RunError where only one of two selectors has a guide."""
+    if is_guided != recorded:
+        has = ("no guide", "a guide")
+        raise RunError(
+            f"{where}: the selector has {has[recorded]}, but the selector of this hierarchy has "
+            f"{has[is_guided]}: declare guide= as it was, or train again"
+        )
+
+
+def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
     """Raise a RunError where a policy has not the spaces of its place.
 
-    Selectors choose among their skills; all skills have the spaces of the first.
+    Selectors choose among their skills; all skills have the spaces of the first. The environment
+    is not needed.
     """
     first = policy.skills.policies[0]
-    wanted = {"observation_space": first.observation_space, "action_space": first.action_space}
-    _check_parts(declaration, policy, wanted, where, "")
-
-
-def _check_parts(
-    declaration: Declaration,
-    policy: HierarchyPolicy,
-    wanted: dict[str, gym.Space[Any]],
-    where: str,
-    path: str,
-) -> None:
-    choices = gym.spaces.Discrete(declaration.choices)
-    places = {SELECTOR: (policy.selector, wanted | {"action_space": choices})}
-    for skill, of_skill in zip(declaration.skills, policy.skills.policies, strict=True):
-        places[skill.name] = of_skill, wanted
-        if (inner := inner_of(skill)) is not None:
-            assert isinstance(of_skill, HierarchyPolicy)
-            _check_parts(inner, of_skill, wanted, where, f"{path}{skill.name}/")
-    for name, (part, spaces) in places.items():
+    for path, part in parts_of(roles, policy).items():
+        role = roles.by_path.get(path)
+        if role is None or role.kind == "critic":
+            continue
+        action_space = first.action_space if role.choices is None else role.action_space
+        spaces = {"observation_space": first.observation_space, "action_space": action_space}
         for kind, space in spaces.items():
             actual = getattr(part, kind)
             if not same_space(actual, space):
                 raise RunError(
-                    f"{where}: the policy in the place of {path + name!r} has {kind} "
+                    f"{where}: the policy in the place of {path!r} has {kind} "
                     f"{shown(actual)}, but {shown(space)} belongs there"
                 )

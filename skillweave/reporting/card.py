@@ -37,7 +37,7 @@ def write_card(
     run, saved = RunDirectory(run.path, public(run.manifest)), load_evaluation(run)
     parts = [
         _header(run, name, saved),
-        f"# {name.partition('/')[2]}",
+        f"# {PurePosixPath(name).name}",
         _about(run),
         *(_shown(path) for path in films),
         _use(run, name),
@@ -65,7 +65,7 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
         task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
         metric = {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
         result = {"task": task, "dataset": {"name": env, "type": env}, "metrics": [metric]}
-        header["model-index"] = [{"name": name.partition("/")[2], "results": [result]}]
+        header["model-index"] = [{"name": PurePosixPath(name).name, "results": [result]}]
     lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
     return "\n".join(["---", *lines, "---"])
 

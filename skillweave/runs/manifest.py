@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.errors import RunError
+from skillweave.paths import names_in
 from skillweave.reading import fit, shown
 from skillweave.runs.files import read_json
 from skillweave.runs.kept import Kept
@@ -24,8 +25,8 @@ from skillweave.skills.foreign_policy import Source
 
 
 def _is_path(text: str) -> bool:
-    names = text.split("/")
-    return len(names) <= MOST_NAMES and all(NAME.fullmatch(name) for name in names)
+    names = names_in(text)
+    return 0 < len(names) <= MOST_NAMES and all(NAME.fullmatch(name) for name in names)
 
 
 MOST_NAMES = 16

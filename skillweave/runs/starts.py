@@ -15,6 +15,7 @@ from typing import Any
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import DeclarationError, RunError
+from skillweave.paths import SELECTOR, decides, level_of, name_of
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import (
@@ -73,16 +74,16 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
 
 def chosen_from(manifest: Mapping[str, Any], name: str) -> Chooses:
     """Return the options that a selector or a critic of skills chooses among; else empty."""
-    node, _, role = name.rpartition("/")
-    if role not in ("selector", "skill_critic"):
+    if not decides(name):
         return (), ()
-    within = f"{node}/" if node else ""
+    level = level_of(name)
+    paths = [skill["name"] for skill in manifest["skills"]]
+    skills = tuple(name_of(path) for path in paths if level_of(path) == level)
     hierarchy: Mapping[str, Any] = manifest
-    if node:
-        hierarchy = next(s for s in manifest["skills"] if s["name"] == node)["hierarchy"]
-    names = [s["name"] for s in manifest["skills"] if s["name"].startswith(within)]
-    skills = tuple(k for k in (name.removeprefix(within) for name in names) if "/" not in k)
-    return skills, tuple(hierarchy.get("call_lengths", ())) if role == "selector" else ()
+    if level:
+        hierarchy = manifest["skills"][paths.index(level)]["hierarchy"]
+    lengths = hierarchy.get("call_lengths", ()) if name_of(name) == SELECTOR else ()
+    return skills, tuple(lengths)
 
 
 def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: str) -> set[str]:

@@ -9,9 +9,9 @@ import numpy as np
 
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import skills_below
+from skillweave.paths import AGENT
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
-from skillweave.training.plain_agent import AGENT
 from skillweave.training.play import Played
 from skillweave.training.skill_report import ENDS, StepOutcome, judge_step, played_below
 from skillweave.types import Array, Policy

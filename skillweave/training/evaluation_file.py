@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NotRequired, TypedDict
 
 from skillweave.errors import RunError
+from skillweave.paths import names_in
 from skillweave.reading import fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
@@ -109,7 +110,7 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     content: EvaluationFile = fit(EvaluationFile, data, str(path))
     names = {entry["name"] for entry in run.manifest.get("skills", [])}
     ours = content.get("run") == run.manifest.get("id")
-    top_level = {name.partition("/")[0] for name in content["evaluation"].skills}
+    top_level = {names_in(name)[0] for name in content["evaluation"].skills}
     if not ours or not top_level <= names:  # a ready hierarchy's own skills are not the run's
         raise RunError(f"{path} belongs to another run; delete it, and evaluate again")
     return SavedEvaluation(

@@ -26,6 +26,7 @@ from skillweave.errors import RunError
 from skillweave.experience import Reference
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
+from skillweave.paths import CRITIC, SELECTOR, decides, level_of, relative
 from skillweave.runs.starts import start_of
 from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds, global_generators
@@ -33,7 +34,7 @@ from skillweave.training.joint_learner import JointLearner
 from skillweave.training.learner import Learner, RolloutLearner, Stack, keep_to_guide
 from skillweave.training.learning_task import JointTask
 from skillweave.training.replay_learner import ReplayLearner, store_of
-from skillweave.training.stage import CRITIC, SELECTOR, Together, decides
+from skillweave.training.stage import Together
 from skillweave.training.stage_log import StageLog, success_rate
 from skillweave.training.stage_run import StageRun, begin_as
 from skillweave.training.trainer import OneAgent
@@ -57,32 +58,31 @@ class JointAgents(OneAgent):
         learning_task = self.learning_task
         self.together = Together(**entry["together"])
         self.first: str = entry["decides"]
-        self.node = self.first.removesuffix(SELECTOR)
+        self.level = level_of(self.first)
         configs = {self.first: self.stage.config} if self.first in entry["learns"] else {}
         configs |= {
             name: config_from_json(settings) for name, settings in entry["algorithms"].items()
         }
         self.algorithms: dict[str, Algorithm] = {}
         for name, config in configs.items():
-            grown = self._as_grown(name, config)
-            actions = learning_task.chooses_from(self._path_in_stage(name))
-            self.algorithms[name] = self._equal_algorithm(grown, actions) or make_algorithm(
-                grown, learning_task.observation_space, actions
+            grown, role = self._as_grown(name, config), learning_task.roles[name]
+            spaces = role.observation_space, role.action_space
+            self.algorithms[name] = self._equal_algorithm(grown, *spaces) or make_algorithm(
+                grown, *spaces
             )
 
-    def _equal_algorithm(self, config: Any, action_space: Any) -> Algorithm | None:
+    def _equal_algorithm(
+        self, config: Any, observation_space: Any, action_space: Any
+    ) -> Algorithm | None:
         """Return an algorithm with equal settings, if one exists: it need not be compiled again.
 
         An algorithm holds no weights, so several learners may share one.
         """
+        wanted = config, observation_space, action_space
         for other in self.algorithms.values():
-            if other.config == config and other.action_space == action_space:
+            if (other.config, other.observation_space, other.action_space) == wanted:
                 return other
         return None
-
-    def _path_in_stage(self, path: str) -> str:
-        """Return a path relative to the stage's hierarchy."""
-        return path.removeprefix(self.node)
 
     def _as_grown(self, name: str, config: Any) -> Any:
         """Return the settings, with the networks that ``name`` has grown in a population."""
@@ -104,20 +104,23 @@ class JointAgents(OneAgent):
         return partial(_collector, self.learning_task, self._acting(), self._margins())
 
     def _acting(self) -> dict[str, Algorithm]:
-        """Return the acting algorithms, by their paths in the stage's hierarchy."""
-        return {self._path_in_stage(k): a for k, a in self.algorithms.items()}
+        """Return the acting algorithms, by their paths in the stage's level."""
+        return {relative(k, self.level): a for k, a in self.algorithms.items()}
 
     def _margins(self) -> dict[str, float]:
-        """Return the margins of interruption, by the paths of critics."""
-        margin = {CRITIC: self.together.margin} if self.together.interrupt else {}
-        return margin | dict(self.learning_task.margins)
+        """Return the margins of interruption, by the paths of critics in the stage's level."""
+        margins = {CRITIC: self.together.margin} if self.together.interrupt else {}
+        for path, role in self.learning_task.roles.items():
+            if role.margin is not None and role.level != self.level:
+                margins[relative(path, self.level)] = role.margin
+        return margins
 
     def _guide_kl(self, name: str) -> float | None:
         """Return the KL within which a learner stays of its guide; None: without limit."""
         if name == self.first:
             kl: float | None = self.stage.entry.get("guide_kl")
             return kl
-        return self.learning_task.guide_kl.get(self._path_in_stage(name))
+        return self.learning_task.roles[name].guide_kl
 
     def learner_from(self, state: None, extra: dict[str, Tensor], log: StageLog) -> Learner:
         """Return all learners: from a checkpoint, from earlier stages, or fresh."""
@@ -144,13 +147,17 @@ class JointAgents(OneAgent):
             keep_to_guide(learner, self._guide_kl(name))
             learners[name] = learner
         weights = self.stage.entry["task_weights"]
-        joint = JointLearner(learners, self.node, self.together.task_weight, weights)
+        joint = JointLearner(learners, self.level, self.together.task_weight, weights)
         if extra:
-            shape = (len(learners), 2)
-            counts = checked_tensor(extra, "counts", shape, torch.int64, str(log.run.path))
-            if not ((counts >= 0) & (counts < 2**53)).all():
-                raise RunError(f"{log.run.path}: its counts of rows and updates are out of range")
-            joint.counts = dict(zip(learners, counts.tolist(), strict=True))
+            for name in learners:
+                counts = checked_tensor(
+                    extra, f"counts.{name}", (2,), torch.int64, str(log.run.path)
+                )
+                if not ((counts >= 0) & (counts < 2**53)).all():
+                    raise RunError(
+                        f"{log.run.path}: its counts of rows and updates are out of range"
+                    )
+                joint.counts[name] = counts.tolist()
         return joint
 
     def _earlier_policy(self, name: str) -> tuple[AgentPolicy, int] | None:
@@ -215,10 +222,10 @@ class JointAgents(OneAgent):
         num_envs = self.stage.config.num_envs
         seeds = self.stage.seeds / name
         config = stack.algorithm.config
-        row_steps = self.learning_task.steps_of_row(self._path_in_stage(name))
+        row_steps = self.learning_task.roles[name].row_steps
         if stack.algorithm.store == "rollout":
             rows = num_envs * int(getattr(self.stage.config, "n_steps", config.n_steps))
-            learns_all_rows = self._path_in_stage(name) in (SELECTOR, CRITIC)
+            learns_all_rows = relative(name, self.level) in (SELECTOR, CRITIC)
             quota = 0 if learns_all_rows else max(1, round(rows * self.together.quota / row_steps))
             return RolloutLearner(stack, seeds, quota)
         store = store_of(stack.algorithm, num_envs)
@@ -273,15 +280,10 @@ class JointAgents(OneAgent):
                     "learn once its initiation() is True where other skills end"
                 )
 
-    def policies(self) -> dict[str, AgentPolicy]:
-        """Return the present policies of the learners, by name."""
-        stacks = zip(self.algorithms, self.learner.stacks, strict=True)
-        return {k: AgentPolicy.of(s.algorithm, state_to(s.state, "cpu")) for k, s in stacks}
-
-    def states(self) -> dict[str, Any]:
-        """Return the present states of the learners, by name."""
-        stacks = zip(self.algorithms, self.learner.stacks, strict=True)
-        return {name: state_to(stack.state, "cpu") for name, stack in stacks}
+    def stacks(self) -> dict[str, Stack]:
+        """Return the stacks of the learners, by path."""
+        assert isinstance(self.learner, JointLearner)
+        return {path: s for path, part in self.learner.learners.items() for s in part.stacks}
 
     def play(self, eval_envs: Collector, seeds: Seeds) -> Array:
         """Play an episode of the hierarchy in each evaluation environment, (N, 4)."""
@@ -294,13 +296,13 @@ class JointAgents(OneAgent):
                 (s.algorithm.acting_params(s.state),),
                 s.state.gamma.cpu().numpy(),
                 seeds / name,
-                greedy=self.learning_task.is_greedy(self._path_in_stage(name)),
+                greedy=self.learning_task.roles[name].greedy,
             )
-            for name, s in zip(self.algorithms, self.learner.stacks, strict=True)
+            for name, s in self.stacks().items()
         }
         ready = Request(0, (), np.ones(1), seeds / self.first, greedy=True)
         of_selector = requests.pop(self.first, ready)
-        of_skills = {self._path_in_stage(k): r for k, r in requests.items()}
+        of_skills = {relative(k, self.level): r for k, r in requests.items()}
         request = replace(of_selector, below=of_skills)
         with torch_threads(1), global_generators(seeds / "global"):
             limit = longest_evaluation(eval_envs.engine.time_limit)
@@ -309,7 +311,10 @@ class JointAgents(OneAgent):
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""
         assert isinstance(self.learner, JointLearner)
-        states = {"counts": torch.tensor(list(self.learner.counts.values()), **INT)}
+        states = {
+            f"counts.{name}": torch.tensor(counts, **INT)
+            for name, counts in self.learner.counts.items()
+        }
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
         return None, extra | states | self.best_tensors()

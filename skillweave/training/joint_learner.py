@@ -13,8 +13,8 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Batch
 from skillweave.ops.device import FLOAT
+from skillweave.paths import CRITIC, SELECTOR, decides, join, name_of, relative
 from skillweave.training.learner import Learner, RolloutLearner, Stack
-from skillweave.training.stage import CRITIC, SELECTOR, decides
 from skillweave.types import Array, prefixed, unprefixed
 
 
@@ -23,7 +23,7 @@ class JointLearner:
 
     Args:
         learners: by path, the selector first unless it is ready, then all other learners.
-        node: the path of the hierarchy: empty, or ``inner/`` for example.
+        level: the path of their level.
         task_weight: the weight of the task's advantage for skills, at the end of the stage.
         weights: weights of skills with another weight, by path.
     """
@@ -31,7 +31,7 @@ class JointLearner:
     def __init__(
         self,
         learners: Mapping[str, Learner],
-        node: str,
+        level: str,
         task_weight: float = 0.0,
         weights: Mapping[str, float] | None = None,
     ) -> None:
@@ -44,9 +44,9 @@ class JointLearner:
             for name, learner in learners.items()
             if isinstance(learner, RolloutLearner) and not decides(name)
         }
-        self._node = node
-        self._selector = node + SELECTOR
-        self._critic = node + CRITIC
+        self._level = level
+        self._selector = join(level, SELECTOR)
+        self._critic = join(level, CRITIC)
         self.counts = {name: [0, 0] for name in learners}
         """Rows in which each has acted, and updates from them, by path."""
         self._acted: dict[str, Tensor] = {}
@@ -69,12 +69,12 @@ class JointLearner:
             rows = max(r.rows for r in requests.values())
             first = Request(rows, (), first.gamma, first.seeds / self._selector)
         record = tuple(dict.fromkeys(name for r in requests.values() for name in r.record))
-        below = {k.removeprefix(self._node): r for k, r in requests.items()}
+        below = {relative(k, self._level): r for k, r in requests.items()}
         return replace(first, below=below, record=record)
 
     def take(self, batches: Mapping[str, Batch]) -> None:
         """Give each learner its own rows, and skills the task's advantage, if it has a weight."""
-        by_learner = {name: batches[name.removeprefix(self._node)] for name in self.learners}
+        by_learner = {name: batches[relative(name, self._level)] for name in self.learners}
         if any(self._weights.values()):
             advantage = self._progress * self._task_advantage(by_learner[self._critic])
             for name, weight in self._weights.items():
@@ -143,7 +143,7 @@ def how_it_acted(name: str, rows: Batch) -> dict[str, Tensor]:
     """
     valid = rows.valid_rows
     metrics: dict[str, float] = {}
-    if name.rpartition("/")[2] == SELECTOR:
+    if name_of(name) == SELECTOR:
         if valid.any():
             metrics["call_length"] = rows["steps"][valid].mean()
     elif not decides(name):

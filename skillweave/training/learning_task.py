@@ -13,15 +13,12 @@ from skillweave.collecting.collector import Collector
 from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.joint import JointCollector
-from skillweave.collecting.levels import CRITIC, SELECTOR
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
-
-CALL = 16
-"""Approximate environment steps of a call without a declared length."""
+from skillweave.training.role import Role, agent_role
 
 
 class MakeCollector(Protocol):
@@ -65,15 +62,14 @@ class LearningTask:
 
 
 def skill_task(
-    spec: EnvSpec,
-    skill: Skill | None = None,
+    role: Role,
     reflexes: Sequence[Reflex] = (),
     starters: SkillSet | None = None,
     start_calls: int = 0,
     search_steps: int | None = None,
     episode_calls: int = 1,
 ) -> LearningTask:
-    """Return the learning task of a skill's stage; ``skill`` None: of the task itself.
+    """Return the learning task of a skill's stage, or of a plain agent's.
 
     Args:
         starters: skills that can act already; they bring the environment to where the skill may
@@ -83,6 +79,7 @@ def skill_task(
         episode_calls: the most calls of the skill in an episode.
     """
     search = start_calls, search_steps, episode_calls
+    spec, skill = role.spec, role.skill
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
@@ -90,11 +87,11 @@ def skill_task(
         engine = make_engine(spec, num_envs, first=first)
         return SkillCollector(engine, acting, skill, tuple(reflexes), starters, *search)
 
-    return LearningTask(spec.name, *spec.spaces, collector)
+    return LearningTask(spec.name, role.observation_space, role.action_space, collector)
 
 
 def selector_task(
-    spec: EnvSpec, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
+    role: Role, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
 ) -> LearningTask:
     """Return the learning task of a selector that calls ready skills.
 
@@ -102,6 +99,7 @@ def selector_task(
         guide: a ready selector that guides its decisions.
         as_skill: the hierarchy as a skill of another one; None: the outermost hierarchy.
     """
+    spec = role.spec
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
@@ -109,10 +107,8 @@ def selector_task(
         engine = make_engine(spec, num_envs, first=first)
         return DecisionCollector(engine, acting, skills, shared, guide, as_skill)
 
-    observation_space = spec.spaces.observation
-    choices = gym.spaces.Discrete(skills.choices)
     return LearningTask(
-        spec.name, observation_space, choices, collector, skills.usual_steps or CALL
+        spec.name, role.observation_space, role.action_space, collector, role.row_steps
     )
 
 
@@ -120,47 +116,21 @@ def selector_task(
 class JointTask(LearningTask):
     """Environments in which a selector calls skills, of which some learn, too."""
 
+    selector: str = field(kw_only=True)
+    """The path of the selector."""
+    roles: Mapping[str, Role] = field(kw_only=True)
+    """The roles of the selector's level, and of levels below it, by path."""
     skills: SkillSet = field(kw_only=True)
     """The skills; learning ones have any policy, or are ``UntrainedHierarchy``."""
-    skill_space: gym.Space[Any] = field(kw_only=True)
-    """Action space of the skills."""
-    spec: EnvSpec = field(kw_only=True)
     guide: ActiveGuide | None = field(kw_only=True)
     """A ready selector that guides the selector's decisions, or decides in its place."""
     as_skill: Skill | None = field(kw_only=True)
     """The hierarchy as a skill of another one."""
-    margins: Mapping[str, float] = field(kw_only=True)
-    """Margins of interruption in hierarchies below, by the paths of their critics."""
-    guide_kl: Mapping[str, float] = field(kw_only=True)
-    """Target KL of guides in hierarchies below, by the paths of their selectors."""
 
-    def chooses_from(self, path: str) -> gym.Space[Any]:
-        """Return the action space of a skill, selector or critic at ``path``."""
-        *nodes, name = path.split("/")
-        level = self.level(nodes)
-        if name == SELECTOR:
-            return gym.spaces.Discrete(level.choices)
-        return gym.spaces.Discrete(len(level.skills)) if name == CRITIC else self.skill_space
-
-    def steps_of_row(self, path: str) -> int:
-        """Return the approximate environment steps of a row of the learner at ``path``."""
-        *nodes, name = path.split("/")
-        return self.level(nodes).usual_steps or CALL if name == SELECTOR else 1
-
-    def is_greedy(self, path: str) -> bool:
-        """Return True if the learner at ``path`` acts greedily in evaluations."""
-        *nodes, name = path.split("/")
-        level = self.level(nodes)
-        return level.greedy_selector if name == SELECTOR else level.greedy
-
-    def level(self, nodes: Sequence[str]) -> SkillSet:
-        """Return the skills of a hierarchy below, by the names on the way to it."""
-        skills = self.skills
-        for node in nodes:
-            number = [s.name for s in skills.skills].index(node)
-            inner: Any = skills.policies[number]
-            skills = inner.skills
-        return skills
+    @property
+    def spec(self) -> EnvSpec:
+        """The environment."""
+        return self.roles[self.selector].spec
 
     def joint_collector(
         self,
@@ -181,26 +151,29 @@ class JointTask(LearningTask):
 
 
 def joint_task(
-    spec: EnvSpec,
+    selector: str,
+    roles: Mapping[str, Role],
     skills: SkillSet,
     guide: ActiveGuide | None = None,
     as_skill: Skill | None = None,
-    margins: Mapping[str, float] | None = None,
-    guide_kl: Mapping[str, float] | None = None,
 ) -> JointTask:
-    """Return the learning task of a selector that calls skills, of which some learn, too."""
-    plain = skill_task(spec)
+    """Return the learning task of a selector that calls skills, of which some learn, too.
+
+    Args:
+        selector: its path.
+        roles: of its level, and of levels below it, by path.
+        skills, guide, as_skill: see ``JointTask``.
+    """
+    role = roles[selector]
     return JointTask(
-        spec.name,
-        plain.observation_space,
-        gym.spaces.Discrete(skills.choices),
-        plain.collector,
-        skills.usual_steps or CALL,
+        role.spec.name,
+        role.observation_space,
+        role.action_space,
+        skill_task(agent_role(role.spec)).collector,
+        role.row_steps,
+        selector=selector,
+        roles=roles,
         skills=skills,
-        skill_space=plain.action_space,
-        spec=spec,
         guide=guide,
         as_skill=as_skill,
-        margins=margins or {},
-        guide_kl=guide_kl or {},
     )

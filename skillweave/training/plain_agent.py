@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
+from skillweave.paths import AGENT
+from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
 from skillweave.settings import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.learning_task import skill_task
+from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage, target_of
-
-AGENT = "agent"
-"""Name of a plain agent's stage."""
 
 
 @checked_names
@@ -43,6 +43,8 @@ class PlainAgent:
     """Training ends early at this share of successful episodes (``info["success"]``)."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
+    _caller: ClassVar[Caller] = "agent"
+    """The entry point in lines of Python that messages print."""
     recorded = False
     """True for a run that was loaded without its code; some of what was declared is missing."""
 
@@ -87,7 +89,7 @@ class PlainAgent:
                 "agent",
                 self.algorithm,
                 self.steps,
-                lambda _: skill_task(spec),
+                lambda _: skill_task(agent_role(spec)),
                 target,
             )
         ]

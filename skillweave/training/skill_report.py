@@ -11,6 +11,7 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.paths import level_of
 from skillweave.settings import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
@@ -388,13 +389,13 @@ def levels_of(skills: Mapping[str, SkillReport]) -> dict[str, dict[str, SkillRep
     """Return the reports grouped by the path of their hierarchy; "": the outermost."""
     levels: dict[str, dict[str, SkillReport]] = {}
     for name, report in skills.items():
-        levels.setdefault(name.rpartition("/")[0], {})[name] = report
+        levels.setdefault(level_of(name), {})[name] = report
     return levels
 
 
 def all_steps(skills: Mapping[str, SkillReport]) -> int:
     """Return the environment steps of all skills, each step counted once."""
-    top = [name for name in skills if name.rpartition("/")[0] not in skills]
+    top = [name for name in skills if level_of(name) not in skills]
     return sum(skills[name].steps for name in top)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from skillweave.algorithms.config import (
@@ -14,26 +14,20 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
-from skillweave.collecting import levels
 from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError, reworded
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
+from skillweave.paths import SELECTOR, join
 from skillweave.settings import AtLeastOne, Fraction, NonNegative, Positive, checked_settings
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
+from skillweave.training.role import Role
 from skillweave.types import Policy
 
-SELECTOR = levels.SELECTOR
-CRITIC = levels.CRITIC
 TOGETHER = "together"
 """Name of the stage in which all learn together."""
-
-
-def decides(path: str) -> bool:
-    """Return True for the path of a selector or a critic of skills, which are no skills."""
-    return path.rpartition("/")[2] in (SELECTOR, CRITIC)
 
 
 Policies = Mapping[str, Policy]
@@ -128,6 +122,7 @@ class Stage:
     """A task of training: its environment, algorithm and budget."""
 
     name: str
+    """The path of its learner, or of the stage in which a level learns together."""
     kind: Literal["agent", "skill", "selector", "together"]
     config: AlgorithmConfig
     """The algorithm's settings."""
@@ -147,8 +142,8 @@ class Stage:
     """True if the selector is ready: ``config`` then only sets the number of environments."""
     guide_kl: float | None = None
     """Keep the selector within this KL of its guide; None disables this."""
-    node: str = ""
-    """The path of the stage's hierarchy: empty, or ``inner/`` for example."""
+    level: str = ""
+    """The path of the level that learns here."""
     compared: bool = False
     """Keep the result only if it is better than the policies before."""
     greedy_judged: bool = False
@@ -165,26 +160,9 @@ class Stage:
         configs = (self.config, *self.beside.values())
         return self.acts_by_code or any(own_schedules(config) for config in configs)
 
-    def inside(self, name: str) -> Stage:
-        """Return this stage in a hierarchy that is the skill ``name`` of another one."""
-
-        def learning_task(policies: Policies) -> LearningTask:
-            inside = {k.removeprefix(path): v for k, v in policies.items() if k.startswith(path)}
-            return self.learning_task(inside)
-
-        path = f"{name}/"
-        return replace(
-            self,
-            name=path + self.name,
-            node=path + self.node,
-            beside={path + k: v for k, v in self.beside.items()},
-            task_weights={path + k: v for k, v in self.task_weights.items()},
-            learning_task=learning_task,
-        )
-
     def entry(self) -> dict[str, Any]:
         """Return the manifest's entry before training."""
-        first = self.node + SELECTOR if self.together else self.name
+        first = join(self.level, SELECTOR) if self.together else self.name
         entry: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,
@@ -311,8 +289,8 @@ def workers_of(entry: Mapping[str, Any], requested: int) -> int:
     return min(requested, int(population["population"]))
 
 
-def check_replay(entry: dict[str, Any], observation_space: Any, action_space: Any) -> None:
-    """Raise a DeclarationError where a stage's replay buffer cannot be made.
+def check_replay(entry: dict[str, Any], role: Role) -> None:
+    """Raise a DeclarationError where the replay buffer of a stage's learner cannot be made.
 
     A buffer that is larger than the free memory is a TrainingError.
 
@@ -320,7 +298,7 @@ def check_replay(entry: dict[str, Any], observation_space: Any, action_space: An
         entry: the manifest's; "evolution" holds the number of members.
     """
     config = config_from_json(entry["algorithm"])
-    algorithm = make_algorithm(config, observation_space, action_space)
+    algorithm = make_algorithm(config, role.observation_space, role.action_space)
     if algorithm.store != "replay":
         return
     members = int((entry.get("evolution") or {"population": 1})["population"])

@@ -115,15 +115,21 @@ class OneAgent:
             learner.act_from_the_start()
         return learner
 
-    def policies(self) -> dict[str, AgentPolicy]:
-        """Return the present policies of the learners, by name."""
+    def stacks(self) -> dict[str, Stack]:
+        """Return the stacks of the learners, by path."""
         (stack,) = self.learner.stacks
-        return {self.stage.name: AgentPolicy.of(self.algorithm, state_to(stack.state, "cpu"))}
+        return {self.stage.name: stack}
+
+    def policies(self) -> dict[str, AgentPolicy]:
+        """Return the present policies of the learners, by path."""
+        return {
+            path: AgentPolicy.of(stack.algorithm, state_to(stack.state, "cpu"))
+            for path, stack in self.stacks().items()
+        }
 
     def states(self) -> dict[str, Any]:
-        """Return the present states of the learners, by name."""
-        (stack,) = self.learner.stacks
-        return {self.stage.name: state_to(stack.state, "cpu")}
+        """Return the present states of the learners, by path."""
+        return {path: state_to(stack.state, "cpu") for path, stack in self.stacks().items()}
 
     def play(self, eval_envs: Collector, seeds: Seeds) -> Array:
         """Play an episode in each evaluation environment, (n, 4); see ``episodes_of``."""
@@ -236,8 +242,8 @@ class OneAgent:
 
     def _load_best(self, best: KeepBest) -> None:
         """Set the learners' states to those of the best evaluation."""
-        for stack, state in zip(self.learner.stacks, best.states.values(), strict=True):
-            stack.state = state_to(state, stack.state.params.device)
+        for path, stack in self.stacks().items():
+            stack.state = state_to(best.states[path], stack.state.params.device)
 
     def tell_early(self, steps: int, log: StageLog) -> None:
         """Report problems so far, while training can still be stopped; none for one agent."""

@@ -14,7 +14,8 @@ from skillweave.collecting.joint import JointCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.hierarchy.schedule import stages_of
+from skillweave.hierarchy.fitting import ready_policies
+from skillweave.hierarchy.roles import roles_of
 from skillweave.seeding import Seeds
 from skillweave.skills import Reflex
 
@@ -81,6 +82,6 @@ def test_reflexes_are_in_force_while_skills_learn():
     from test_together import declare
 
     hierarchy = declare(reflexes=[BACK])
-    (stage,) = stages_of(hierarchy)
-    skills = stage.learning_task(hierarchy.ready_policies()).skills
+    (stage,) = hierarchy.stages()
+    skills = stage.learning_task(ready_policies(roles_of(hierarchy))).skills
     assert skills.reflexes == (BACK,)

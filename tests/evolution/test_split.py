@@ -36,6 +36,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
+from skillweave.training.role import agent_role
 
 SMALL = PPO(num_envs=2, n_steps=16, batch_size=16, update_epochs=1, network=Network((8, 6)))
 EVERYTHING = Mutations(0.1, 0.3, 0.2, 0.3, 0.1, units=(4, 16), layers=(1, 3), layer_share=0.5)
@@ -155,7 +156,7 @@ def test_a_split_population_goes_on_from_its_last_generation(whole, tmp_path, mo
 def test_one_part_is_the_population_itself(network):
     config, learning_task = (
         replace(SMALL, network=network),
-        skill_task(EnvSpec(Walk, engine="sync")),
+        skill_task(agent_role(EnvSpec(Walk, engine="sync"))),
     )
     evolution, seeds = replace(EVOLVE, start="random"), Seeds(3)
     parts = Parts(workers_here, learning_task, config, seeds, 5, 1, 2)

@@ -42,6 +42,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 from skillweave.training.learning_task import skill_task
+from skillweave.training.role import agent_role
 
 SMALL = Network((8, 6), "relu")
 REPLAY: dict[str, Any] = {
@@ -303,7 +304,7 @@ def test_a_member_that_diverges_is_reported_and_replaced(name, tmp_path, monkeyp
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_member_that_diverges_while_it_learns_leaves_the_others_alone(name, tmp_path):
     config = replace(CONFIGS[name], max_grad_norm=1e30)
-    learning_task = skill_task(spec(name))
+    learning_task = skill_task(agent_role(spec(name)))
     population = Population.fresh(config, Evolution(3, 1, 2), learning_task, Seeds(0))
     sick = population.members[1]
     sick.state.params.fill_(float("nan"))
@@ -375,7 +376,9 @@ class Patient(Skill):
 def test_members_go_on_with_the_open_episodes_of_their_places(name):
     # Generations of 3 steps of each environment, episodes of 10.
     evolution = Evolution(3, 4, 1, mutations=EVERYTHING)
-    population = Population.fresh(CONFIGS[name], evolution, skill_task(spec(name)), Seeds(0))
+    population = Population.fresh(
+        CONFIGS[name], evolution, skill_task(agent_role(spec(name))), Seeds(0)
+    )
     ages = []
     for generation in range(4):
         until = population.steps // 3 + 6
@@ -389,7 +392,7 @@ def test_members_go_on_with_the_open_episodes_of_their_places(name):
 
 @pytest.mark.parametrize("name", ["ppo", "dqn"])
 def test_the_steps_of_members_are_those_that_their_environments_made(name):
-    learning_task = skill_task(spec(name), Patient())
+    learning_task = skill_task(replace(agent_role(spec(name)), skill=Patient()))
     evolution = Evolution(3, 3, 1, mutations=EVERYTHING)
     population, told = Population.fresh(CONFIGS[name], evolution, learning_task, Seeds(0)), []
     for generation in range(3):

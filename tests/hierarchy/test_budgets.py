@@ -15,7 +15,6 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
-from skillweave.hierarchy.schedule import stages_of
 
 
 class One(Skill):
@@ -65,7 +64,7 @@ def test_steps_are_split_as_the_hierarchy_learns(case):
     found = declare(**how)
     assert found.budgets() == budgets
     assert found.total_steps == sum(budgets.values())
-    assert {s.name: s.budget for s in stages_of(found)} == budgets
+    assert {s.name: s.budget for s in found.stages()} == budgets
     assert found.plain_agent().steps == found.total_steps
 
 
@@ -96,11 +95,11 @@ def test_a_hierarchy_below_takes_a_share_for_each_who_learns_in_it():
 def test_where_no_skill_learns_the_selector_trains_alone():
     found = declare(Ready(), steps=300)
     assert found.budgets() == {"selector": 300}
-    assert [s.kind for s in stages_of(found)] == ["selector"]
+    assert [s.kind for s in found.stages()] == ["selector"]
 
 
 def test_by_default_all_learn_together_and_skills_feel_the_task():
-    (stage,) = stages_of(declare())
+    (stage,) = declare().stages()
     assert stage.together == Together()
     assert stage.together.task_weight == 1.0
     assert list(stage.beside) == ["one", "two", "skill_critic"]
@@ -111,15 +110,15 @@ def test_a_skill_keeps_to_its_own_reward_where_it_says_so():
     class Own(Skill):
         task_weight = 0.0
 
-    (stage,) = stages_of(declare(One(), Own()))
+    (stage,) = declare(One(), Own()).stages()
     assert stage.task_weights == {"own": 0.0}
     assert stage.entry()["task_weights"] == {"own": 0.0}
-    alone = stages_of(declare(Own()))[0]
+    alone = declare(Own()).stages()[0]
     assert "skill_critic" not in alone.beside, "no skill needs what the critic says"
 
 
 def test_skills_that_learn_from_replay_need_no_critic_of_the_task():
-    (stage,) = stages_of(declare(algorithm=DQN()))
+    (stage,) = declare(algorithm=DQN()).stages()
     assert list(stage.beside) == ["one", "two"]
 
 
@@ -128,9 +127,9 @@ def test_nothing_is_compared_where_nothing_is_left_open():
         return obs[:, 0] > 0
 
     fixed = Selection(greedy_skills=True)
-    assert not stages_of(declare(selector=rule, selection=fixed))[0].greedy_judged
-    assert stages_of(declare(selection=fixed))[0].greedy_judged, "the selector's choice is open"
-    assert stages_of(declare(selector=rule))[0].greedy_judged, "that of the skills is"
+    assert not declare(selector=rule, selection=fixed).stages()[0].greedy_judged
+    assert declare(selection=fixed).stages()[0].greedy_judged, "the selector's choice is open"
+    assert declare(selector=rule).stages()[0].greedy_judged, "that of the skills is"
 
 
 def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
@@ -139,7 +138,7 @@ def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
     class Inner(Skill):
         policy, task_weight = inner, 0.5
 
-    (stage,) = stages_of(declare(One(), Inner()))
+    (stage,) = declare(One(), Inner()).stages()
     assert stage.task_weights == {"inner/one": 0.5, "inner/two": 0.5}
 
 
@@ -153,5 +152,5 @@ def test_a_weight_that_is_none_is_refused(weight):
 
 
 def test_lengths_learn_together_too():
-    (stage,) = stages_of(declare(call_steps=Lengths(4, 8), selector=PPO()))
+    (stage,) = declare(call_steps=Lengths(4, 8), selector=PPO()).stages()
     assert stage.kind == "together"

@@ -1,12 +1,13 @@
 """Declarations: what is wrong is said; settings change them; files carry their weights."""
 
 import dataclasses
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from declaring import plainly
+from declaring import plainly, skills_with
 from gymnasium.spaces import Box, Dict, Discrete, Text
 
 from skillweave import (
@@ -25,7 +26,8 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api import Run
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.hierarchy.weights import read_weights, write_weights
+from skillweave.hierarchy.roles import roles_of
+from skillweave.hierarchy.weights import open_weights, read_weights, write_weights
 from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
@@ -210,7 +212,7 @@ def test_budgets_are_the_skills_own_else_the_hierarchys_and_nothing_for_ready_po
     ],
 )
 def test_a_declaration_is_data_where_acting_needs_no_code_of_the_users(make, is_data):
-    assert make().is_data is is_data
+    assert roles_of(make()).is_data is is_data
 
 
 # Settings ------------------------------------------------------------------------------------
@@ -391,7 +393,11 @@ def agent(seed: int, actions: int = 2, **settings) -> AgentPolicy:
 
 def trained(d: Hierarchy) -> HierarchyPolicy:
     policies = [s.policy or agent(i, normalize_obs=i == 0) for i, s in enumerate(d.skills)]
-    return HierarchyPolicy(agent(9, len(policies)), d.skill_set(policies))
+    return HierarchyPolicy(agent(9, len(policies)), skills_with(d, policies))
+
+
+def read(d: Hierarchy, path: Path) -> HierarchyPolicy:
+    return read_weights(roles_of(d), *open_weights(path), path)[1]
 
 
 def acts(policy, steps: int = 30) -> list:
@@ -424,8 +430,8 @@ def test_the_file_says_how_long_calls_last_and_whether_skills_are_greedy(
     tmp_path, call_steps, greedy
 ):
     d = declare(call_steps=call_steps, greedy_skills=greedy)
-    write_weights(tmp_path / "w", d, trained(d))
-    skills = read_weights(declare(), tmp_path / "w").skills
+    write_weights(tmp_path / "w", roles_of(d), trained(d))
+    skills = read(declare(), tmp_path / "w").skills
     assert (skills.call_steps, skills.greedy) == (call_steps, greedy)
 
 
@@ -440,11 +446,11 @@ def test_the_file_says_how_long_calls_last_and_whether_skills_are_greedy(
 def test_weights_of_another_hierarchy_say_whose_they_are(tmp_path, make, says):
     d = declare()
     path = tmp_path / "weights.safetensors"
-    write_weights(path, d, trained(d))
+    write_weights(path, roles_of(d), trained(d))
     other = make()
     before = other.call_steps
     with pytest.raises(SkillweaveError, match=says) as raised:
-        read_weights(other, path)
+        read(other, path)
     assert str(path) in str(raised.value)
     assert other.call_steps == before
 
@@ -454,15 +460,15 @@ def test_weights_without_a_skill_that_is_to_be_trained_say_which(tmp_path):
         pass
 
     d = declare(Center(), Lean())
-    write_weights(tmp_path / "w", d, trained(d))
+    write_weights(tmp_path / "w", roles_of(d), trained(d))
     with pytest.raises(SkillweaveError, match="no weights of 'center'"):
-        read_weights(declare(), tmp_path / "w")
+        read(declare(), tmp_path / "w")
 
 
 @pytest.mark.parametrize("change", ["missing", "shape", "kind"])
 def test_a_file_that_does_not_hold_what_it_says_is_named(tmp_path, change):
     d, path = declare(), tmp_path / "weights.safetensors"
-    write_weights(path, d, trained(d))
+    write_weights(path, roles_of(d), trained(d))
     tensors, header = read_tensors(path)
     name = next(k for k in tensors if k.startswith("lean/actor"))
     if change == "missing":
@@ -474,14 +480,14 @@ def test_a_file_that_does_not_hold_what_it_says_is_named(tmp_path, change):
     write_tensors(path, tensors, header)
     says = "holds something of kind 'agent'" if change == "kind" else name.removeprefix("lean/")
     with pytest.raises(SkillweaveError, match=says) as raised:
-        read_weights(declare(), path)
+        read(declare(), path)
     assert str(path) in str(raised.value)
     assert change == "kind" or "lean" in str(raised.value)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(SkillweaveError, match="nowhere"):
-        read_weights(declare(), tmp_path / "nowhere")
+        read(declare(), tmp_path / "nowhere")
 
 
 # A hierarchy as a skill -----------------------------------------------------------------------
@@ -493,11 +499,11 @@ def test_a_whole_hierarchy_is_a_skill_of_another(tmp_path):
     assert (skill.name, skill.max_steps, skill.policy.labels) == ("stand", 12, ("center", "lean"))
     outer = declare(skill, Center())
     outer.check_spaces()
-    assert (list(outer.budgets()), outer.is_data) == (["center", "selector"], False)
+    assert (list(outer.budgets()), roles_of(outer).is_data) == (["center", "selector"], False)
     policy = trained(outer)
     assert policy.labels == ("stand", "center")
-    write_weights(tmp_path / "w", outer, policy)
-    again = read_weights(declare(skill, Center()), tmp_path / "w")
+    write_weights(tmp_path / "w", roles_of(outer), policy)
+    again = read(declare(skill, Center()), tmp_path / "w")
     assert acts(again) == acts(policy)
 
 

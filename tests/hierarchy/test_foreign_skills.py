@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from declaring import plainly
+from declaring import plainly, skills_with
 from gymnasium.spaces import Box, MultiDiscrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
 
@@ -196,7 +196,7 @@ def test_a_hierarchy_as_a_skill_must_be_the_one_that_the_run_was_trained_with(tm
     changed[2].policy.skills = replace(changed[2].policy.skills, call_steps=6)
     for one in changed:
         parts = [one.policy, middle.policy.skills.policies[1]]
-        skills = declare(one, skill("c", linear())).skill_set(parts)
+        skills = skills_with(declare(one, skill("c", linear())), parts)
         outer = declare(skill("whole", HierarchyPolicy(middle.policy.selector, skills)))
         for read, path in (
             (outer.load, run.path),

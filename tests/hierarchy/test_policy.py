@@ -8,7 +8,7 @@ import pytest
 import torch
 from calls.cases import BY_HAND
 from calls.users import hierarchy as policy_of
-from declaring import plainly
+from declaring import plainly, skills_with
 from reference_calls import (
     EPISODE,
     POSITION,
@@ -79,14 +79,14 @@ class Remote(Skill):
 def alone(skill: Skill, others: tuple, **more) -> Run:
     """A run of a hierarchy in which a selector never chooses ``skill``, which comes last."""
     declared = Hierarchy(Walk, [*others, skill], **plainly(more))
-    skills = declared.skill_set([s.policy for s in declared.skills])
+    skills = skills_with(declared, [s.policy for s in declared.skills])
     return Run(declared, Path("nowhere"), HierarchyPolicy(Chooser(len(skills.skills)), skills))
 
 
 def always(skill: Skill, **more) -> HierarchyPolicy:
     """A selector that has no choice."""
     declared = Hierarchy(Walk, [skill], **plainly(more))
-    return HierarchyPolicy(Chooser(1), declared.skill_set([skill.policy]))
+    return HierarchyPolicy(Chooser(1), skills_with(declared, [skill.policy]))
 
 
 @pytest.mark.parametrize("kind", [Counter, Zigzag, "nested"])
@@ -128,7 +128,7 @@ def test_a_film_of_a_skill_alone_shows_its_reflexes_too(tmp_path):
 
     anywhere = Reflex(lambda obs: np.ones(len(obs), bool), action=2)
     declared = Hierarchy(Shown, [Left(), Zigzag()], reflexes=[anywhere], learn="apart")
-    policy = HierarchyPolicy(Chooser(2), declared.skill_set([Left.policy, Zigzag.policy]))
+    policy = HierarchyPolicy(Chooser(2), skills_with(declared, [Left.policy, Zigzag.policy]))
     told = Run(declared, tmp_path / "run", policy).render(
         tmp_path / "a.gif", episodes=3, skill="left"
     )

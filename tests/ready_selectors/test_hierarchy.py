@@ -23,6 +23,7 @@ from ready_selectors.chain import (
 from skillweave import PPO, Automaton, Hierarchy, LastCall, SkillweaveError, tree
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides, list_settings
+from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 
@@ -145,7 +146,7 @@ def test_a_ready_selector_takes_no_steps():
     assert ready.total_steps == 64
     assert ready.plain_agent().steps == 64
     assert declare(SMALL, Learnt(), selector_steps=1000).total_steps == 1064
-    assert not ready.is_data
+    assert not roles_of(ready).is_data
     with pytest.raises(SkillweaveError, match=r"no part of this hierarchy is trained.*set steps"):
         declare(by_rule).plain_agent()
     assert declare(by_rule, steps=50).plain_agent().steps == 50

@@ -11,7 +11,6 @@ import pytest
 from benchmarks.pay.shuttle import POINTS
 from benchmarks.pay.shuttle import suite as shuttle_suite
 from skillweave import SkillweaveError, Step
-from skillweave.hierarchy import training
 from skillweave.recipes import _cheetah as cheetah
 from skillweave.recipes import shuttle
 
@@ -208,7 +207,7 @@ def test_skills_see_all_but_the_leg():
 
 
 def test_calls_by_lot_become_few_long_before_the_end():
-    (stage,) = training.stages_of(shuttle.declare())
+    (stage,) = shuttle.declare().stages()
     config = stage.config
     assert (config.epsilon, config.epsilon_final, config.epsilon_fraction) == (0.95, 0.05, 0.4)
 

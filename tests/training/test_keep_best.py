@@ -117,9 +117,9 @@ def test_every_stage_keeps_its_best_and_says_so(
     judged: list[Any] = []
     scores = select_best._scores
 
-    def noted(declaration: Any, run: Any, before: Any, after: Any, *more: Any) -> Any:
+    def noted(roles: Any, level: Any, run: Any, before: Any, after: Any, *more: Any) -> Any:
         judged.append((run, after))
-        return scores(declaration, run, before, after, *more)
+        return scores(roles, level, run, before, after, *more)
 
     monkeypatch.setattr(select_best, "_scores", noted)
     heard = Heard()

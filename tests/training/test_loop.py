@@ -40,6 +40,7 @@ from skillweave.training.learner import Stack
 from skillweave.training.learning_task import skill_task
 from skillweave.training.loop import Progress, Saved
 from skillweave.training.replay_learner import learner_of
+from skillweave.training.role import agent_role
 
 CONFIG = PPO(
     num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3, gamma=0.9,
@@ -347,7 +348,8 @@ SMALL = {
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", SMALL)
 def test_environments_in_processes_teach_the_same_as_in_this_one_though_workers_die(name):
-    config, learning_task = SMALL[name], skill_task(EnvSpec("CartPole-v1", engine="sync"))
+    config = SMALL[name]
+    learning_task = skill_task(agent_role(EnvSpec("CartPole-v1", engine="sync")))
     algorithm = make_algorithm(config, learning_task.observation_space, learning_task.action_space)
 
     def collector(num_envs: int, first: int):

@@ -12,6 +12,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
+from skillweave.paths import AGENT
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -49,7 +50,6 @@ from skillweave.skills.base import RecordedSkill
 from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
-from skillweave.training.plain_agent import AGENT
 from skillweave.training.play import Played as PlayedStep
 from skillweave.training.skill_report import levels_of
 from skillweave.types import Policy

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from skillweave.paths import level_of
 from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
@@ -113,7 +114,7 @@ def _failing(name: str, report: SkillReport) -> str:
 
 def _leaves(skills: Mapping[str, SkillReport]) -> dict[str, SkillReport]:
     """Return the skills that act themselves, by path: without those that are hierarchies."""
-    above = {name.rpartition("/")[0] for name in skills}
+    above = {level_of(name) for name in skills}
     return {name: report for name, report in skills.items() if name not in above}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +11,15 @@ from typing import Any, TypeVar
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy import training
-from skillweave.hierarchy.declaration import Declaration
-from skillweave.hierarchy.guidance import adopt_guide
-from skillweave.hierarchy.nesting import copied, every_hierarchy, every_skill, inner_of
-from skillweave.hierarchy.weights import adopt_calls, check_selector
+from skillweave.hierarchy.declaration import Declaration, with_roles
+from skillweave.hierarchy.roles import Level, Roles, roles_of
+from skillweave.hierarchy.weights import check_guided, check_selector, with_calls
+from skillweave.paths import SELECTOR
 from skillweave.reporting.report.facts import plain, settings
-from skillweave.runs.command_words import Caller, called_by
+from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.skills import Skill
+from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.types import Policy
 
 MOST_NAMED = 3
@@ -36,14 +38,12 @@ def load_policy(declared: D, path: Path) -> Trained[D]:
     """
     run = RunDirectory.open(path)
     declared.validate()
-    with called_by(caller_of(declared)):
+    with called_by(declared._caller):
         declared = apply_manifest(declared, run)
-        return declared, run, training.load(declared, run)
-
-
-def caller_of(declared: Declaration | PlainAgent) -> Caller:
-    """Return what messages call a declaration."""
-    return "hierarchy" if isinstance(declared, Declaration) else "agent"
+        if run.manifest["kind"] == "agent":
+            return declared, run, load_agent_of(run)
+        assert isinstance(declared, Declaration)
+        return declared, run, training.load(roles_of(declared), run)
 
 
 def apply_manifest(declared: D, run: RunDirectory) -> D:
@@ -55,35 +55,41 @@ def apply_manifest(declared: D, run: RunDirectory) -> D:
     check_run(declared, run)
     if not isinstance(declared, Declaration) or run.manifest["kind"] != "hierarchy":
         return declared
-    copy = copied(declared)
-    entries = {s["name"]: s for s in run.manifest["skills"]}
-    for path, skill in every_skill(copy.skills):
-        for field in ("max_steps", "call_steps"):
-            if getattr(skill, field) != entries[path].get(field):
-                setattr(skill, field, entries[path].get(field))
-    for path, hierarchy in every_hierarchy(copy):
-        if path:
-            _apply_settings(hierarchy, entries[path]["hierarchy"], f"{run.path}: {path}")
-        else:
-            _apply_settings(hierarchy, run.manifest, str(run.path))
-    return copy
+    return with_roles(declared, _recorded_roles(roles_of(declared), run))
 
 
-def describe_differences(
-    declared: Declaration | PlainAgent, run: RunDirectory, recipe: str | None = None
-) -> str:
-    """Describe the settings in which a run differs from its declaration; empty if none does.
+def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
+    """Return the roles of a declaration with the settings that a run records."""
+    entries = {entry["name"]: entry for entry in run.manifest["skills"]}
 
-    A recipe's settings are not compared: the command line may have changed them.
-    """
-    if declared.recorded or recipe is not None:
-        return ""
-    seed, flat = run.manifest["seed"], run.manifest["kind"] == "agent"
-    if isinstance(declared, Declaration):
-        content = training.manifest(declared, seed=seed, flat=flat)
-    else:
-        content = declared.manifest(seed)
-    return differences(content, run)
+    def recorded(level: Level) -> Level:
+        entry = entries[level.path]["hierarchy"] if level.path else run.manifest
+        where = f"{run.path}: {level.path}" if level.path else str(run.path)
+        check_guided(level.guide is not None, "guide" in entry, where)
+        guide = level.guide
+        if guide is not None:
+            guide = replace(guide, restrict=entry["guide_restrict"], target_kl=entry["guide_kl"])
+        level = with_calls(level, entry)
+        search = ("start_calls", "search_steps", "episode_calls")
+        return replace(
+            level,
+            skills={path: _limited(s, entries[path]) for path, s in level.skills.items()},
+            guide=guide,
+            learn=entry["learn"],
+            apart=replace(level.apart, **{name: entry[name] for name in search}),
+            selection=replace(level.selection, call_cost=entry["call_cost"]),
+        )
+
+    return roles.changed(recorded)
+
+
+def _limited(skill: Skill, entry: Mapping[str, Any]) -> Skill:
+    """Return a copy of a skill with the limits of its calls that a run records."""
+    limited = copy.copy(skill)
+    for field in ("max_steps", "call_steps"):
+        if getattr(skill, field) != entry.get(field):
+            setattr(limited, field, entry.get(field))
+    return limited
 
 
 def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool = True) -> str:
@@ -112,50 +118,45 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
     return f"the run continues with its own settings: {', '.join(named)}{more}"
 
 
-def _apply_settings(declared: Declaration, entry: dict[str, Any], where: str) -> None:
-    adopt_guide(declared, entry, where)
-    adopt_calls(declared, entry)
-    declared.learn = entry["learn"]
-    search = ("start_calls", "search_steps", "episode_calls")
-    declared.apart = replace(declared.apart, **{name: entry[name] for name in search})
-    declared.selection = replace(declared.selection, call_cost=entry["call_cost"])
-
-
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
     """Raise a RunError where a run is not one of this declaration."""
     if run.manifest["kind"] == "hierarchy":
         if isinstance(declared, PlainAgent):
             raise RunError(f"{run.path} is the run of a hierarchy, not of a plain agent")
-        skills = dict(every_skill(declared.skills))
-        mine = list(skills)
-        theirs = [s["name"] for s in run.manifest["skills"]]
-        if mine != theirs:
+        _check_roles(roles_of(declared), run)
+    what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
+    _check_place(declared.spec, what, run)
+
+
+def _check_roles(roles: Roles, run: RunDirectory) -> None:
+    """Raise a RunError where a run was trained with other skills, selectors or reflexes."""
+    mine = list(roles.skills)
+    theirs = [entry["name"] for entry in run.manifest["skills"]]
+    if mine != theirs:
+        raise RunError(
+            f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
+            f"has {', '.join(mine)}"
+        )
+    entries: dict[str, dict[str, Any]] = {"": run.manifest}
+    for entry in run.manifest["skills"]:
+        path = entry["name"]
+        if (path in roles.levels) != ("hierarchy" in entry):
             raise RunError(
-                f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
-                f"has {', '.join(mine)}"
+                f"{run.path}: skill {path!r} is a hierarchy in the run or in "
+                "this declaration, not in both; declare it as it was trained"
             )
-        ready = declared.ready_selector is not None
-        check_selector(ready, "selector" in run.manifest, str(run.path))
-        for entry in run.manifest["skills"]:
-            inner = inner_of(skills[entry["name"]])
-            if (inner is not None) != ("hierarchy" in entry):
-                raise RunError(
-                    f"{run.path}: skill {entry['name']!r} is a hierarchy in the run or in "
-                    "this declaration, not in both; declare it as it was trained"
-                )
-            if inner is not None:
-                where = f"{run.path}: {entry['name']}"
-                ready = inner.ready_selector is not None
-                check_selector(ready, "selector" in entry["hierarchy"], where)
-                _check_reflexes(inner, entry["hierarchy"], where)
-        _check_reflexes(declared, run.manifest, str(run.path))
-    _check_place(declared, run)
+        if "hierarchy" in entry:
+            entries[path] = entry["hierarchy"]
+    for path, level in roles.levels.items():
+        where = f"{run.path}: {path}" if path else str(run.path)
+        check_selector(level.ready_selector is not None, SELECTOR in entries[path], where)
+        _check_reflexes(level, entries[path], where)
 
 
-def _check_reflexes(declared: Declaration, entry: dict[str, Any], where: str) -> None:
+def _check_reflexes(level: Level, entry: dict[str, Any], where: str) -> None:
     """Raise a RunError where the reflexes are not those of training."""
     theirs: list[str] = entry["reflexes"]
-    mine = [str(r.name) for r in declared.reflexes]
+    mine = [str(r.name) for r in level.reflexes]
     if mine != theirs:
         raise RunError(
             f"{where} was trained with {_reflexes(theirs)}, but this hierarchy has "
@@ -167,15 +168,19 @@ def _reflexes(names: list[str]) -> str:
     return f"the reflexes {', '.join(names)}" if names else "no reflexes"
 
 
-def _check_place(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
-    """Raise a RunError where a run was trained in another environment."""
+def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
+    """Raise a RunError where a run was trained in another environment.
+
+    Args:
+        spec: the declared environment.
+        what: the word for what is declared on it: agent or hierarchy.
+    """
     theirs, their_kwargs = run.manifest["env"], run.manifest["env_kwargs"]
-    mine, my_kwargs = declared.spec.name, declared.spec.json_kwargs
+    mine, my_kwargs = spec.name, spec.json_kwargs
     if (theirs, their_kwargs) == (mine, my_kwargs):
         return
     if theirs == mine:
         theirs, mine = f"{theirs} made with {their_kwargs}", f"one made with {my_kwargs}"
-    what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
     raise RunError(
         f"{run.path} was trained on {theirs}, but this {what} is on {mine}. Load it where it was "
         "trained; to try its policy elsewhere then: evaluate(run.policy, env)"

@@ -1,0 +1,61 @@
+"""A role: one part of a hierarchy that acts or learns, with its own observations and actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium as gym
+
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.envs.make import EnvSpec
+from skillweave.paths import AGENT, level_of
+from skillweave.skills import Skill
+
+
+@dataclass(frozen=True)
+class Role:
+    """A skill, a selector or a critic of skills of a hierarchy; or a plain agent."""
+
+    path: str
+    kind: Literal["agent", "skill", "selector", "critic"]
+    spec: EnvSpec
+    """The environment in which it acts."""
+    config: AlgorithmConfig | None = None
+    """The algorithm that it learns by; None: it is ready, a hierarchy, or a critic, whose settings
+    follow from the selector's in each stage."""
+    skill: Skill | None = None
+    """The skill; None: of another kind."""
+    choices: int | None = None
+    """The number of a selector's choices, or of a critic's values; None: it acts in the
+    environment."""
+    row_steps: int = 1
+    """Approximate environment steps of a row of its experience."""
+    greedy: bool = True
+    """It acts greedily in evaluations."""
+    margin: float | None = None
+    """A critic's margin of interruption; None: it interrupts no call."""
+    guide_kl: float | None = None
+    """A selector stays within this KL of its guide while it learns; None: without limit."""
+
+    @property
+    def level(self) -> str:
+        """The path of its hierarchy."""
+        return level_of(self.path)
+
+    @property
+    def observation_space(self) -> gym.Space[Any]:
+        """The space of what it observes."""
+        return self.spec.spaces.observation
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The space of its actions, or of its choices."""
+        if self.choices is not None:
+            return gym.spaces.Discrete(self.choices)
+        return self.spec.spaces.action
+
+
+def agent_role(spec: EnvSpec) -> Role:
+    """Return the role of a plain agent in an environment."""
+    return Role(AGENT, "agent", spec)
