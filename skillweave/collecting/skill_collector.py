@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.judge import judge, raw_columns, seen_by
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.collector import SUCCESS, Collector
+from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.start_policy import StartPolicy
-from skillweave.collecting.writer import BatchWriter
-from skillweave.envs.engine import Engine, RawStep
+from skillweave.collecting.views import raw_columns, steps_of, successes_of
+from skillweave.collecting.writer import TraceWriter
+from skillweave.envs.engine import Engine
 from skillweave.errors import TrainingError
-from skillweave.experience import Batch
+from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
-
-
-@dataclass
-class Judged:
-    """The outcome of a step for the skill, in all environments."""
-
-    reward: Array  # (n,) float32
-    terminated: Array  # (n,) bool
-    truncated: Array  # (n,) bool, never where terminated
-    success: Array | None  # (n,) bool, or of the task float64, NaN where unknown
 
 
 class SkillCollector(Collector):
@@ -103,26 +92,18 @@ class SkillCollector(Collector):
         how = self._start_calls, self._search_steps, self._episode_calls
         return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
 
-    def _collect(self, request: Request) -> dict[str, Batch]:
-        self._prepare(request)
-        out = BatchWriter(request.rows, self.num_envs)
-        state = None if self.memory is None else self.memory.copy()
-        starts = self.kept["elapsed"] == 0
-        for _ in range(request.rows):
-            self._step(out)
-        batch = out.batch(recurrent_state=state)
-        if state is None:
-            return {"": batch}
-        episode_start = np.concatenate([starts[None], batch.ended[:-1]])
-        if (valid := batch.get("valid")) is not None:  # the first row after a search
-            episode_start[1:] |= valid[1:] & ~valid[:-1]
-        return {"": batch.replace(episode_start=episode_start)}
-
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
         self._rng, self._record = (request.seeds / "search").numpy(), request.record
+        self._before = None if self.memory is None else self.memory.copy()
+        self._starts = self.kept["elapsed"] == 0
 
-    def _step(self, out: BatchWriter | None = None) -> None:
+    def _writer(self, rows: int) -> TraceWriter:
+        reads = self.skill is not None and any(map(self.skill.defines, self.skill.methods))
+        reads |= any(name.startswith(INFO) for name in self._record)
+        return TraceWriter(rows, self.num_envs, keep_infos=reads)
+
+    def _step(self, out: TraceWriter) -> None:
         """One step of every environment."""
         if self._start_calls:
             self._draw_calls()
@@ -140,53 +121,93 @@ class SkillCollector(Collector):
         if playing is not None:
             action = action.copy()
             action[searching] = self._starters.act(searching, obs, mask, self._rng)
+        out.write(
+            obs=obs,
+            action=acted.action,
+            env_action=action,
+            valid=playing,
+            mask=mask,
+            dist_params=acted.dist_params,
+            overridden=overridden,
+        )
         raw = self.engine.step(action)
         self.kept["age"] += 1
         self.kept["elapsed"] += 1
         if playing is not None:
             self.kept["elapsed"][searching] = 0
         step = raw.seen(obs, action, self.kept["age"].copy())
-        judged = self._judge(step, playing)
-        ended = judged.terminated | judged.truncated
-        if out is not None:
-            out.write(
-                obs=obs,
-                action=acted.action,
-                reward=judged.reward,
-                terminated=judged.terminated,
-                truncated=judged.truncated,
-                next_obs=raw.next_obs,
-                valid=playing,
-                mask=mask,
-                next_mask=self.engine.mask(),
-                dist_params=acted.dist_params,
-                overridden=overridden,
-                **raw_columns(step, self.kept["elapsed"], self._record),
-            )
-            out.next()
-        self._count(raw, judged, playing)
+        end = self._ends(step, playing)
+        out.write(
+            next_obs=raw.next_obs,
+            next_mask=self.engine.mask(),
+            env_reward=raw.reward,
+            env_terminated=raw.terminated,
+            env_truncated=raw.truncated,
+            call_elapsed=self.kept["elapsed"],
+            call_end=end,
+        )
         if memory is not None and acted.recurrent_state is not None:
             memory[:] = acted.recurrent_state
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs
-        over = ended
+        called = np.flatnonzero(end)
+        over = called
         if playing is not None:
-            over = np.where(playing, ended, raw.terminated | raw.truncated)
-        ids = np.flatnonzero(over)
-        if len(ids):
-            called = ids if playing is None else np.flatnonzero(playing & ended)
-            success = None if judged.success is None else judged.success[called]
-            self._tell(called, raw.info, success, task=self.skill is not None)
-            more = self._call_again(called[(judged.truncated & ~raw.truncated)[called]])
-            self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
+            over = np.flatnonzero(np.where(playing, end != 0, raw.terminated | raw.truncated))
+        if len(over):
+            success = judge(None, step).success if self.skill is None else None
+            success = None if success is None else success[called]
+            self._tell(out.row, called, raw.info, success, task=self.skill is not None)
+            more = self._call_again(called[end[called] == CallEnd.LIMIT])
+            self._begin_anew(np.setdiff1d(over, more) if len(more) else over)
         if playing is not None:
-            going_on = searching[~over[searching]]
+            going_on = searching[~(raw.terminated | raw.truncated)[searching]]
             part = seen_by(None, step, step.elapsed[going_on], going_on)
             free = self._starters.observe(going_on, part)
             left = self.kept["calls_left"]
             left[free] = np.maximum(left[free] - 1, 0)
             self._give_up(self._look(going_on))
+        out.next(raw.info)
+
+    def _ends(self, step: Step, playing: Array | None) -> Array:
+        """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
+        end = np.zeros(self.num_envs, np.int8)
+        rows = self._all if playing is None else np.flatnonzero(playing)
+        skill = self.skill
+        if skill is not None and len(rows):
+            part = seen_by(skill, step, self.kept["elapsed"][rows], rows)
+            end[rows[part.timed_out]] = CallEnd.LIMIT
+            end[rows[judge(skill, part, rows).stops]] = CallEnd.OWN
+        end[rows[(step.terminated | step.truncated)[rows]]] = CallEnd.EPISODE
+        return end
+
+    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+        acts, elapsed = trace.valid_rows, trace["call_elapsed"]
+        steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"])
+        self._steps = steps.replace(valid=trace.get("valid"))
+        found = self._count(
+            np.stack([steps["reward"], trace["env_reward"] * acts, acts], -1, dtype=np.float64)
+        )
+        if self.skill is not None and self.skill.defines("success"):
+            success = successes_of(trace, self.skill, acts, elapsed)
+            for row, ids, episodes in found:
+                episodes[:, SUCCESS] = success[row, ids]
+        return found
+
+    def _views(self, trace: Trace) -> dict[str, Batch]:
+        names = ("obs", "action", "next_obs", "mask", "next_mask", "dist_params", "overridden")
+        batch = self._steps.replace(
+            **{name: trace.get(name) for name in names},
+            steps=np.ones(trace.lead, np.int64),
+            **raw_columns(trace, self._record),
+        )
+        if self._before is None:
+            return {"": batch}
+        starts = np.concatenate([self._starts[None], batch.ended[:-1]])
+        if (valid := batch.get("valid")) is not None:  # the first row after a search
+            starts[1:] |= valid[1:] & ~valid[:-1]
+        return {"": batch.replace(recurrent_state=self._before, episode_start=starts)}
 
     def _call_again(self, limited: Array) -> Array:
         """The skill's calls in environments ``limited`` (k,) ended at its limit and nothing else.
@@ -276,28 +297,3 @@ class SkillCollector(Collector):
         if self._search_steps is None:
             return f"of {by}"
         return f"of {by}, reset after {self._search_steps:,} of them (search_steps)"
-
-    def _judge(self, step: Step, playing: Array | None) -> Judged:
-        """Judge a step for the skill; anything where it did not play."""
-        rows = self._all if playing is None else np.flatnonzero(playing)
-        elapsed = self.kept["elapsed"][rows]
-        outcome = judge(self.skill, seen_by(self.skill, step, elapsed, rows), rows)
-        if playing is None:
-            ends = outcome.terminated, outcome.truncated
-            return Judged(outcome.reward, *ends, outcome.success)
-        knows = self.skill is not None and self.skill.defines("success")
-        rewards, never = np.zeros(self.num_envs, np.float32), self._never
-        found = Judged(rewards, never.copy(), never.copy(), never.copy() if knows else None)
-        if len(rows):
-            found.reward[rows], found.terminated[rows] = outcome.reward, outcome.terminated
-            found.truncated[rows] = outcome.truncated
-            if found.success is not None:
-                found.success[rows] = outcome.success
-        return found
-
-    def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:
-        """Keep the sums of the open episodes."""
-        sums: Any = self.kept["sums"]
-        sums[:, 0] += judged.reward
-        sums[:, 1] += raw.reward if playing is None else raw.reward * playing
-        sums[:, 2] += 1 if playing is None else playing

@@ -1,0 +1,235 @@
+"""Calls of a trace: a selector's decisions, each with the whole call that followed it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.guide import as_logits
+from skillweave.collecting.levels import SELECTOR, Level
+from skillweave.experience import Batch, Trace, padded_last_axis
+from skillweave.types import Array
+
+
+class OpenCalls:
+    """The calls of one selector that are open at the end of a request.
+
+    Args:
+        level: whose selector it is.
+        num_envs: N.
+        shaped: the collector's dict of arrays (N, …) whose shape is known when a call starts.
+        keep_rewards: of each call, keep the reward of every step.
+    """
+
+    def __init__(
+        self, level: Level, num_envs: int, shaped: dict[str, Array], *, keep_rewards: bool = False
+    ) -> None:
+        n, player, self._shaped = num_envs, level.player, shaped
+        self.level, self.keep_rewards = level, keep_rewards
+        self.memory_size = 0 if level.selector is None else level.selector.acting.memory_size
+        self.kept: dict[str, Array] = {
+            "acted": np.zeros(n, bool),  # the level acted in the latest step
+            "open": np.zeros(n, bool),  # a call is open
+            "first": np.zeros(n, bool),  # the selector's memory was empty before this call
+            "reward": np.zeros(n),  # Σ γᵏ rₖ
+            "discount": np.zeros(n),  # γ^τ
+            "tau": np.zeros(n, np.int64),
+            "choice": np.zeros(n, np.int64),
+            "before": np.zeros((n, self.memory_size), np.float32),  # the selector's memory
+        }
+        """Of each environment, (N, …); changed in place."""
+        guide, choices = player.guide, player.skills.choices
+        if player.restricts or guide is not None:
+            self.kept["allowed"] = np.ones((n, choices), bool)  # when it decided
+        if guide is not None:
+            self.kept["guide_allows"] = np.ones((n, choices), bool)  # after the latest step
+        if guide is not None and guide.tells:
+            self.kept["chances"] = np.zeros((n, choices), np.float32)  # of the guide's choice
+
+    def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
+        """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
+
+        The return of a decision is Σ γᵏ rₖ over its call, less the cost of a call. A call whose
+        level does not act any more is cut: its value goes on where another skill acts.
+
+        Args:
+            steps: the level's steps, as its selector is judged by them; ``valid`` where it acts.
+            closes: (T, N) bool, the selector's call is over after this step.
+            gamma: (N,) float64, the discount of one step.
+        """
+        ends = self._ends(trace, steps, closes, gamma)
+        batch = self._batch(trace, steps, ends)
+        self._keep(trace)
+        return batch
+
+    def _ends(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> dict[str, Array]:
+        """Find the calls that end, in the order of time; open ones go on in place.
+
+        Returns:
+            Of each, (K,): ``row`` and ``env`` of its last step (or of the step in which another
+            skill acts: ``cut``), the row in which it was ``decided`` on (−1: in an earlier
+            request), ``first``, ``reward``, ``steps``; perhaps the ``rewards`` (K, L) of its steps.
+        """
+        kept = self.kept
+        acted, is_open, total, weight, tau = (
+            kept[name] for name in ("acted", "open", "reward", "discount", "tau")
+        )
+        lead, acts, reward = trace.lead, steps["valid"], steps["reward"]
+        reset = trace["call_end"] == CallEnd.EPISODE
+        choice = trace.get(self.level.path + "choice")
+        begins = np.zeros(lead, bool) if choice is None else choice >= 0
+        over, cut, first = (np.zeros(lead, bool) for _ in range(3))
+        lasted, decided = np.zeros(lead, np.int64), np.full(lead, -1)
+        sums, rewards, latest = np.zeros(lead), list[Array](), np.full(lead[1], -1)
+        for t in range(len(begins)):
+            np.logical_and(is_open, ~acts[t], out=cut[t])
+            new = begins[t]
+            total[new], weight[new], tau[new] = 0.0, 1.0, 0
+            latest[new], kept["first"][new] = t, ~acted[new]
+            is_open[cut[t]], is_open[new] = False, True
+            if self.keep_rewards:
+                self._keep_rewards(new, is_open, reward[t])
+            np.add(total, weight * reward[t], out=total, where=is_open)
+            np.multiply(weight, gamma, out=weight, where=is_open)
+            tau += is_open
+            ends = closes[t] & is_open
+            np.logical_or(ends, cut[t], out=over[t])
+            sums[t], lasted[t], decided[t], first[t] = total, tau, latest, kept["first"]
+            if self.keep_rewards and over[t].any():
+                rewards.append(self._shaped[self.level.path + "rewards"][over[t]])
+            is_open[ends] = False
+            acted[:] = acts[t] & ~reset[t]
+            for values in (total, weight, tau):
+                values[reset[t]] = 0
+        self._decided = latest
+        row, env = np.nonzero(over)
+        columns = {"cut": cut, "decided": decided, "first": first, "reward": sums, "steps": lasted}
+        found = {name: values[row, env] for name, values in columns.items()}
+        if self.keep_rewards:
+            parts = padded_last_axis([*rewards, np.zeros((0, 1), np.float32)])
+            found["rewards"] = np.concatenate(parts)
+        return found | {"row": row, "env": env}
+
+    def _keep_rewards(self, new: Array, is_open: Array, reward: Array) -> None:
+        """Keep the reward of this step of the open calls; all (N,), ``new`` ones start."""
+        tau = self.kept["tau"]
+        longest = int(tau.max()) + 1
+        rewards = self._shaped.get(self.level.path + "rewards")
+        if rewards is None:
+            rewards = np.zeros((len(tau), 16), np.float32)
+        if longest > rewards.shape[1]:
+            rewards = np.pad(rewards, ((0, 0), (0, longest)))
+        rewards[new] = 0.0
+        rewards[is_open, tau[is_open]] = reward[is_open]
+        self._shaped[self.level.path + "rewards"] = rewards
+
+    def _batch(self, trace: Trace, steps: Batch, ends: Mapping[str, Array]) -> Batch:
+        """Return the calls that ended as columns (D, N): some have more of them than others."""
+        row, env, cut = ends["row"], ends["env"], ends["cut"]
+        values = self._at_decisions(trace, ends)
+        values |= {
+            "reward": (ends["reward"] - self.level.player.skills.call_cost).astype(np.float32),
+            "steps": ends["steps"],
+            "terminated": steps["terminated"][row, env] & ~cut,
+            "truncated": steps["truncated"][row, env] | cut,
+            "next_obs": trace["next_obs"][row, env],
+            "episode_start": ends["first"],
+        }
+        if cut.any():
+            values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
+        if "mask" in values:
+            values["next_mask"] = self._next_mask(trace, values, ends)
+        if "chances" in values:
+            values["guide"] = as_logits(values.pop("chances"), values["mask"])
+        if self.keep_rewards:
+            values["rewards"] = ends["rewards"]
+        return self._laid_out(values, env)
+
+    def _decision_columns(self) -> Mapping[str, tuple[str, Array | None]]:
+        """By a row's name: the column of the trace, and the same of the calls that were open."""
+        kept, shaped, path = self.kept, self._shaped, self.level.path
+        learner = path + SELECTOR
+        found: dict[str, tuple[str, Array | None]] = {
+            "obs": ("obs", shaped.get(path + "obs")),
+            "action": (path + "choice", kept["choice"]),
+            "dist_params": (f"{learner}/dist_params", shaped.get(path + "head")),
+        }
+        if self.memory_size:
+            found["recurrent_state"] = f"{learner}/state_before", kept["before"]
+        if "allowed" in kept:
+            found["mask"] = path + "allowed", kept["allowed"]
+        if "chances" in kept:
+            found["chances"] = path + "chances", kept["chances"]
+        return found
+
+    def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
+        """Return what stood where calls were decided on, (K, …), by a row's names."""
+        decided, env, found = ends["decided"], ends["env"], dict[str, Array]()
+        earlier = decided < 0
+        for name, (column, before) in self._decision_columns().items():
+            here = trace.get(column)
+            if here is not None:
+                found[name] = here[decided, env]
+                if before is not None:
+                    found[name][earlier] = before[env[earlier]]
+            elif before is not None:
+                found[name] = before[env]
+        return found
+
+    def _next_mask(
+        self, trace: Trace, values: Mapping[str, Array], ends: Mapping[str, Array]
+    ) -> Array:
+        """Return where skills may start in the true successors; all where that does not matter."""
+        mask = np.ones_like(values["mask"])
+        on = np.flatnonzero(~values["terminated"])
+        if not len(on):
+            return mask
+        may = self.level.player.skills.startable(values["next_obs"][on])
+        if "guide_allows" in self.kept:
+            # Where the level does not act any more, the guide stands where it stood.
+            row, env = (ends["row"] - ends["cut"])[on], ends["env"][on]
+            allows = trace[self.level.path + "guide_allows"][row, env]
+            earlier = row < 0
+            allows[earlier] = self.kept["guide_allows"][env[earlier]]
+            may = may & allows
+        mask[on] = may | ~may.any(axis=1, keepdims=True)
+        return mask
+
+    def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:
+        """Return values (K, …) of environments ``env`` (K,) as (D, N, …), by environment."""
+        n = len(self.kept["tau"])
+        count = np.bincount(env, minlength=n)
+        order = np.argsort(env, kind="stable")
+        place = np.empty(len(env), np.int64)
+        place[order] = np.arange(len(env)) - (count.cumsum() - count).repeat(count)
+        height = max(1, int(count.max()))
+        found: dict[str, Any] = {}
+        for name, value in values.items():
+            found[name] = np.zeros((height, n, *value.shape[1:]), value.dtype)
+            found[name][place, env] = value
+        memory, starts = found.pop("recurrent_state", None), found.pop("episode_start")
+        valid = np.arange(height)[:, None] < count
+        return Batch(
+            **found,
+            valid=None if valid.all() else valid,
+            recurrent_state=None if memory is None else memory[0],
+            episode_start=None if memory is None else starts,
+        )
+
+    def _keep(self, trace: Trace) -> None:
+        """Keep what was decided of calls that are still open."""
+        env = np.flatnonzero(self.kept["open"] & (self._decided >= 0))
+        for column, held in list(self._decision_columns().values()):
+            here = trace.get(column)
+            if here is None:
+                continue
+            if held is None or held.shape[1:] != here.shape[2:]:
+                held = np.zeros(here.shape[1:], here.dtype)
+                name = "obs" if column == "obs" else "head"
+                self._shaped[self.level.path + name] = held
+            held[env] = here[self._decided[env], env]
+        if "guide_allows" in self.kept:
+            self.kept["guide_allows"][:] = trace[self.level.path + "guide_allows"][-1]
