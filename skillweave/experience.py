@@ -60,15 +60,16 @@ SCHEMA: dict[str, Column] = {
     "env_terminated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own end
     "env_truncated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own limit
     "call_elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the call so far
-    # In a trace, by the path of a level (``inner/skill``) or of a learner (``inner/up/action``):
+    # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
     "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
-    "choice": Column(fill=-1, raw=True, rollout=False),  # (T, N) int64; -1: no decision here
-    "allowed": Column(fill=True, raw=True, rollout=False),  # (T, N, A) bool, of that decision
-    "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's choice there
-    "state_before": Column(raw=True, rollout=False),  # (T, N, M) float32, recurrent, before it
-    "guide_allows": Column(fill=True, raw=True, rollout=False),  # (T, N, A) bool, after the step
+    "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
+    "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices
+    # Under the path of a learner (``inner/selector/decided``), where it decided:
+    "decided": Column(raw=True, rollout=False),  # (T, N) bool, here
+    "allowed": Column(raw=True, rollout=False),  # (T, N, A) bool, among which choices
+    "state_before": Column(raw=True, rollout=False),  # (T, N, M) float32, its recurrent state
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
 INFO = "info."

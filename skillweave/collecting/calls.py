@@ -10,6 +10,7 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import as_logits
 from skillweave.collecting.levels import SELECTOR, Level
+from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.types import Array
 
@@ -38,16 +39,12 @@ class OpenCalls:
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
             "choice": np.zeros(n, np.int64),
-            "before": np.zeros((n, self.memory_size), np.float32),  # the selector's memory
         }
         """Of each environment, (N, …); changed in place."""
-        guide, choices = player.guide, player.skills.choices
-        if player.restricts or guide is not None:
-            self.kept["allowed"] = np.ones((n, choices), bool)  # when it decided
-        if guide is not None:
-            self.kept["guide_allows"] = np.ones((n, choices), bool)  # after the latest step
-        if guide is not None and guide.tells:
-            self.kept["chances"] = np.zeros((n, choices), np.float32)  # of the guide's choice
+        if self.memory_size:
+            self.kept["before"] = np.zeros((n, self.memory_size), np.float32)  # the selector's
+        if player.restricts or player.guide is not None:
+            self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
 
     def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
         """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
@@ -79,8 +76,8 @@ class OpenCalls:
         )
         lead, acts, reward = trace.lead, steps["valid"], steps["reward"]
         reset = trace["call_end"] == CallEnd.EPISODE
-        choice = trace.get(self.level.path + "choice")
-        begins = np.zeros(lead, bool) if choice is None else choice >= 0
+        begins = trace.get(f"{self.level.path}{SELECTOR}/decided")
+        begins = np.zeros(lead, bool) if begins is None else begins
         over, cut, first = (np.zeros(lead, bool) for _ in range(3))
         lasted, decided = np.zeros(lead, np.int64), np.full(lead, -1)
         sums, rewards, latest = np.zeros(lead), list[Array](), np.full(lead[1], -1)
@@ -129,8 +126,7 @@ class OpenCalls:
     def _batch(self, trace: Trace, steps: Batch, ends: Mapping[str, Array]) -> Batch:
         """Return the calls that ended as columns (D, N): some have more of them than others."""
         row, env, cut = ends["row"], ends["env"], ends["cut"]
-        values = self._at_decisions(trace, ends)
-        values |= {
+        values = self._at_decisions(trace, ends) | {
             "reward": (ends["reward"] - self.level.player.skills.call_cost).astype(np.float32),
             "steps": ends["steps"],
             "terminated": steps["terminated"][row, env] & ~cut,
@@ -140,62 +136,53 @@ class OpenCalls:
         }
         if cut.any():
             values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
+        if self.level.selector is not None:
+            values["action"] = np.asarray(self.level.selector.acting.to_env(values["action"]))
         if "mask" in values:
-            values["next_mask"] = self._next_mask(trace, values, ends)
-        if "chances" in values:
-            values["guide"] = as_logits(values.pop("chances"), values["mask"])
+            values["next_mask"] = self._next_mask(trace, values, row, env)
+        if (chances := trace.get(self.level.path + "chances")) is not None:
+            values["guide"] = as_logits(chances[row, env], values["mask"])
         if self.keep_rewards:
             values["rewards"] = ends["rewards"]
         return self._laid_out(values, env)
 
-    def _decision_columns(self) -> Mapping[str, tuple[str, Array | None]]:
-        """By a row's name: the column of the trace, and the same of the calls that were open."""
-        kept, shaped, path = self.kept, self._shaped, self.level.path
-        learner = path + SELECTOR
-        found: dict[str, tuple[str, Array | None]] = {
-            "obs": ("obs", shaped.get(path + "obs")),
-            "action": (path + "choice", kept["choice"]),
-            "dist_params": (f"{learner}/dist_params", shaped.get(path + "head")),
-        }
-        if self.memory_size:
-            found["recurrent_state"] = f"{learner}/state_before", kept["before"]
-        if "allowed" in kept:
-            found["mask"] = path + "allowed", kept["allowed"]
-        if "chances" in kept:
-            found["chances"] = path + "chances", kept["chances"]
+    def _decided_on(self) -> dict[str, tuple[str, str, Array | None]]:
+        """By a row's name: the selector's column, its name here, and the values of open calls."""
+        path, found = self.level.path, dict[str, tuple[str, str, Array | None]]()
+        for name, column, here in _DECIDED_ON:
+            kept = self.kept.get(here)
+            held = self._shaped.get(path + here) if kept is None else kept
+            found[name] = f"{path}{SELECTOR}/{column}", here, held
         return found
 
     def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
         """Return what stood where calls were decided on, (K, …), by a row's names."""
         decided, env, found = ends["decided"], ends["env"], dict[str, Array]()
         earlier = decided < 0
-        for name, (column, before) in self._decision_columns().items():
-            here = trace.get(column)
-            if here is not None:
-                found[name] = here[decided, env]
-                if before is not None:
-                    found[name][earlier] = before[env[earlier]]
-            elif before is not None:
-                found[name] = before[env]
+        for name, (column, _, held) in self._decided_on().items():
+            values = trace.get(column)
+            if values is not None:
+                found[name] = values[decided, env]
+                if held is not None:  # other networks have chosen, if it has another shape
+                    fits = held.shape[1:] == values.shape[2:]
+                    found[name][earlier] = held[env[earlier]] if fits else 0
+            elif held is not None:
+                found[name] = held[env]
+            if name in ("dist_params", "recurrent_state") and name in found:
+                found[name] = known(found[name])
         return found
 
     def _next_mask(
-        self, trace: Trace, values: Mapping[str, Array], ends: Mapping[str, Array]
+        self, trace: Trace, values: Mapping[str, Array], row: Array, env: Array
     ) -> Array:
         """Return where skills may start in the true successors; all where that does not matter."""
-        mask = np.ones_like(values["mask"])
+        mask, level = np.ones_like(values["mask"]), self.level
         on = np.flatnonzero(~values["terminated"])
-        if not len(on):
-            return mask
-        may = self.level.player.skills.startable(values["next_obs"][on])
-        if "guide_allows" in self.kept:
-            # Where the level does not act any more, the guide stands where it stood.
-            row, env = (ends["row"] - ends["cut"])[on], ends["env"][on]
-            allows = trace[self.level.path + "guide_allows"][row, env]
-            earlier = row < 0
-            allows[earlier] = self.kept["guide_allows"][env[earlier]]
-            may = may & allows
-        mask[on] = may | ~may.any(axis=1, keepdims=True)
+        if len(on):
+            may = level.player.skills.startable(values["next_obs"][on])
+            if (allows := trace.get(level.path + "guide_allows")) is not None:
+                may &= allows[row[on], env[on]]
+            mask[on] = may | ~may.any(axis=1, keepdims=True)
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:
@@ -222,14 +209,23 @@ class OpenCalls:
     def _keep(self, trace: Trace) -> None:
         """Keep what was decided of calls that are still open."""
         env = np.flatnonzero(self.kept["open"] & (self._decided >= 0))
-        for column, held in list(self._decision_columns().values()):
-            here = trace.get(column)
-            if here is None:
+        for column, here, held in self._decided_on().values():
+            values = trace.get(column)
+            if values is None:
                 continue
-            if held is None or held.shape[1:] != here.shape[2:]:
-                held = np.zeros(here.shape[1:], here.dtype)
-                name = "obs" if column == "obs" else "head"
-                self._shaped[self.level.path + name] = held
-            held[env] = here[self._decided[env], env]
-        if "guide_allows" in self.kept:
-            self.kept["guide_allows"][:] = trace[self.level.path + "guide_allows"][-1]
+            if here not in self.kept and (held is None or held.shape[1:] != values.shape[2:]):
+                held = np.zeros(values.shape[1:], values.dtype)
+                self._shaped[self.level.path + here] = held
+            if held is not None:
+                now = values[self._decided[env], env]
+                held[env] = known(now) if here in ("head", "before") else now
+
+
+_DECIDED_ON = (
+    ("obs", "obs", "obs"),
+    ("action", "action", "choice"),
+    ("dist_params", "dist_params", "head"),
+    ("mask", "allowed", "allowed"),
+    ("recurrent_state", "state_before", "before"),
+)
+"""Names of a row of decisions, of a selector's columns, and of what is kept of open calls."""

@@ -229,6 +229,12 @@ class Collector:
             if name not in self.after_request:
                 kept[ids] = 0
 
+    def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
+        """Keep arrays (N, …) that change when the steps of a request are judged."""
+        named = {prefix + name: value for name, value in kept.items()}
+        self.kept |= named
+        self.after_request |= named.keys()
+
     def _clear(self, ids: Array) -> None:
         """Nothing of environments ``ids`` (k,) is left of the requests before."""
         for name in self.after_request:

@@ -14,7 +14,6 @@ from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.player import LearnerActor, Player
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.experience import Trace
 from skillweave.skills import Skill
 from skillweave.types import Array, Policy
 
@@ -50,11 +49,12 @@ def with_learners(
     def policy_of(skill: Skill, policy: Any) -> Any:
         name = path + skill.name
         if name in learners:
-            return LearnerActor(learners[name])
+            return LearnerActor(learners[name], name)
         if not isinstance(policy, UntrainedHierarchy):
             return policy
-        chooser = learners.get(f"{name}/{SELECTOR}")
-        selector = policy.selector if chooser is None else LearnerActor(chooser)
+        selector: Any = policy.selector
+        if (chooser := f"{name}/{SELECTOR}") in learners:
+            selector = LearnerActor(learners[chooser], chooser, decides=True)
         below = with_learners(policy.skills, learners, margins, f"{name}/")
         return Player(below, selector, policy.guide)
 
@@ -76,7 +76,7 @@ def _worth(critic: Acting) -> Callable[[Array], Array]:
     return worth
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Level:
     """Skills below one selector: the root's, or those of a skill that is a hierarchy and learns."""
 
@@ -125,29 +125,3 @@ class Level:
         yield self
         for level in self.below.values():
             yield from level.all()
-
-    def leaf(self, trace: Trace, first: int = 1) -> tuple[Array, int]:
-        """Return the number of the leaf that acts in each row of a trace, (T, N).
-
-        Args:
-            first: the number of this level's first leaf.
-
-        Returns:
-            The numbers, and the first number that is free.
-        """
-        running = trace[self.path + "skill"]
-        found = np.zeros(running.shape, np.int64)
-        for i in range(len(self.skills)):
-            acts = running == i
-            if i in self.below:
-                inside, first = self.below[i].leaf(trace, first)
-                found[acts] = inside[acts]
-                continue
-            found[acts] = first
-            first += 1
-        return found, first
-
-    def leaves(self) -> int:
-        """Return the number of leaves, here and below."""
-        below = sum(level.leaves() for level in self.below.values())
-        return len(self.skills) - len(self.below) + below

@@ -20,11 +20,12 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.acting import Acted, Acting
+from skillweave.collecting.acting import Acting
 from skillweave.collecting.call_end import CallEnd, Interruption
 from skillweave.collecting.guide import ActiveGuide, LastCall
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError
 from skillweave.skills import apply_reflexes, path_of
@@ -44,6 +45,8 @@ class Turn:
     """(N,), steps of the episodes so far, for messages."""
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
+    trace: TraceWriter | None = None
+    """Where those who learn write what they choose; None: nothing is recorded."""
 
 
 class Actor(Protocol):
@@ -100,29 +103,21 @@ class PolicyActor:
         _put(memory, rows, self._policy.observe({k: v[rows] for k, v in memory.items()}, step))
 
 
-@dataclass
-class Choice:
-    """A learner's latest actions, and what they followed from."""
-
-    rows: Array  # (k,) environments
-    obs: Array  # (k, …)
-    acted: Acted
-    mask: Array | None  # (k, A) bool
-    recurrent_state: Array | None  # (k, M), before
-
-
 class LearnerActor:
-    """A network that learns, among the actors; its latest choice is recorded.
+    """A network that learns, among the actors; what it chooses is written into the trace.
 
     Args:
         acting: the network.
+        path: of the learner, before the names of its columns.
+        decides: it is a selector: what it decided on is written, too.
     """
 
     watches = False
 
-    def __init__(self, acting: Acting) -> None:
+    def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
         self.acting = acting
-        self.latest: Choice | None = None
+        names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
+        self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -141,7 +136,10 @@ class LearnerActor:
         acted = self.acting.some(rows, obs, mask, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
-        self.latest = Choice(rows, obs, acted, mask, before)
+        if turn.trace is not None:
+            every = np.ones(len(rows), bool)
+            values = acted.action, acted.dist_params, every, obs, mask, before
+            turn.trace.write(rows, **dict(zip(self._columns, values, strict=False)))
         actions: Array = self.acting.to_env(acted.action)
         return actions
 
@@ -237,7 +235,7 @@ class Player:
     ) -> Array:
         """Return actions (k, …) as of ``act``, where calls run in all environments ``rows``."""
         running, actions = memory["skill"][rows], None
-        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden)
+        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden, turn.trace)
         for i, actor in enumerate(self.actors):
             mine = np.flatnonzero(running == i)
             if not len(mine):
@@ -336,7 +334,7 @@ class Player:
             assert may is not None, "nothing chooses"
             choice = may.argmax(axis=1)  # the guide has left one
         else:
-            how = Turn(greedy, turn.rng, turn.age)
+            how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
         self.begin(memory, rows, choice)
 

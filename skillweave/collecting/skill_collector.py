@@ -200,7 +200,7 @@ class SkillCollector(Collector):
         batch = self._steps.replace(
             **{name: trace.get(name) for name in names},
             steps=np.ones(trace.lead, np.int64),
-            **raw_columns(trace, self._record),
+            **raw_columns(trace, self._record, trace["call_elapsed"]),
         )
         if self._before is None:
             return {"": batch}

@@ -95,16 +95,22 @@ def judged(
     return np.concatenate(each)
 
 
-def raw_columns(trace: Trace, names: Sequence[str]) -> dict[str, Array]:
+def raw_columns(trace: Trace, names: Sequence[str], elapsed: Array) -> dict[str, Array]:
     """Return raw columns by name, (T, N, …) each.
+
+    Args:
+        elapsed: (T, N) int64, steps of the calls so far.
 
     Raises:
         EnvError: no environment gives a key of ``info`` that is wanted.
     """
-    return {
-        name: _info_column(trace, name.removeprefix(INFO)) if name.startswith(INFO) else trace[name]
-        for name in names
-    }
+    found: dict[str, Array] = {}
+    for name in names:
+        if name.startswith(INFO):
+            found[name] = _info_column(trace, name.removeprefix(INFO))
+        else:
+            found[name] = elapsed if name == "call_elapsed" else trace[name]
+    return found
 
 
 def _info_column(trace: Trace, key: str) -> Array:
