@@ -20,7 +20,7 @@ from skillweave.collecting.levels import CRITIC, SELECTOR, Level, with_learners
 from skillweave.collecting.player import LearnerActor, Player, Turn
 from skillweave.collecting.restored import ranges_of
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.collecting.views import raw_columns, rewards_of, steps_of, timed_out
+from skillweave.collecting.views import rewards_of, rows_of, steps_of, timed_out
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
@@ -276,15 +276,9 @@ class HierarchyCollector(Collector):
         # Elsewhere it is called again at once.
         ends = (end == CallEnd.EPISODE) | timed_out(trace, skill, elapsed)
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        names = ("obs", "next_obs", "mask", "next_mask", "overridden")
-        action = trace.get(f"{path}/action")
-        batch = steps.replace(
-            **{name: trace.get(name) for name in names},
-            action=self._no_actions(trace.lead) if action is None else action,
-            steps=np.ones(trace.lead, np.int64),
-            dist_params=trace.get(f"{path}/dist_params"),
-            **raw_columns(trace, self._record, elapsed),
-        )
+        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record)
+        if "action" not in batch:
+            batch = batch.replace(action=self._no_actions(trace.lead))
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]

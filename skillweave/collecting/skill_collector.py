@@ -10,7 +10,7 @@ from skillweave.collecting.collector import SUCCESS, Collector
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.start_policy import StartPolicy
-from skillweave.collecting.views import raw_columns, steps_of, successes_of
+from skillweave.collecting.views import rows_of, steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.engine import Engine
 from skillweave.errors import TrainingError
@@ -196,12 +196,7 @@ class SkillCollector(Collector):
         return found
 
     def _views(self, trace: Trace) -> dict[str, Batch]:
-        names = ("obs", "action", "next_obs", "mask", "next_mask", "dist_params", "overridden")
-        batch = self._steps.replace(
-            **{name: trace.get(name) for name in names},
-            steps=np.ones(trace.lead, np.int64),
-            **raw_columns(trace, self._record, trace["call_elapsed"]),
-        )
+        batch = rows_of(trace, self._steps, "", trace["call_elapsed"], self._record)
         if self._before is None:
             return {"": batch}
         starts = np.concatenate([self._starts[None], batch.ended[:-1]])

@@ -95,25 +95,28 @@ def judged(
     return np.concatenate(each)
 
 
-def raw_columns(trace: Trace, names: Sequence[str], elapsed: Array) -> dict[str, Array]:
-    """Return raw columns by name, (T, N, …) each.
+def rows_of(trace: Trace, steps: Batch, path: str, elapsed: Array, record: Sequence[str]) -> Batch:
+    """Return the steps of a learner with all that it may learn from.
 
     Args:
-        elapsed: (T, N) int64, steps of the calls so far.
+        path: before the names of the learner's own columns: empty, or ``inner/up/``.
+        elapsed: (T, N) int64, steps of its calls so far.
+        record: names of raw columns.
 
     Raises:
         EnvError: no environment gives a key of ``info`` that is wanted.
     """
-    found: dict[str, Array] = {}
-    for name in names:
-        if name.startswith(INFO):
-            found[name] = _info_column(trace, name.removeprefix(INFO))
-        else:
-            found[name] = elapsed if name == "call_elapsed" else trace[name]
-    return found
+    names = ("obs", "next_obs", "mask", "next_mask", "overridden", *record)
+    own = ("action", "dist_params")
+    found = {k: _info_column(trace, k) if k.startswith(INFO) else trace.get(k) for k in names}
+    if "call_elapsed" in record:
+        found["call_elapsed"] = elapsed
+    found |= {k: trace.get(path + k) for k in own} | {"steps": np.ones(trace.lead, np.int64)}
+    return steps.replace(**found)
 
 
-def _info_column(trace: Trace, key: str) -> Array:
+def _info_column(trace: Trace, name: str) -> Array:
+    key = name.removeprefix(INFO)
     for info in trace.infos:
         if key not in info:
             raise EnvError(f"info[{key!r}] is to be recorded, but {missing_key(info)}")

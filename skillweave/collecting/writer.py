@@ -87,17 +87,10 @@ class _Uncopied:
     def __init__(self, key: str) -> None:
         self._key = key
 
-    def __getattr__(self, name: str) -> Any:
-        raise self._error()
-
-    def __getitem__(self, row: Any) -> Any:
-        raise self._error()
-
-    def __array__(self, *args: Any, **kwargs: Any) -> Any:
-        raise self._error()
-
-    def _error(self) -> EnvError:
-        return EnvError(
+    def _refuse(self, *_: Any) -> Any:
+        raise EnvError(
             f"info[{self._key!r}] holds an object that cannot be copied, and rewards are computed "
             "after the steps of a round: let the environment set numbers or arrays there"
         )
+
+    __getattr__ = __getitem__ = __array__ = __iter__ = __len__ = _refuse
