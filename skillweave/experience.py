@@ -146,7 +146,7 @@ class Batch(Mapping[str, Array]):
 
 
 class Trace(Batch):
-    """What happened in T steps of N environments, for everyone who learns from it.
+    """Record of T steps of N environments, from which every learner gets its rows.
 
     Its columns are raw: what the environments did, who acted, and why calls ended. The columns of
     a level have its path before their name, those of a learner the learner's.
