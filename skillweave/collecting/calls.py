@@ -38,11 +38,11 @@ class OpenCalls:
             "reward": np.zeros(n),  # Σ γᵏ rₖ
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
-            "choice": np.zeros(n, np.int64),
+            "action": np.zeros(n, np.int64),  # the choice
         }
         """Of each environment, (N, …); changed in place."""
         if self.memory_size:
-            self.kept["before"] = np.zeros((n, self.memory_size), np.float32)  # the selector's
+            self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
         if player.restricts or player.guide is not None:
             self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
 
@@ -146,31 +146,32 @@ class OpenCalls:
             values["rewards"] = ends["rewards"]
         return self._laid_out(values, env)
 
-    def _decided_on(self) -> dict[str, tuple[str, str, Array | None]]:
-        """By a row's name: the selector's column, its name here, and the values of open calls."""
-        path, found = self.level.path, dict[str, tuple[str, str, Array | None]]()
-        for name, column, here in _DECIDED_ON:
-            kept = self.kept.get(here)
-            held = self._shaped.get(path + here) if kept is None else kept
-            found[name] = f"{path}{SELECTOR}/{column}", here, held
-        return found
-
     def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
-        """Return what stood where calls were decided on, (K, …), by a row's names."""
-        decided, env, found = ends["decided"], ends["env"], dict[str, Array]()
-        earlier = decided < 0
-        for name, (column, _, held) in self._decided_on().items():
-            values = trace.get(column)
+        """Return what calls were decided on, (K, …), by the names of a row."""
+        found = {"obs": trace["next_obs"][ends["row"], ends["env"]]}  # if there is no call
+        earlier = ends["decided"] < 0
+        for name, column in DECIDED_ON.items():
+            values, held = self._decided_on(trace, column), self._held(column)
             if values is not None:
-                found[name] = values[decided, env]
+                found[name] = values[ends["decided"], ends["env"]]
                 if held is not None:  # other networks have chosen, if it has another shape
                     fits = held.shape[1:] == values.shape[2:]
-                    found[name][earlier] = held[env[earlier]] if fits else 0
+                    found[name][earlier] = held[ends["env"][earlier]] if fits else 0
             elif held is not None:
-                found[name] = held[env]
-            if name in ("dist_params", "recurrent_state") and name in found:
-                found[name] = known(found[name])
+                found[name] = held[ends["env"]]
         return found
+
+    def _decided_on(self, trace: Trace, name: str) -> Array | None:
+        """Return a column of the selector, (T, N, …); None: it has not decided."""
+        values: Array | None = trace.get(f"{self.level.path}{SELECTOR}/{name}")
+        if values is None or name not in ("dist_params", "state_before"):
+            return values
+        return known(values)  # of a member that has diverged, it may be NaN
+
+    def _held(self, name: str) -> Array | None:
+        """Return what open calls were decided on, (N, …); None: none was open before."""
+        kept = self.kept.get(name)
+        return self._shaped.get(self.level.path + name) if kept is None else kept
 
     def _next_mask(
         self, trace: Trace, values: Mapping[str, Array], row: Array, env: Array
@@ -209,23 +210,21 @@ class OpenCalls:
     def _keep(self, trace: Trace) -> None:
         """Keep what was decided of calls that are still open."""
         env = np.flatnonzero(self.kept["open"] & (self._decided >= 0))
-        for column, here, held in self._decided_on().values():
-            values = trace.get(column)
-            if values is None:
+        for name in DECIDED_ON.values():
+            if (values := self._decided_on(trace, name)) is None:
                 continue
-            if here not in self.kept and (held is None or held.shape[1:] != values.shape[2:]):
+            held = self._held(name)
+            if held is None or held.shape[1:] != values.shape[2:]:
                 held = np.zeros(values.shape[1:], values.dtype)
-                self._shaped[self.level.path + here] = held
-            if held is not None:
-                now = values[self._decided[env], env]
-                held[env] = known(now) if here in ("head", "before") else now
+                self._shaped[self.level.path + name] = held
+            held[env] = values[self._decided[env], env]
 
 
-_DECIDED_ON = (
-    ("obs", "obs", "obs"),
-    ("action", "action", "choice"),
-    ("dist_params", "dist_params", "head"),
-    ("mask", "allowed", "allowed"),
-    ("recurrent_state", "state_before", "before"),
-)
-"""Names of a row of decisions, of a selector's columns, and of what is kept of open calls."""
+DECIDED_ON = {
+    "obs": "obs",
+    "action": "action",
+    "dist_params": "dist_params",
+    "mask": "allowed",
+    "recurrent_state": "state_before",
+}
+"""By a name of decisions: the selector's column in a trace, and its name among open calls."""

@@ -285,7 +285,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
     return found
 
 
-_OF_LEARNERS = {"memory", "before", "player.selector.rnn"}
+_OF_LEARNERS = {"memory", "state_before", "player.selector.rnn"}
 """What is kept of the learners' memory: others begin without."""
 
 

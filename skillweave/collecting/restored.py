@@ -81,7 +81,7 @@ def opened(
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{name!r} of open calls is not finite")
     running = kept.get("player.end", np.ones(1, np.int8)) == CallEnd.RUNNING
-    if "choice" in kept and running.any() and "obs" not in found:
+    if "tau" in kept and running.any() and "obs" not in found:
         raise ValueError("it does not say where open calls began")
     return found
 
