@@ -80,7 +80,7 @@ def column(name: str) -> Column:
     """Return a column of ``SCHEMA``, perhaps under a path; or the column of a key of ``info``."""
     if name.startswith(INFO):
         return Column(raw=True, rollout=False)
-    return SCHEMA[name.rpartition("/")[2]]
+    return SCHEMA.get(name) or SCHEMA[name.rpartition("/")[2]]
 
 
 class Batch(Mapping[str, Array]):

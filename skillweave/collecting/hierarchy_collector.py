@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import EPISODE, LIMIT, RUNNING
 from skillweave.collecting.calls import OpenCalls
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.guide import ActiveGuide
@@ -162,7 +162,7 @@ class HierarchyCollector(Collector):
         end = self.player.observe(self.memory, self._all, step)
         terminated, truncated = self._ends(step, end)
         ended = np.flatnonzero(terminated | truncated)
-        end[ended] = CallEnd.EPISODE
+        end[ended] = EPISODE
         self._write(out, step, end)
         out.write(terminated=terminated, truncated=truncated)
         self.obs = raw.next_obs
@@ -184,7 +184,7 @@ class HierarchyCollector(Collector):
         outcome = judge(self.as_skill, seen_by(self.as_skill, step, step.elapsed), self._all)
         terminated, truncated = outcome.terminated, step.truncated | outcome.truncated
         if self.skills.restricts:
-            waits = np.flatnonzero(end != CallEnd.RUNNING)
+            waits = np.flatnonzero(end != RUNNING)
             truncated[waits] |= ~self.skills.startable(step.next_obs[waits]).any(axis=1)
         return terminated, truncated & ~terminated
 
@@ -230,7 +230,7 @@ class HierarchyCollector(Collector):
     def _views(self, trace: Trace) -> dict[str, Batch]:
         self._check_lengths()
         end = trace["call_end"]
-        return dict(self._of_level(trace, self.root, self._steps, end, end != CallEnd.RUNNING))
+        return dict(self._of_level(trace, self.root, self._steps, end, end != RUNNING))
 
     def _of_level(
         self, trace: Trace, level: Level, steps: Batch, end: Array, closes: Array
@@ -274,7 +274,7 @@ class HierarchyCollector(Collector):
         path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
         steps = steps_of(trace, skill, acts, elapsed, end)
         # Elsewhere it is called again at once.
-        ends = (end == CallEnd.EPISODE) | timed_out(trace, skill, elapsed)
+        ends = (end == EPISODE) | timed_out(trace, skill, elapsed)
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
         batch = rows_of(trace, steps, f"{path}/", elapsed, self._record)
         if "action" not in batch:
@@ -282,7 +282,7 @@ class HierarchyCollector(Collector):
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]
-        goes_on = acts & (trace["call_end"] != CallEnd.EPISODE)
+        goes_on = acts & (trace["call_end"] != EPISODE)
         starts = ~np.concatenate([before[None], goes_on[:-1]])
         before[:] = goes_on[-1]
         return batch.replace(recurrent_state=self._states[path], episode_start=starts)
@@ -303,10 +303,10 @@ class HierarchyCollector(Collector):
         steps = steps_of(trace, skill, acts, elapsed, end)
         own = trace[below.path + "call_end"]
         limited = steps["truncated"] & timed_out(trace, skill, elapsed)
-        closes = (own != CallEnd.RUNNING) | (end == CallEnd.EPISODE) | limited
+        closes = (own != RUNNING) | (end == EPISODE) | limited
         # The hierarchy's own end cuts the calls below it, unless it is called again at once.
-        cut = (own == CallEnd.RUNNING) & (end != CallEnd.RUNNING)
-        inner = np.where(end == CallEnd.EPISODE, np.int8(CallEnd.EPISODE), np.int8(CallEnd.LIMIT))
+        cut = (own == RUNNING) & (end != RUNNING)
+        inner = np.where(end == EPISODE, np.int8(EPISODE), np.int8(LIMIT))
         return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
 
     def _check_lengths(self) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import EPISODE, LIMIT, OWN, RUNNING
 from skillweave.collecting.collector import SUCCESS, Collector
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.start_policy import StartPolicy
 from skillweave.collecting.views import rows_of, steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
-from skillweave.envs.engine import Engine
+from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.infos import told_success
 from skillweave.errors import TrainingError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
@@ -72,6 +73,8 @@ class SkillCollector(Collector):
             self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
         self._restricted = skill is not None and skill.defines("initiation")
         self._searches = self._restricted or self._start_calls > 0
+        self._asks = self._searches or (skill is not None and skill.defines("termination"))
+        """Something is asked about each step while it is made."""
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
@@ -135,8 +138,8 @@ class SkillCollector(Collector):
         self.kept["elapsed"] += 1
         if playing is not None:
             self.kept["elapsed"][searching] = 0
-        step = raw.seen(obs, action, self.kept["age"].copy())
-        end = self._ends(step, playing)
+        step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
+        end = self._ends(raw, step, playing)
         out.write(
             next_obs=raw.next_obs,
             next_mask=self.engine.mask(),
@@ -156,12 +159,13 @@ class SkillCollector(Collector):
         if playing is not None:
             over = np.flatnonzero(np.where(playing, end != 0, raw.terminated | raw.truncated))
         if len(over):
-            success = judge(None, step).success if self.skill is None else None
+            success = None if self.skill is not None else told_success(raw.info, self.num_envs)
             success = None if success is None else success[called]
             self._tell(out.row, called, raw.info, success, task=self.skill is not None)
-            more = self._call_again(called[end[called] == CallEnd.LIMIT])
+            more = self._call_again(called[end[called] == LIMIT])
             self._begin_anew(np.setdiff1d(over, more) if len(more) else over)
         if playing is not None:
+            assert step is not None
             going_on = searching[~(raw.terminated | raw.truncated)[searching]]
             part = seen_by(None, step, step.elapsed[going_on], going_on)
             free = self._starters.observe(going_on, part)
@@ -170,25 +174,28 @@ class SkillCollector(Collector):
             self._give_up(self._look(going_on))
         out.next(raw.info)
 
-    def _ends(self, step: Step, playing: Array | None) -> Array:
+    def _ends(self, raw: RawStep, step: Step | None, playing: Array | None) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
-        end = np.zeros(self.num_envs, np.int8)
-        rows = self._all if playing is None else np.flatnonzero(playing)
-        skill = self.skill
-        if skill is not None and len(rows):
-            part = seen_by(skill, step, self.kept["elapsed"][rows], rows)
-            end[rows[part.timed_out]] = CallEnd.LIMIT
-            end[rows[judge(skill, part, rows).stops]] = CallEnd.OWN
-        end[rows[(step.terminated | step.truncated)[rows]]] = CallEnd.EPISODE
+        end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
+        if skill is not None and skill.max_steps is not None:
+            end[elapsed >= skill.max_steps] = LIMIT
+        if skill is not None and step is not None:
+            rows = self._all if playing is None else np.flatnonzero(playing)
+            if len(rows):
+                part = seen_by(skill, step, elapsed[rows], rows)
+                end[rows[judge(skill, part, rows).stops]] = OWN
+        end[raw.terminated | raw.truncated] = EPISODE
+        if playing is not None:
+            end[~playing] = RUNNING
         return end
 
     def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
         acts, elapsed = trace.valid_rows, trace["call_elapsed"]
         steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"])
         self._steps = steps.replace(valid=trace.get("valid"))
-        found = self._count(
-            np.stack([steps["reward"], trace["env_reward"] * acts, acts], -1, dtype=np.float64)
-        )
+        each = np.empty((*trace.lead, 3))
+        each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
+        found = self._count(each)
         if self.skill is not None and self.skill.defines("success"):
             success = successes_of(trace, self.skill, acts, elapsed)
             for row, ids, episodes in found:

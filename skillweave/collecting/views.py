@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import EPISODE, OWN, RUNNING
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
@@ -32,11 +32,11 @@ def steps_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array, end
     Returns:
         ``reward``, ``terminated`` and ``truncated``, 0 in other rows; ``valid`` is ``acts``.
     """
-    over = acts & (end != CallEnd.RUNNING)
-    terminated = acts & (trace["env_terminated"] | (end == CallEnd.OWN))
+    over = acts & (end != RUNNING)
+    terminated = acts & (trace["env_terminated"] | (end == OWN))
     # The end of an episode hides the skill's own termination, so it is asked again there.
-    hidden = (end == CallEnd.EPISODE) & over & ~terminated
-    if skill is not None and skill.defines("termination") and hidden.any():
+    if skill is not None and skill.defines("termination"):
+        hidden = (end == EPISODE) & over & ~terminated
         terminated[hidden] = judged(trace, skill, "stops", hidden, elapsed)
     reward = rewards_of(trace, skill, acts, elapsed)
     truncated = over & ~terminated
