@@ -72,12 +72,14 @@ def judged(
 ) -> Array:
     """Return a property of a skill's ``Outcome`` in the K rows where it acts, (K,), by time.
 
+    A reward that changes (``Skill.reward_changes``) gets each step by itself, once, by time.
+
     Raises:
         SkillweaveError: the skill's method failed, or returned a wrong result; the message is that
             of the first step in which it does.
     """
     steps = np.flatnonzero(acts.any(axis=1))
-    if len(steps) > 1:
+    if len(steps) > 1 and not (what == "reward" and skill.reward_changes):
         step = _together(trace, steps, acts, elapsed)
         ids = np.nonzero(acts)[1]
         try:

@@ -138,6 +138,23 @@ def test_a_reward_is_called_once_in_a_request(make: Any, path: str) -> None:
     assert sizes == [int(rows.valid_rows.sum())]
 
 
+@pytest.mark.usefixtures("unprobed")
+@pytest.mark.parametrize(("make", "path"), [(alone, ""), (below, "reads")])
+def test_a_reward_that_changes_gets_each_step_once_and_in_order(make: Any, path: str) -> None:
+    found = []
+    for rows in (ROWS, 1):
+        given: list[list[float]] = []
+
+        def pays(step: Any, given: Any = given) -> Any:
+            given.append(step.next_obs.tolist())
+            return np.full(len(step.reward), float(len(given)))
+
+        skill = skill_of(pays, reward_changes=True)
+        found.append((rewards(make(skill), rows, path).tolist(), given))
+    assert found[0] == found[1]
+    assert len(found[0][1]) == 24 or path
+
+
 @pytest.mark.parametrize(("make", "path"), [(alone, ""), (below, "reads")])
 @pytest.mark.parametrize(
     "wrong",
