@@ -110,20 +110,9 @@ class SkillCollector(Collector):
         """One step of every environment."""
         if self._start_calls:
             self._draw_calls()
-        obs, mask, memory = self.obs, self.engine.mask(), self.memory
-        playing = ~self.kept["searching"] if self._searches else None
-        if playing is not None and playing.all():
-            playing = None
+        obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
         acted = self.acting.all(obs, mask, memory)
-        action = self.acting.to_env(acted.action)
-        overridden = None
-        if self.reflexes:
-            space = self.engine.action_space
-            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
-        searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
-        if playing is not None:
-            action = action.copy()
-            action[searching] = self._starters.act(searching, obs, mask, self._rng)
+        action, overridden = self._actions(obs, acted.action, mask, playing)
         out.write(
             obs=obs,
             action=acted.action,
@@ -135,9 +124,7 @@ class SkillCollector(Collector):
         )
         raw = self.engine.step(action)
         self.kept["age"] += 1
-        self.kept["elapsed"] += 1
-        if playing is not None:
-            self.kept["elapsed"][searching] = 0
+        self.kept["elapsed"] += 1 if playing is None else playing
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
         end = self._ends(raw, step, playing)
         out.write(
@@ -154,25 +141,51 @@ class SkillCollector(Collector):
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs
-        called = np.flatnonzero(end)
-        over = called
-        if playing is not None:
-            over = np.flatnonzero(np.where(playing, end != 0, raw.terminated | raw.truncated))
-        if len(over):
+        if len(called := np.flatnonzero(end)):
             success = None if self.skill is not None else told_success(raw.info, self.num_envs)
             success = None if success is None else success[called]
             self._tell(out.row, called, raw.info, success, task=self.skill is not None)
             more = self._call_again(called[end[called] == LIMIT])
-            self._begin_anew(np.setdiff1d(over, more) if len(more) else over)
-        if playing is not None:
-            assert step is not None
-            going_on = searching[~(raw.terminated | raw.truncated)[searching]]
-            part = seen_by(None, step, step.elapsed[going_on], going_on)
-            free = self._starters.observe(going_on, part)
-            left = self.kept["calls_left"]
-            left[free] = np.maximum(left[free] - 1, 0)
-            self._give_up(self._look(going_on))
+            self._begin_anew(np.setdiff1d(called, more) if len(more) else called)
+        if step is not None and playing is not None:
+            self._search(step, np.flatnonzero(~playing))
         out.next(raw.info)
+
+    def _playing(self) -> Array | None:
+        """Return where the skill acts, (N,) bool; None: everywhere."""
+        if not self._searches or not self.kept["searching"].any():
+            return None
+        return ~self.kept["searching"]
+
+    def _actions(
+        self, obs: Array, chosen: Array, mask: Array | None, playing: Array | None
+    ) -> tuple[Array, Array | None]:
+        """Return the actions (N, …) of the skill, of reflexes, and of the search for its start.
+
+        Args:
+            chosen: what the learner chose, in policy units.
+
+        Returns:
+            The actions, and where reflexes act, (N,) bool; None: there are none.
+        """
+        action, overridden = self.acting.to_env(chosen), None
+        if self.reflexes:
+            space = self.engine.action_space
+            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
+        if playing is not None:
+            searching, action = np.flatnonzero(~playing), action.copy()
+            action[searching] = self._starters.act(searching, obs, mask, self._rng)
+        return action, overridden
+
+    def _search(self, step: Step, searching: Array) -> None:
+        """Let environments ``searching`` (k,) go on until the skill may start in them."""
+        over = (step.terminated | step.truncated)[searching]
+        self._begin_anew(searching[over])
+        ids = searching[~over]
+        free = self._starters.observe(ids, seen_by(None, step, step.elapsed[ids], ids))
+        left = self.kept["calls_left"]
+        left[free] = np.maximum(left[free] - 1, 0)
+        self._give_up(self._look(ids))
 
     def _ends(self, raw: RawStep, step: Step | None, playing: Array | None) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
