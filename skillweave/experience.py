@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skillweave.paths import name_of
 from skillweave.types import Array
 
 if TYPE_CHECKING:
@@ -60,6 +61,16 @@ SCHEMA: dict[str, Column] = {
     "env_terminated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own end
     "env_truncated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own limit
     "call_elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the call so far
+    # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
+    "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
+    "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
+    "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
+    "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
+    "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices
+    # Under the path of a learner (``inner/selector/decided``), where it decided:
+    "decided": Column(raw=True, rollout=False),  # (T, N) bool, here
+    "allowed": Column(raw=True, rollout=False),  # (T, N, A) bool, among which choices
+    "state_before": Column(raw=True, rollout=False),  # (T, N, M) float32, its recurrent state
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
 INFO = "info."
@@ -67,8 +78,10 @@ INFO = "info."
 
 
 def column(name: str) -> Column:
-    """Return a column of ``SCHEMA``, or the column of a key of ``info``."""
-    return Column(raw=True, rollout=False) if name.startswith(INFO) else SCHEMA[name]
+    """Return a column of ``SCHEMA``, perhaps under a path; or the column of a key of ``info``."""
+    if name.startswith(INFO):
+        return Column(raw=True, rollout=False)
+    return SCHEMA.get(name) or SCHEMA[name_of(name)]
 
 
 class Batch(Mapping[str, Array]):
@@ -84,7 +97,8 @@ class Batch(Mapping[str, Array]):
     def __init__(self, **columns: Array | None) -> None:
         """Take the columns that are not None."""
         if not columns.keys() <= SCHEMA.keys():
-            unknown = [k for k in columns if k not in SCHEMA and not k.startswith(INFO)]
+            names = (name_of(k) for k in columns if not k.startswith(INFO))
+            unknown = [name for name in names if name not in SCHEMA]
             assert not unknown, f"no column of SCHEMA: {unknown}"
         self._columns = {name: x for name, x in columns.items() if x is not None}
 
@@ -130,6 +144,27 @@ class Batch(Mapping[str, Array]):
         """Return a slice of the T rows."""
         whole = {k: v if column(k).per_env else v[part] for k, v in self.items()}
         return Batch(**whole)
+
+
+class Trace(Batch):
+    """Record of T steps of N environments, from which every learner gets its rows.
+
+    Its columns are raw: what the environments did, who acted, and why calls ended. The columns of
+    a level have its path before their name, those of a learner the learner's.
+    """
+
+    __slots__ = ("infos",)
+
+    def __init__(self, infos: Sequence[Mapping[str, Any]], columns: Mapping[str, Array]) -> None:
+        """Take the columns, and the ``info`` of each step; no infos: nothing reads them."""
+        super().__init__(**columns)
+        self.infos = infos
+
+    @property
+    def lead(self) -> tuple[int, int]:
+        """T and N."""
+        rows, envs = self["next_obs"].shape[:2]
+        return rows, envs
 
 
 def side_by_side(batches: Sequence[Batch], members: int) -> Batch:

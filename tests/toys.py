@@ -18,8 +18,8 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
@@ -263,7 +263,7 @@ class Calls(Toy):
 
     def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
         calls = tuple(Call(i, (1, 10)[i], self.allowed[i]) for i in range(2))
-        return DecisionCollector(
+        return HierarchyCollector(
             self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared
         )
 

@@ -11,10 +11,11 @@ import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.restored import check_numbers, opened
+from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import info_numbers
 from skillweave.errors import RunError
-from skillweave.experience import Batch, padded_last_axis, side_by_side
+from skillweave.experience import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.seeding import Seeds, seed_global_generators
 from skillweave.skills.info_words import info_keys
 from skillweave.types import Array, prefixed, unprefixed
@@ -23,6 +24,8 @@ RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""
 FIRST_INFO = 4
 """The column of the first logged key of ``info``; those of the others follow."""
+PLAYED = 64
+"""Steps after which episodes that are played are judged."""
 
 
 @dataclass
@@ -66,28 +69,38 @@ class Collector:
         """By names of these, what numbers that choose among something may be."""
         self.open: dict[str, Array] = {}
         """The same of what has a shape that is known only when it begins."""
+        self.after_request = {"sums"}
+        """Names in ``kept`` that change when the steps of a request are judged, not in a step."""
         self.begun = False
         self._all = np.arange(n)
         self.log_info: tuple[str, ...] = ()
         """I keys of ``info`` whose values at the ends of episodes are logged."""
         self._info_keys: set[str] = set()
-        self._ended: list[Array] = []  # numbers of episodes that ended, and their environments
-        self._who: list[Array] = []
+        self._ended: list[tuple[int, Array, Array]] = []
+        """Of episodes that ended in a request: row, environments, and numbers without sums."""
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
         if not self.begun:
             self.obs = np.array(self.engine.reset((seeds / "env").integer()))
+            self._clear(self._all)
             self._forget(self._all)
             self.begun = True
 
     def collect(self, request: Request) -> Collected:
         """``request.rows`` steps of each environment."""
-        before, self._ended, self._who = self.engine.steps_made, [], []
-        self._info_keys = set()
-        batches = self._collect(request)
+        before, self._info_keys, self._ended = self.engine.steps_made, set(), []
+        self._prepare(request)
+        writer = self._writer(request.rows)
+        for _ in range(request.rows):
+            self._step(writer)
+        trace = writer.trace()
+        found = self._episodes(trace)
+        batches = self._views(trace)
         steps = self.engine.steps_made - before
-        episodes = np.concatenate([np.zeros((0, FIRST_INFO + len(self.log_info))), *self._ended])
+        episodes = np.concatenate(
+            [np.zeros((0, FIRST_INFO + len(self.log_info))), *(x for _, _, x in found)]
+        )
         limited = self.engine.time_limit is not None
         longest = 0 if limited else int(self.kept["age"].max())
         keys = frozenset(self._info_keys)
@@ -106,17 +119,20 @@ class Collector:
         self.begun = False
         self.start(seeds)
         found = np.full((self.num_envs, FIRST_INFO + len(self.log_info)), np.nan)
-        playing = np.ones(self.num_envs, bool)
+        playing, unknown = np.ones(self.num_envs, bool), np.ones(self.num_envs, bool)
         self._prepare(request)
-        for _ in range(limit):
-            self._ended, self._who = [], []
-            self._step()
-            for ids, episodes in zip(self._who, self._ended, strict=True):
-                first = playing[ids]
-                found[ids[first]], playing[ids[first]] = episodes[first], False
-            playing &= ~self._given_up()
-            if not playing.any():
-                return found
+        steps, self._ended = 0, []
+        while steps < limit and playing.any():
+            writer = self._writer(min(PLAYED, limit - steps))
+            while writer.row < min(PLAYED, limit - steps) and playing.any():
+                self._step(writer)
+                for _, ids, _ in self._ended[-1:]:
+                    playing[ids] = False
+                playing &= ~self._given_up()
+            steps += writer.row
+            for _, ids, episodes in self._episodes(writer.trace()):
+                first = unknown[ids]
+                found[ids[first]], unknown[ids[first]] = episodes[first], False
         found[playing, :3] = self.kept["sums"][playing]
         return found
 
@@ -155,9 +171,12 @@ class Collector:
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
         space = self.engine.observation_space
-        self.open = opened(unprefixed("open", state), self.kept, self.obs, space)
+        self.open.clear()
+        self.open |= opened(unprefixed("open", state), self.kept, self.obs, space)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
-        return self._begin_anew(np.union1d(early, other))
+        ids = np.union1d(early, other)
+        self._clear(ids)
+        return self._begin_anew(ids)
 
     def close(self) -> None:
         """Release the environments."""
@@ -171,17 +190,55 @@ class Collector:
         """Act by this request from now on."""
         raise NotImplementedError
 
-    def _step(self, out: Any = None) -> None:
-        """Step every environment; ``out`` takes what is to be learnt from."""
+    def _writer(self, rows: int) -> TraceWriter:
+        """Return what writes the trace of ``rows`` steps."""
+        return TraceWriter(rows, self.num_envs)
+
+    def _step(self, out: TraceWriter) -> None:
+        """Step every environment, and write what happened."""
         raise NotImplementedError
 
-    def _collect(self, request: Request) -> dict[str, Batch]:
+    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+        """Judge the steps of a trace; return what ended in them: row, environments, numbers.
+
+        ``_count`` makes them; the numbers are (k, 4 + I), as in ``Collected.episodes``.
+        """
         raise NotImplementedError
+
+    def _views(self, trace: Trace) -> dict[str, Batch]:
+        """Return what each learner did, by path."""
+        raise NotImplementedError
+
+    def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
+        """Add numbers (T, N, 3) to the sums of the open episodes; return those that ended."""
+        found, self._ended = self._ended, []
+        sums: Any = self.kept["sums"]
+        at = 0
+        for row, numbers in enumerate(each):
+            sums += numbers
+            while at < len(found) and found[at][0] == row:
+                _, ids, episodes = found[at]
+                known = ~np.isnan(episodes[:, :3])
+                episodes[:, :3][known] = sums[ids][known]
+                sums[ids], at = 0.0, at + 1
+        return found
 
     def _forget(self, ids: Array) -> None:
         """Episodes of environments ``ids`` (k,) have just begun."""
-        for kept in self.kept.values():
-            kept[ids] = 0
+        for name, kept in self.kept.items():
+            if name not in self.after_request:
+                kept[ids] = 0
+
+    def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
+        """Keep arrays (N, …) that change when the steps of a request are judged."""
+        named = {prefix + name: value for name, value in kept.items()}
+        self.kept |= named
+        self.after_request |= named.keys()
+
+    def _clear(self, ids: Array) -> None:
+        """Nothing of environments ``ids`` (k,) is left of the requests before."""
+        for name in self.after_request:
+            self.kept[name][ids] = 0
 
     def _begin_anew(self, ids: Array) -> Array:
         if len(ids):
@@ -191,11 +248,18 @@ class Collector:
         return ids
 
     def _tell(
-        self, ids: Array, info: Mapping[str, Any], success: Array | None = None, *, task: bool
+        self,
+        row: int,
+        ids: Array,
+        info: Mapping[str, Any],
+        success: Array | None = None,
+        *,
+        task: bool,
     ) -> None:
         """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
 
         Args:
+            row: of the step.
             info: of all environments, at this step.
             success: (k,), whether they have succeeded.
             task: their return of the task is another one than that of who acts.
@@ -207,13 +271,10 @@ class Collector:
                 self._info_keys |= set(info_keys(info))
             else:
                 episodes[:, column] = numbers
-        episodes[:, :3] = self.kept["sums"][ids]
-        if not task:
-            episodes[:, TASK_RETURN] = np.nan
+        episodes[:, [RETURN, TASK_RETURN, LENGTH] if task else [RETURN, LENGTH]] = 0.0
         if success is not None:
             episodes[:, SUCCESS] = success
-        self._ended.append(episodes)
-        self._who.append(ids)
+        self._ended.append((row, ids, episodes))
 
 
 def _checksum(state: Mapping[str, Array]) -> int:
@@ -224,7 +285,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
     return found
 
 
-_OF_LEARNERS = {"memory", "before", "player.selector.rnn"}
+_OF_LEARNERS = {"memory", "state_before", "player.selector.rnn"}
 """What is kept of the learners' memory: others begin without."""
 
 
@@ -250,7 +311,8 @@ def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
         for name, rows in collector.kept.items():
             if name not in _OF_LEARNERS:
                 rows[:] = joined.kept[name][part]
-        collector.open = {k: v[part].copy() for k, v in joined.open.items()}
+        collector.open.clear()
+        collector.open |= {k: v[part].copy() for k, v in joined.open.items()}
         collector.obs, first = joined.obs[part].copy(), part.stop
 
 

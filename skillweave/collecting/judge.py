@@ -8,15 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.envs.infos import info_rows, random_actions, told_success
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import DeclarationError, EnvError
+from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
 from skillweave.skills.info_read import info_keys_read
-from skillweave.skills.info_words import StoredInfo, missing_key
+from skillweave.skills.info_words import StoredInfo
 from skillweave.types import Array, Step
 
 
@@ -71,20 +70,6 @@ class Outcome:
 def judge(skill: Skill | None, step: Step, ids: Array | None = None) -> Outcome:
     """Judge n steps by a skill; the arguments are those of ``Outcome``."""
     return Outcome(skill, step, ids)
-
-
-def terminated_in_call(skill: Skill, step: Step, end: Array, ids: Array) -> Array:
-    """Return where the value of what follows a step in a call is 0, (n,) bool.
-
-    ``end`` (n,) already says whether the skill's own termination ended the call; only at the end of
-    an episode, which hides it, is the skill asked again.
-    """
-    terminated: Array = step.terminated | (end == CallEnd.OWN)
-    rows = np.flatnonzero((end == CallEnd.EPISODE) & ~terminated)
-    if len(rows) and skill.defines("termination"):
-        last = seen_by(skill, step, step.elapsed[rows], rows)
-        terminated[rows] = judge(skill, last, ids[rows]).stops
-    return terminated
 
 
 def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
@@ -149,33 +134,6 @@ class JudgedBy:
             terminated=outcome.terminated.reshape(lead),
             truncated=outcome.truncated.reshape(lead),
         )
-
-
-def raw_columns(step: Step, elapsed: Array, wanted: Sequence[str]) -> dict[str, Array]:
-    """Return the raw columns of a step that are wanted, (N, …) each.
-
-    Args:
-        elapsed: (N,) steps of the call so far.
-
-    Raises:
-        EnvError: no environment gives a key of ``info`` that is wanted.
-    """
-    if not wanted:
-        return {}
-    known = {
-        "env_action": step.action,
-        "env_reward": step.reward,
-        "env_terminated": step.terminated,
-        "env_truncated": step.truncated,
-        "call_elapsed": elapsed,
-    }
-    found: dict[str, Array] = {}
-    for name in wanted:
-        key = name.removeprefix(INFO)
-        if name not in known and key not in step.info:
-            raise EnvError(f"info[{key!r}] is to be recorded, but {missing_key(step.info)}")
-        found[name] = known[name] if name in known else np.asarray(step.info[key])
-    return found
 
 
 def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None = None) -> Step:

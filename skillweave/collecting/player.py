@@ -20,11 +20,12 @@ from typing import Any, Protocol
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.acting import Acted, Acting
-from skillweave.collecting.call_end import CallEnd, Interruption
+from skillweave.collecting.acting import Acting
+from skillweave.collecting.call_end import EPISODE, INTERRUPTED, LIMIT, OWN, RUNNING, Interruption
 from skillweave.collecting.guide import ActiveGuide, LastCall
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError
 from skillweave.skills import apply_reflexes, path_of
@@ -44,6 +45,8 @@ class Turn:
     """(N,), steps of the episodes so far, for messages."""
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
+    trace: TraceWriter | None = None
+    """Where those who learn write what they choose; None: nothing is recorded."""
 
 
 class Actor(Protocol):
@@ -100,29 +103,21 @@ class PolicyActor:
         _put(memory, rows, self._policy.observe({k: v[rows] for k, v in memory.items()}, step))
 
 
-@dataclass
-class Choice:
-    """A learner's latest actions, and what they followed from."""
-
-    rows: Array  # (k,) environments
-    obs: Array  # (k, …)
-    acted: Acted
-    mask: Array | None  # (k, A) bool
-    recurrent_state: Array | None  # (k, M), before
-
-
 class LearnerActor:
-    """A network that learns, among the actors; its latest choice is recorded.
+    """A network that learns, among the actors; what it chooses is written into the trace.
 
     Args:
         acting: the network.
+        path: of the learner, before the names of its columns.
+        decides: it is a selector: what it decided on is written, too.
     """
 
     watches = False
 
-    def __init__(self, acting: Acting) -> None:
+    def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
         self.acting = acting
-        self.latest: Choice | None = None
+        names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
+        self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -141,7 +136,10 @@ class LearnerActor:
         acted = self.acting.some(rows, obs, mask, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
-        self.latest = Choice(rows, obs, acted, mask, before)
+        if turn.trace is not None:
+            every = np.ones(len(rows), bool)
+            values = acted.action, acted.dist_params, every, obs, mask, before
+            turn.trace.write(rows, **dict(zip(self._columns, values, strict=False)))
         actions: Array = self.acting.to_env(acted.action)
         return actions
 
@@ -194,7 +192,7 @@ class Player:
         memory: Memory = {
             "skill": np.full(n, -1),
             "elapsed": np.zeros(n, np.int64),
-            "end": np.full(n, CallEnd.EPISODE, np.int8),
+            "end": np.full(n, EPISODE, np.int8),
         }
         if self.skills.lengths:
             memory["limit"] = np.zeros(n, np.int64)
@@ -210,7 +208,7 @@ class Player:
     def restart(self, memory: Memory, rows: Array) -> None:
         """Start new episodes in environments ``rows`` (k,): no call has started."""
         memory["skill"][rows] = -1
-        memory["end"][rows] = CallEnd.EPISODE
+        memory["end"][rows] = EPISODE
         chooses = {} if self.selector is None else self.selector.start(len(rows))
         fresh = {f"selector.{k}": v for k, v in chooses.items()}
         if self.guide is not None:
@@ -226,7 +224,7 @@ class Player:
             mask: (k, A) bool, actions that the environments allow; None: all. Networks keep to it;
                 policies made elsewhere and reflexes may take another action.
         """
-        ended = np.flatnonzero(memory["end"][rows] != CallEnd.RUNNING)
+        ended = np.flatnonzero(memory["end"][rows] != RUNNING)
         if len(ended):
             every = len(ended) == len(rows)
             self._decide(memory, rows[ended], obs if every else obs[ended], turn)
@@ -237,7 +235,7 @@ class Player:
     ) -> Array:
         """Return actions (k, …) as of ``act``, where calls run in all environments ``rows``."""
         running, actions = memory["skill"][rows], None
-        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden)
+        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden, turn.trace)
         for i, actor in enumerate(self.actors):
             mine = np.flatnonzero(running == i)
             if not len(mine):
@@ -270,7 +268,7 @@ class Player:
         changed = memory["skill"][rows] != skill
         memory["skill"][rows] = skill
         memory["elapsed"][rows] = 0
-        memory["end"][rows] = CallEnd.RUNNING
+        memory["end"][rows] = RUNNING
         for i, keys in enumerate(self._keys):
             if keys and len(fresh := rows[changed & (skill == i)]):
                 _put(self.of_skill(memory, i), fresh, self.actors[i].start(len(fresh)))
@@ -286,10 +284,10 @@ class Player:
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
         end = np.zeros(len(rows), np.int8)
         if self.skills.lengths:
-            end[elapsed >= memory["limit"][rows]] = CallEnd.LIMIT
+            end[elapsed >= memory["limit"][rows]] = LIMIT
         for i, limit in enumerate(self._limits):
             if limit is not None:
-                end[(running == i) & (elapsed >= limit)] = CallEnd.LIMIT
+                end[(running == i) & (elapsed >= limit)] = LIMIT
         for i, actor in enumerate(self.actors):
             if actor.watches or self._stops[i]:
                 mine = np.flatnonzero(running == i)
@@ -297,7 +295,7 @@ class Player:
                     self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
         if self.skills.interruption is not None:
             self._interrupt(self.skills.interruption, running, step.next_obs, end)
-        end[step.terminated | step.truncated] = CallEnd.EPISODE
+        end[step.terminated | step.truncated] = EPISODE
         memory["end"][rows] = end
         self._watch(memory, rows, step, running, elapsed, end)
         return end
@@ -336,7 +334,7 @@ class Player:
             assert may is not None, "nothing chooses"
             choice = may.argmax(axis=1)  # the guide has left one
         else:
-            how = Turn(greedy, turn.rng, turn.age)
+            how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
         self.begin(memory, rows, choice)
 
@@ -351,29 +349,29 @@ class Player:
             below = self.of_skill(memory, i)
             actor.observe(below, rows[mine], part)
             if isinstance(actor, Player) and actor.restricts:
-                end[mine[actor.is_stuck(below, rows[mine], part.next_obs)]] = CallEnd.LIMIT
+                end[mine[actor.is_stuck(below, rows[mine], part.next_obs)]] = LIMIT
         if self._stops[i]:
-            end[mine[judge(skill, part, rows[mine]).stops]] = CallEnd.OWN
+            end[mine[judge(skill, part, rows[mine]).stops]] = OWN
 
     def is_stuck(self, memory: Memory, rows: Array, obs: Array) -> Array:
         """(k,) bool, the selector must decide, but no skill may start; its own call ends there."""
         stuck = np.zeros(len(rows), bool)
-        ended = np.isin(memory["end"][rows], (CallEnd.RUNNING, CallEnd.EPISODE), invert=True)
-        waits = np.flatnonzero(ended)
+        end = memory["end"][rows]
+        waits = np.flatnonzero((end != RUNNING) & (end != EPISODE))
         if len(waits):
             stuck[waits] = ~self.skills.startable(obs[waits]).any(axis=1)
         return stuck
 
     def _interrupt(self, how: Interruption, running: Array, obs: Array, end: Array) -> None:
         """End calls where a new decision is worth clearly more, in place."""
-        rows = np.flatnonzero(end == CallEnd.RUNNING)
+        rows = np.flatnonzero(end == RUNNING)
         if not len(rows):
             return
         worth, n = how.worth(obs[rows]), len(self.actors)
         goes_on = worth[np.arange(len(rows)), running[rows]]
         may = self.skills.startable(obs[rows])[:, :: max(1, len(self.skills.lengths))]
         again = np.where(may.any(axis=1), worth[:, n], -np.inf)  # else no skill could be called
-        end[rows[again - goes_on > how.margin]] = CallEnd.INTERRUPTED
+        end[rows[again - goes_on > how.margin]] = INTERRUPTED
 
     def _watch(
         self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
@@ -396,11 +394,11 @@ class Player:
 
         By the skill's ``success``; of a skill without one, if its own termination ended the call.
         """
-        found: Array = end == CallEnd.OWN
+        found: Array = end == OWN
         for i, skill in enumerate(self.skills.skills):
             if not skill.defines("success"):
                 continue
-            over = np.flatnonzero((running == i) & (end != CallEnd.RUNNING))
+            over = np.flatnonzero((running == i) & (end != RUNNING))
             if len(over):
                 part = seen_by(skill, step, elapsed[over], over)
                 found[over] = judge(skill, part, rows[over]).success

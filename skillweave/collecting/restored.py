@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import RUNNING, CallEnd
 from skillweave.collecting.player import Player
 from skillweave.paths import join, level_of, name_of
 from skillweave.spaces import obs_codec, to_tensor
@@ -47,7 +47,7 @@ def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> Non
             raise ValueError(f"{name!r} of open episodes is not finite")
     for player in PLAYERS:
         end, skill = kept.get(f"{player}.end"), kept.get(f"{player}.skill")
-        if end is not None and skill is not None and (skill[end == CallEnd.RUNNING] < 0).any():
+        if end is not None and skill is not None and (skill[end == RUNNING] < 0).any():
             raise ValueError("a call is open, and no skill runs")
 
 
@@ -80,8 +80,8 @@ def opened(
         found[name] = known(value)
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{name!r} of open calls is not finite")
-    running = kept.get("player.end", np.ones(1, np.int8)) == CallEnd.RUNNING
-    if "choice" in kept and running.any() and "obs" not in found:
+    running = kept.get("player.end", np.ones(1, np.int8)) == RUNNING
+    if "tau" in kept and running.any() and "obs" not in found:
         raise ValueError("it does not say where open calls began")
     return found
 

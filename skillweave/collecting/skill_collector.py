@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.collector import Collector
-from skillweave.collecting.judge import judge, raw_columns, seen_by
+from skillweave.collecting.call_end import EPISODE, LIMIT, OWN, RUNNING
+from skillweave.collecting.collector import SUCCESS, Collector
+from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.start_policy import StartPolicy
-from skillweave.collecting.writer import BatchWriter
+from skillweave.collecting.views import rows_of, steps_of, successes_of
+from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.engine import Engine, RawStep
+from skillweave.envs.infos import told_success
 from skillweave.errors import TrainingError
-from skillweave.experience import Batch
+from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
-
-
-@dataclass
-class Judged:
-    """The outcome of a step for the skill, in all environments."""
-
-    reward: Array  # (n,) float32
-    terminated: Array  # (n,) bool
-    truncated: Array  # (n,) bool, never where terminated
-    success: Array | None  # (n,) bool, or of the task float64, NaN where unknown
 
 
 class SkillCollector(Collector):
@@ -83,6 +73,8 @@ class SkillCollector(Collector):
             self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
         self._restricted = skill is not None and skill.defines("initiation")
         self._searches = self._restricted or self._start_calls > 0
+        self._asks = self._searches or (skill is not None and skill.defines("termination"))
+        """Something is asked about each step while it is made."""
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
@@ -103,90 +95,134 @@ class SkillCollector(Collector):
         how = self._start_calls, self._search_steps, self._episode_calls
         return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
 
-    def _collect(self, request: Request) -> dict[str, Batch]:
-        self._prepare(request)
-        out = BatchWriter(request.rows, self.num_envs)
-        state = None if self.memory is None else self.memory.copy()
-        starts = self.kept["elapsed"] == 0
-        for _ in range(request.rows):
-            self._step(out)
-        batch = out.batch(recurrent_state=state)
-        if state is None:
-            return {"": batch}
-        episode_start = np.concatenate([starts[None], batch.ended[:-1]])
-        if (valid := batch.get("valid")) is not None:  # the first row after a search
-            episode_start[1:] |= valid[1:] & ~valid[:-1]
-        return {"": batch.replace(episode_start=episode_start)}
-
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
         self._rng, self._record = (request.seeds / "search").numpy(), request.record
+        self._before = None if self.memory is None else self.memory.copy()
+        self._starts = self.kept["elapsed"] == 0
 
-    def _step(self, out: BatchWriter | None = None) -> None:
+    def _writer(self, rows: int) -> TraceWriter:
+        reads = self.skill is not None and any(map(self.skill.defines, self.skill.methods))
+        reads |= any(name.startswith(INFO) for name in self._record)
+        return TraceWriter(rows, self.num_envs, keep_infos=reads)
+
+    def _step(self, out: TraceWriter) -> None:
         """One step of every environment."""
         if self._start_calls:
             self._draw_calls()
-        obs, mask, memory = self.obs, self.engine.mask(), self.memory
-        playing = ~self.kept["searching"] if self._searches else None
-        if playing is not None and playing.all():
-            playing = None
+        obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
         acted = self.acting.all(obs, mask, memory)
-        action = self.acting.to_env(acted.action)
-        overridden = None
-        if self.reflexes:
-            space = self.engine.action_space
-            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
-        searching = np.zeros(0, np.int64) if playing is None else np.flatnonzero(~playing)
-        if playing is not None:
-            action = action.copy()
-            action[searching] = self._starters.act(searching, obs, mask, self._rng)
+        action, overridden = self._actions(obs, acted.action, mask, playing)
+        out.write(
+            obs=obs,
+            action=acted.action,
+            env_action=action,
+            valid=playing,
+            mask=mask,
+            dist_params=acted.dist_params,
+            overridden=overridden,
+        )
         raw = self.engine.step(action)
         self.kept["age"] += 1
-        self.kept["elapsed"] += 1
-        if playing is not None:
-            self.kept["elapsed"][searching] = 0
-        step = raw.seen(obs, action, self.kept["age"].copy())
-        judged = self._judge(step, playing)
-        ended = judged.terminated | judged.truncated
-        if out is not None:
-            out.write(
-                obs=obs,
-                action=acted.action,
-                reward=judged.reward,
-                terminated=judged.terminated,
-                truncated=judged.truncated,
-                next_obs=raw.next_obs,
-                valid=playing,
-                mask=mask,
-                next_mask=self.engine.mask(),
-                dist_params=acted.dist_params,
-                overridden=overridden,
-                **raw_columns(step, self.kept["elapsed"], self._record),
-            )
-            out.next()
-        self._count(raw, judged, playing)
+        self.kept["elapsed"] += 1 if playing is None else playing
+        step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
+        end = self._ends(raw, step, playing)
+        out.write(
+            next_obs=raw.next_obs,
+            next_mask=self.engine.mask(),
+            env_reward=raw.reward,
+            env_terminated=raw.terminated,
+            env_truncated=raw.truncated,
+            call_elapsed=self.kept["elapsed"],
+            call_end=end,
+        )
         if memory is not None and acted.recurrent_state is not None:
             memory[:] = acted.recurrent_state
             if playing is not None:
                 memory[~playing] = 0
         self.obs = raw.next_obs
-        over = ended
+        if len(called := np.flatnonzero(end)):
+            success = None if self.skill is not None else told_success(raw.info, self.num_envs)
+            success = None if success is None else success[called]
+            self._tell(out.row, called, raw.info, success, task=self.skill is not None)
+            more = self._call_again(called[end[called] == LIMIT])
+            self._begin_anew(np.setdiff1d(called, more) if len(more) else called)
+        if step is not None and playing is not None:
+            self._search(step, np.flatnonzero(~playing))
+        out.next(raw.info)
+
+    def _playing(self) -> Array | None:
+        """Return where the skill acts, (N,) bool; None: everywhere."""
+        if not self._searches or not self.kept["searching"].any():
+            return None
+        return ~self.kept["searching"]
+
+    def _actions(
+        self, obs: Array, chosen: Array, mask: Array | None, playing: Array | None
+    ) -> tuple[Array, Array | None]:
+        """Return the actions (N, …) of the skill, of reflexes, and of the search for its start.
+
+        Args:
+            chosen: what the learner chose, in policy units.
+
+        Returns:
+            The actions, and where reflexes act, (N,) bool; None: there are none.
+        """
+        action, overridden = self.acting.to_env(chosen), None
+        if self.reflexes:
+            space = self.engine.action_space
+            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         if playing is not None:
-            over = np.where(playing, ended, raw.terminated | raw.truncated)
-        ids = np.flatnonzero(over)
-        if len(ids):
-            called = ids if playing is None else np.flatnonzero(playing & ended)
-            success = None if judged.success is None else judged.success[called]
-            self._tell(called, raw.info, success, task=self.skill is not None)
-            more = self._call_again(called[(judged.truncated & ~raw.truncated)[called]])
-            self._begin_anew(np.setdiff1d(ids, more) if len(more) else ids)
+            searching, action = np.flatnonzero(~playing), action.copy()
+            action[searching] = self._starters.act(searching, obs, mask, self._rng)
+        return action, overridden
+
+    def _search(self, step: Step, searching: Array) -> None:
+        """Let environments ``searching`` (k,) go on until the skill may start in them."""
+        over = (step.terminated | step.truncated)[searching]
+        self._begin_anew(searching[over])
+        ids = searching[~over]
+        free = self._starters.observe(ids, seen_by(None, step, step.elapsed[ids], ids))
+        left = self.kept["calls_left"]
+        left[free] = np.maximum(left[free] - 1, 0)
+        self._give_up(self._look(ids))
+
+    def _ends(self, raw: RawStep, step: Step | None, playing: Array | None) -> Array:
+        """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
+        end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
+        if skill is not None and skill.max_steps is not None:
+            end[elapsed >= skill.max_steps] = LIMIT
+        if skill is not None and step is not None:
+            rows = self._all if playing is None else np.flatnonzero(playing)
+            if len(rows):
+                part = seen_by(skill, step, elapsed[rows], rows)
+                end[rows[judge(skill, part, rows).stops]] = OWN
+        end[raw.terminated | raw.truncated] = EPISODE
         if playing is not None:
-            going_on = searching[~over[searching]]
-            part = seen_by(None, step, step.elapsed[going_on], going_on)
-            free = self._starters.observe(going_on, part)
-            left = self.kept["calls_left"]
-            left[free] = np.maximum(left[free] - 1, 0)
-            self._give_up(self._look(going_on))
+            end[~playing] = RUNNING
+        return end
+
+    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+        acts, elapsed = trace.valid_rows, trace["call_elapsed"]
+        steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"])
+        self._steps = steps.replace(valid=trace.get("valid"))
+        each = np.empty((*trace.lead, 3))
+        each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
+        found = self._count(each)
+        if self.skill is not None and self.skill.defines("success"):
+            success = successes_of(trace, self.skill, acts, elapsed)
+            for row, ids, episodes in found:
+                episodes[:, SUCCESS] = success[row, ids]
+        return found
+
+    def _views(self, trace: Trace) -> dict[str, Batch]:
+        batch = rows_of(trace, self._steps, "", trace["call_elapsed"], self._record)
+        if self._before is None:
+            return {"": batch}
+        starts = np.concatenate([self._starts[None], batch.ended[:-1]])
+        if (valid := batch.get("valid")) is not None:  # the first row after a search
+            starts[1:] |= valid[1:] & ~valid[:-1]
+        return {"": batch.replace(recurrent_state=self._before, episode_start=starts)}
 
     def _call_again(self, limited: Array) -> Array:
         """The skill's calls in environments ``limited`` (k,) ended at its limit and nothing else.
@@ -276,28 +312,3 @@ class SkillCollector(Collector):
         if self._search_steps is None:
             return f"of {by}"
         return f"of {by}, reset after {self._search_steps:,} of them (search_steps)"
-
-    def _judge(self, step: Step, playing: Array | None) -> Judged:
-        """Judge a step for the skill; anything where it did not play."""
-        rows = self._all if playing is None else np.flatnonzero(playing)
-        elapsed = self.kept["elapsed"][rows]
-        outcome = judge(self.skill, seen_by(self.skill, step, elapsed, rows), rows)
-        if playing is None:
-            ends = outcome.terminated, outcome.truncated
-            return Judged(outcome.reward, *ends, outcome.success)
-        knows = self.skill is not None and self.skill.defines("success")
-        rewards, never = np.zeros(self.num_envs, np.float32), self._never
-        found = Judged(rewards, never.copy(), never.copy(), never.copy() if knows else None)
-        if len(rows):
-            found.reward[rows], found.terminated[rows] = outcome.reward, outcome.terminated
-            found.truncated[rows] = outcome.truncated
-            if found.success is not None:
-                found.success[rows] = outcome.success
-        return found
-
-    def _count(self, raw: RawStep, judged: Judged, playing: Array | None) -> None:
-        """Keep the sums of the open episodes."""
-        sums: Any = self.kept["sums"]
-        sums[:, 0] += judged.reward
-        sums[:, 1] += raw.reward if playing is None else raw.reward * playing
-        sums[:, 2] += 1 if playing is None else playing

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import RUNNING
 from skillweave.collecting.judge import seen_by
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.restored import ranges_of
@@ -76,7 +76,7 @@ class StartPolicy:
         rows = np.flatnonzero(runs)
         part = seen_by(None, step, step.elapsed[rows], rows)
         end = self._player.observe(self._calls, called, part)
-        return np.concatenate([ids[~runs], called[end != CallEnd.RUNNING]])
+        return np.concatenate([ids[~runs], called[end != RUNNING]])
 
     def stop(self, ids: Array) -> None:
         """End the calls in environments ``ids`` (k,): the skill starts, or an episode."""
@@ -85,7 +85,7 @@ class StartPolicy:
 
     def _runs(self, ids: Array) -> Array:
         """(k,) bool, a call runs."""
-        runs: Array = self._calls["end"][ids] == CallEnd.RUNNING
+        runs: Array = self._calls["end"][ids] == RUNNING
         return runs
 
     def _call(self, ids: Array, obs: Array, rng: np.random.Generator) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import RUNNING
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.checks import LONGEST_EPISODE
@@ -124,7 +124,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
             step = raw.seen(rows_obs, action, steps[rows])
-            over = self._player.observe(self._memory, rows, step) != CallEnd.RUNNING
+            over = self._player.observe(self._memory, rows, step) != RUNNING
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()

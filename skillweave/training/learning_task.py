@@ -10,9 +10,8 @@ import gymnasium as gym
 
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import Engine
@@ -105,7 +104,7 @@ def selector_task(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return DecisionCollector(engine, acting, skills, shared, guide, as_skill)
+        return HierarchyCollector(engine, acting, skills, shared, guide, as_skill)
 
     return LearningTask(
         spec.name, role.observation_space, role.action_space, collector, role.row_steps
@@ -138,15 +137,21 @@ class JointTask(LearningTask):
         acting: Acting | None,
         learners: Mapping[str, Acting],
         margins: Mapping[str, float],
-    ) -> JointCollector:
+    ) -> HierarchyCollector:
         """Return a collector of environments in ``engine``.
 
         Args:
             acting: the selector; None: the guide decides.
-            learners, margins: see ``JointCollector``.
+            learners, margins: see ``HierarchyCollector``.
         """
-        return JointCollector(
-            engine, acting, self.skills, learners, margins, self.guide, self.as_skill
+        return HierarchyCollector(
+            engine,
+            acting,
+            self.skills,
+            guide=self.guide,
+            as_skill=self.as_skill,
+            learners=learners,
+            margins=margins,
         )
 
 

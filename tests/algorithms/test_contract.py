@@ -354,8 +354,8 @@ def test_an_end_is_not_bootstrapped(name):
 class TenSteps(SkillCollector):
     """Says of every row that it took ten steps."""
 
-    def _collect(self, request):
-        batches = super()._collect(request)
+    def _views(self, trace):
+        batches = super()._views(trace)
         batches[""]["steps"][:] = 10
         return batches
 

@@ -18,9 +18,8 @@ from reference_calls import seeds_of
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
 from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_collector import SkillCollector
@@ -188,7 +187,7 @@ def decisions(case: Case) -> Played:
     guide, selector = _first(case)
     skills = skill_set(case.level, policies_of(case.level))
     return _collect(
-        case, lambda: DecisionCollector(engine_of(case), selector, skills, True, guide), "", {}
+        case, lambda: HierarchyCollector(engine_of(case), selector, skills, True, guide), "", {}
     )  # fmt: skip
 
 
@@ -222,8 +221,9 @@ def joint(case: Case) -> Played:
     guide, selector = _first(case)
     skills = skills_of(case.level, "")
 
-    def make() -> JointCollector:
-        return JointCollector(engine_of(case), selector, skills, learners, margins, guide)
+    def make() -> HierarchyCollector:
+        how = {"guide": guide, "learners": learners, "margins": margins}
+        return HierarchyCollector(engine_of(case), selector, skills, **how)
 
     return _collect(case, make, "selector", learners)
 

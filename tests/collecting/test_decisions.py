@@ -20,7 +20,7 @@ from toy_acting import Again, Choices, Given, requests
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -40,7 +40,7 @@ def skill_set(*kinds, call_steps=5, **how):
 def collector_of(skills, n=N, keep_rewards=False, env=Walk, acting=None, **spec):
     engine = make_engine(EnvSpec(env, engine="sync", **spec), n)
     acting = acting or Choices(n, len(skills.skills))
-    found = DecisionCollector(engine, acting, skills, keep_rewards)
+    found = HierarchyCollector(engine, acting, skills, keep_rewards)
     found.start(Seeds(7))
     return found
 
@@ -187,7 +187,7 @@ def test_where_no_skill_may_start_the_error_names_them_all():
 
 
 def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.decision_collector.LONGEST_EPISODE", 20)
+    monkeypatch.setattr("skillweave.collecting.hierarchy_collector.LONGEST_EPISODE", 20)
 
     class Eternal(Left):
         max_steps = None

@@ -9,8 +9,8 @@ from toy_acting import Choices, requests
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.collector import joined_collected
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.guide import SMOOTHED, ActiveGuide, as_logits
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import make_engine
 from skillweave.seeding import Seeds
@@ -27,7 +27,7 @@ AUTOMATON = Automaton(
 def collector_of(guide, call_steps=2):
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
     acting = Choices(N, skills.choices)
-    found = DecisionCollector(make_engine(SPEC, N), acting, skills, guide=guide)
+    found = HierarchyCollector(make_engine(SPEC, N), acting, skills, guide=guide)
     found.start(Seeds(2))
     return found
 
@@ -35,7 +35,7 @@ def collector_of(guide, call_steps=2):
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
     for greedy in (False, True):
-        collector = DecisionCollector(
+        collector = HierarchyCollector(
             make_engine(SPEC, N), Choices(N, len(SKILLS)), skills,
             guide=ActiveGuide(bound(AUTOMATON), decides=True),
         )  # fmt: skip

@@ -12,7 +12,7 @@ from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -82,7 +82,9 @@ def collector_of(call_steps, margin=None, n=N):
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
     learners = {"up": Learner(n), "down": Learner(n), "skill_critic": Values(n)}
     margins = {} if margin is None else {"skill_critic": margin}
-    collector = JointCollector(engine, Choices(n, found.choices), found, learners, margins)
+    collector = HierarchyCollector(
+        engine, Choices(n, found.choices), found, learners=learners, margins=margins
+    )
     collector.start(Seeds(7))
     return collector
 
@@ -183,7 +185,9 @@ def test_a_learner_of_the_library_acts_and_its_head_is_kept():
     state = algorithm.init([Seeds(0)])
     skills = SkillSet((Down(), Stay()), (None, Stay.policy), call_steps=3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
-    collector = JointCollector(engine, Choices(n, 2), skills, {"down": Acting([(algorithm, 1)], n)})
+    collector = HierarchyCollector(
+        engine, Choices(n, 2), skills, learners={"down": Acting([(algorithm, 1)], n)}
+    )
     collector.start(Seeds(1))
     request = next(requests(30))
     own = replace(request, params=(algorithm.acting_params(state),))

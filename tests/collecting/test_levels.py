@@ -12,8 +12,7 @@ from reference_calls import POSITION, T, Walk, one_step, scripted, seeds_of
 from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
 
-from skillweave.collecting.decision_collector import DecisionCollector
-from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -95,7 +94,7 @@ def collector_of(node, outer_steps, inner_steps, chooser=Selector, env=Walk):
         "up": Learner(N), f"{name}/down": Learner(N), f"{name}/selector": chooser(N, 2),
         f"{name}/skill_critic": Values(N), "skill_critic": Values(N),
     }  # fmt: skip
-    collector = JointCollector(engine, Choices(N, 2), whole, learners)
+    collector = HierarchyCollector(engine, Choices(N, 2), whole, learners=learners)
     collector.start(Seeds(7))
     return collector
 
@@ -320,7 +319,7 @@ class Early(Skill):
 def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
     skills = SkillSet((Early(),), (Early.policy,), call_steps=call_steps)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    collector = DecisionCollector(engine, Choices(N, 1), skills, as_skill=Paid())
+    collector = HierarchyCollector(engine, Choices(N, 1), skills, as_skill=Paid())
     collector.start(Seeds(7))
     rows = collector.collect(next(requests(60, GAMMA))).batches[""]
     for n in range(N):

@@ -10,7 +10,7 @@ from reference_calls import POSITION, Walk
 from test_joint import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
 
-from skillweave.collecting.joint import JointCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -59,7 +59,7 @@ def test_rows_of_skills_that_learn_under_a_selector():
     skills = SkillSet((Up(), Down(), Stay()), (None, None, Stay.policy), (BACK,), 3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     learners = {"up": Learner(N), "down": Learner(N), "skill_critic": Values(N)}
-    collector = JointCollector(engine, Choices(N, 3), skills, learners)
+    collector = HierarchyCollector(engine, Choices(N, 3), skills, learners=learners)
     collector.start(Seeds(7))
     seen = 0
     for request in itertools.islice(asked(40), 3):

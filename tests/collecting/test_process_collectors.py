@@ -18,8 +18,8 @@ from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
 
 from skillweave.collecting import processes, worker_process
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.placement import make_collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.collecting.skill_collector import SkillCollector
@@ -39,7 +39,7 @@ def skills():
 def deciding(env=Again):
     def make(num_envs, first):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return DecisionCollector(engine, Choices(num_envs, 4), skills())
+        return HierarchyCollector(engine, Choices(num_envs, 4), skills())
 
     return make
 

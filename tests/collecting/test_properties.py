@@ -15,7 +15,7 @@ from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collected, joined_collected, joined_from, parted
-from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.joined import JoinedEngines
@@ -140,7 +140,7 @@ def test_decisions_chain_in_every_space(shows):
         chooses = type("Chooses", (), {"observation_space": kind.observation_space})
         chooses.action_space = gym.spaces.Discrete(2)
         learns, params = learner(chooses, "memory")
-        collector = DecisionCollector(engine, Acting([(learns, 1)], 3), calls)
+        collector = HierarchyCollector(engine, Acting([(learns, 1)], 3), calls)
         collector.start(Seeds(2))
         collected = [collector.collect(r) for r in itertools.islice(asked(params, 9), 5)]
         assert sum(c.steps for c in collected) == 135
@@ -174,7 +174,7 @@ def decision_part(kind):
     skills = tuple(k() for k in (Left, Right, Zigzag, Counter))
     calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=40)
     engine = make_engine(EnvSpec(Walk, engine="sync"), 2)
-    return DecisionCollector(engine, Choices(2, 4), calls, keep_rewards=kind == "rewards")
+    return HierarchyCollector(engine, Choices(2, 4), calls, keep_rewards=kind == "rewards")
 
 
 class Slow(Skill):
@@ -195,7 +195,7 @@ class Longer(Walk):
 def long_part(kind):
     skills = SkillSet((Slow(), Slow()), (Slow.policy, Slow.policy))
     engine = make_engine(EnvSpec(Longer, engine="sync"), 2)
-    return DecisionCollector(engine, Choices(2, 2), skills, keep_rewards=True)
+    return HierarchyCollector(engine, Choices(2, 2), skills, keep_rewards=True)
 
 
 def compare(one, two):

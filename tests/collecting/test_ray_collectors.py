@@ -26,8 +26,8 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.collecting.cluster import Ray
-from skillweave.collecting.decision_collector import DecisionCollector
 from skillweave.collecting.group import Collectors
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -86,7 +86,7 @@ def deciding(env=Again):
         kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
         skills = SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return DecisionCollector(engine, Choices(num_envs, 4), skills)
+        return HierarchyCollector(engine, Choices(num_envs, 4), skills)
 
     return make
 

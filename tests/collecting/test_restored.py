@@ -26,18 +26,21 @@ def test_only_where_a_call_has_begun_is_an_observation_looked_at(prefix):
 
 def test_what_a_diverged_member_decided_by_is_nought_and_infinity_is_refused():
     head = np.array([[1, np.nan], [0, 2]], np.float32)
-    assert opened({"head": head}, {}, SEEN[:2], SPACE)["head"].tolist() == [[1, 0], [0, 2]]
+    assert opened({"dist_params": head}, {}, SEEN[:2], SPACE)["dist_params"].tolist() == [
+        [1, 0],
+        [0, 2],
+    ]
     head[0, 1] = np.inf
-    with pytest.raises(ValueError, match="'head' of open calls is not finite"):
-        opened({"head": head}, {}, SEEN[:2], SPACE)
+    with pytest.raises(ValueError, match="'dist_params' of open calls is not finite"):
+        opened({"dist_params": head}, {}, SEEN[:2], SPACE)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "refused"),
     [
-        ("choice", 2, False),
-        ("choice", 3, True),
-        ("choice", -1, True),
+        ("action", 2, False),
+        ("action", 3, True),
+        ("action", -1, True),
         ("tau", 2**31 - 1, False),
         ("tau", 2**31, True),
         ("tau", -2, True),
@@ -50,12 +53,12 @@ def test_what_a_diverged_member_decided_by_is_nought_and_infinity_is_refused():
     ],
 )
 def test_own_numbers_have_ranges_and_a_users_may_be_anything(name, value, refused):
-    own = {"choice": np.zeros(2, np.int64), name: np.array([0, value])}
+    own = {"action": np.zeros(2, np.int64), name: np.array([0, value])}
     if not refused:
-        check_numbers(own, {"choice": range(3)})
+        check_numbers(own, {"action": range(3)})
         return
     with pytest.raises(ValueError, match=repr(name)):
-        check_numbers(own, {"choice": range(3)})
+        check_numbers(own, {"action": range(3)})
 
 
 @pytest.mark.parametrize("player", ["player", "starters"])

@@ -8,7 +8,7 @@ import pytest
 from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
 from toy_acting import Again, Choices, Counts, Given, requests, step
 
-from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -64,7 +64,7 @@ def of_selector(greedy=True):
     def make():
         skills = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
         calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=5, greedy=greedy)
-        return DecisionCollector(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
+        return HierarchyCollector(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
 
     return make
 

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.decision_collector import DecisionCollector
+from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import checksums
@@ -247,7 +247,7 @@ def test_the_next_mask_is_that_of_the_true_successor(options):
 
 def test_decisions_are_packed_arrays_with_both_masks(options):
     acting, params = learner(Discrete(2))
-    collector = DecisionCollector(options.engine, acting, options.skills)
+    collector = HierarchyCollector(options.engine, acting, options.skills)
     collector.start(Seeds(0))
     stuck = 0
     for i in range(3):

@@ -65,7 +65,7 @@ def test_who_takes_its_place_goes_on_with_calls_that_it_can_learn_from(
         with pytest.raises(KeyboardInterrupt):
             declare().train(path, seed=3, quiet=True, evolve=evolve)
     heads = {k: v for k, v in read_tensors(path / "checkpoint.safetensors")[0].items()
-             if k.endswith("open.head")}  # fmt: skip
+             if k.endswith("open.dist_params")}  # fmt: skip
     assert len(heads) == 3
     assert all(bool(v.isfinite().all()) for v in heads.values())
     stages = declare().resume(path, quiet=True).info()["stages"]

@@ -1,0 +1,323 @@
+"""The collector of a hierarchy: its selector learns from decisions, and skills perhaps from steps.
+
+No environment waits for another: where a call is over, the selector decides again, while the other
+calls go on. A call that is open when the rows are full goes on in the next batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.call_end import EPISODE, LIMIT, RUNNING
+from skillweave.collecting.calls import OpenCalls
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.levels import Level, with_learners
+from skillweave.collecting.player import LearnerActor, Player, Turn
+from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.views import rewards_of, rows_of, steps_of, timed_out
+from skillweave.collecting.writer import TraceWriter
+from skillweave.envs.checks import LONGEST_EPISODE
+from skillweave.envs.engine import Engine
+from skillweave.errors import DeclarationError, SkillError
+from skillweave.experience import INFO, Batch, Trace
+from skillweave.paths import CRITIC, SELECTOR
+from skillweave.skills import Skill, path_of
+from skillweave.spaces import action_codec
+from skillweave.types import Array, Step, prefixed, unprefixed
+
+
+class HierarchyCollector(Collector):
+    """N environments in which a selector calls skills, and all learn from the same steps.
+
+    To a selector a row is a decision: its reward is Σ γᵏ rₖ over the call, to be discounted by γ^τ
+    afterwards (Sutton, Precup & Singh 1999, sec. 3). To a skill that learns it is a step in which
+    the skill acted, judged by its own reward and its own end. A trajectory of a skill goes on from
+    call to call, where it is called again at once after a limit; elsewhere the end of a call cuts
+    it, and its value goes on. A skill that is a hierarchy is judged in the same way.
+
+    Args:
+        engine: the environments.
+        acting: the selectors that learn; None: the guide decides, or only ``like`` is to act.
+        skills: what their actions mean; those that learn have any policy, ``UntrainedHierarchy``
+            where one is a hierarchy.
+        keep_rewards: of each call, keep the reward of every step, so that others may learn from it
+            with a γ of their own.
+        guide: a ready selector that is asked wherever they decide.
+        as_skill: the skill that all of it is, in another hierarchy: its reward and its ends count;
+            None: the environment's.
+        learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
+            ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: the
+            selector alone learns; its decisions have the path "" then, else ``selector``.
+        margins: by the paths of critics: calls end where a new decision is worth this much more.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        acting: Acting | None,
+        skills: SkillSet,
+        keep_rewards: bool = False,
+        guide: ActiveGuide | None = None,
+        as_skill: Skill | None = None,
+        learners: Mapping[str, Acting] | None = None,
+        margins: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(engine)
+        n, self.learners = self.num_envs, dict(learners or {})
+        self.skills = skills
+        if learners is not None:
+            self.skills = with_learners(skills, learners, margins or {})
+        self.keep_rewards, self.guide, self.as_skill = keep_rewards, guide, as_skill
+        self.selector = None if acting is None else LearnerActor(acting, SELECTOR, decides=True)
+        self.player = Player(self.skills, self.selector, guide)
+        self.memory = self.player.start(n)
+        """The player's, (N, …) each; changed in place."""
+        self.kept |= prefixed("player", self.memory)
+        self.ranges |= prefixed("player", ranges_of(self.player))
+        self.root = Level(self.player, self.learners)
+        self.levels = {
+            level: self.memory
+            if level is self.root
+            else unprefixed(level.prefix.removesuffix("."), self.memory)
+            for level in self.root.all()
+        }
+        """The levels in which something learns, each with its own memory."""
+        self._together = learners is not None
+        self._whole = self._together or as_skill is not None
+        """Steps are recorded as a whole; else only where the selector decides and calls end."""
+        self._open: dict[str, OpenCalls] = {}  # by the paths of levels whose selectors learn
+        ready = guide is not None and guide.decides and acting is None
+        for level in self.levels:
+            if level.selector is not None or (level is self.root and not ready):
+                calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
+                self._open[level.path] = calls
+                self._keep_after_request(level.path, calls.kept)
+                self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
+        self._recurrent = {
+            level.path + level.skills[i].name: memory[f"{i}.rnn"]
+            for level, memory in self.levels.items()
+            for i, actor in level.learning.items()
+            if actor.acting.memory_size
+        }
+        for path in self._recurrent:  # whether the skill acted in the latest step
+            self._keep_after_request(f"{path}/", {"acted": np.zeros(n, bool)})
+        reflexes = any(level.player.skills.reflexes for level in self.levels)
+        self.overridden = np.zeros(n, bool) if reflexes and self._together else None
+        """(N,), where reflexes acted in the latest step; None: not recorded."""
+
+    def like(self, engine: Engine, acting: Acting) -> HierarchyCollector:
+        """Return a collector of the same kind over other environments."""
+        if self._together:
+            raise DeclarationError("hierarchies that learn as a whole do not evolve")
+        return HierarchyCollector(
+            engine, acting, self.skills, self.keep_rewards, self.guide, self.as_skill
+        )
+
+    def _forget(self, ids: Array) -> None:
+        super()._forget(ids)
+        self.player.restart(self.memory, ids)
+
+    # Steps are made -----------------------------------------------------------------------------
+
+    def _prepare(self, request: Request) -> None:
+        self._record, self._gammas = request.record, dict[str, Array]()  # by path, (N,)
+        if self.selector is not None:
+            self._begin("", self.selector.acting, request)
+        for path, acting in self.learners.items():
+            self._begin(path.removesuffix(SELECTOR), acting, request.below[path])
+        self._states = {path: memory.copy() for path, memory in self._recurrent.items()}
+        rng = (request.seeds / "skills").numpy()
+        self._turn = Turn(request.greedy, rng, self.kept["age"], self.overridden)
+
+    def _begin(self, path: str, acting: Acting, request: Request) -> None:
+        """Let a learner act by a request."""
+        acting.begin(request, every_step=False)
+        self._gammas[path] = request.gamma.astype(np.float64).repeat(acting.each)
+
+    def _writer(self, rows: int) -> TraceWriter:
+        judges = [level.skills[i] for level in self.levels for i in (*level.learning, *level.below)]
+        reads = self.as_skill is not None or any(name.startswith(INFO) for name in self._record)
+        reads |= any(s.defines(method) for s in judges for method in ("reward", "termination"))
+        self._turn.trace = TraceWriter(rows, self.num_envs, keep_infos=reads)
+        return self._turn.trace
+
+    def _step(self, out: TraceWriter) -> None:
+        """One step of every environment."""
+        obs, mask = self.obs, self.engine.mask()
+        if self.overridden is not None:
+            self.overridden[:] = False
+        action = self.player.act(self.memory, self._all, obs, mask, self._turn)
+        if self._whole:
+            out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
+            for level, memory in self.levels.items():
+                out.write(**{level.path + "skill": memory["skill"]})
+        raw = self.engine.step(action)
+        self.kept["age"] += 1
+        step = raw.seen(obs, action, self.kept["age"].copy())
+        end = self.player.observe(self.memory, self._all, step)
+        terminated, truncated = self._ends(step, end)
+        ended = np.flatnonzero(terminated | truncated)
+        end[ended] = EPISODE
+        self._write(out, step, end)
+        out.write(terminated=terminated, truncated=truncated)
+        self.obs = raw.next_obs
+        if len(ended):
+            success = judge(None, step).success
+            succeeded = None if success is None else success[ended]
+            self._tell(out.row, ended, raw.info, succeeded, task=False)
+            self._begin_anew(ended)
+        out.next(raw.info)
+
+    def _ends(self, step: Step, end: Array) -> tuple[Array, Array]:
+        """Return where episodes are terminated, and truncated, (N,) bool each.
+
+        Where all of it is a skill, its ends count. Where a call has ended and no skill may start,
+        its own call ends, too; its value goes on.
+        """
+        if self.as_skill is None:
+            return step.terminated, step.truncated & ~step.terminated
+        outcome = judge(self.as_skill, seen_by(self.as_skill, step, step.elapsed), self._all)
+        terminated, truncated = outcome.terminated, step.truncated | outcome.truncated
+        if self.skills.restricts:
+            waits = np.flatnonzero(end != RUNNING)
+            truncated[waits] |= ~self.skills.startable(step.next_obs[waits]).any(axis=1)
+        return terminated, truncated & ~terminated
+
+    def _write(self, out: TraceWriter, step: Step, end: Array) -> None:
+        """Write what a step has led to, and why calls ended, (N,)."""
+        for level, memory in self.levels.items():
+            path, player = level.path, level.player
+            if self._whole:
+                ends = {"call_elapsed": memory["elapsed"], "call_end": memory["end"]}
+                out.write(**{path + name: value for name, value in ends.items()})
+            if player.guide is not None and level.selector is not None:
+                every = np.ones((self.num_envs, player.skills.choices), bool)
+                allows = player.guide.ahead(memory, self._all, every)
+                out.write(**{path + "guide_allows": allows})
+                if player.guide.tells:
+                    out.write(**{path + "chances": memory["chances"]})
+        out.write(env_reward=step.reward, call_end=end)
+        if not self._whole:
+            over = np.flatnonzero(end)
+            out.write(over, next_obs=step.next_obs[over])
+            return
+        out.write(
+            next_obs=step.next_obs,
+            next_mask=self.engine.mask(),
+            env_terminated=step.terminated,
+            env_truncated=step.truncated,
+            elapsed=step.elapsed,
+        )
+
+    # They are judged ----------------------------------------------------------------------------
+
+    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+        every = np.ones(trace.lead, bool)
+        reward = trace["env_reward"]
+        if self.as_skill is not None:
+            reward = rewards_of(trace, self.as_skill, every, trace["elapsed"])
+        ends = {name: trace[name] for name in ("terminated", "truncated")}
+        self._steps = Batch(reward=reward, **ends, valid=every)
+        each = np.zeros((*trace.lead, 3))
+        each[..., 0], each[..., 2] = reward, 1.0
+        return self._count(each)
+
+    def _views(self, trace: Trace) -> dict[str, Batch]:
+        self._check_lengths()
+        end = trace["call_end"]
+        return dict(self._of_level(trace, self.root, self._steps, end, end != RUNNING))
+
+    def _of_level(
+        self, trace: Trace, level: Level, steps: Batch, end: Array, closes: Array
+    ) -> Iterator[tuple[str, Batch]]:
+        """Yield what the learners of a level did, by path, and of those below it.
+
+        Args:
+            steps, closes: see ``OpenCalls.calls_of``.
+            end: (T, N) int8, why calls of its skills ended, for what they learn.
+        """
+        if level.path in self._open:
+            gamma = self._gammas[level.path]
+            calls = self._open[level.path].calls_of(trace, steps, closes, gamma)
+            yield level.path + SELECTOR if self._together else "", calls
+        if not self._together:
+            return
+        if level.has_critic:
+            yield level.path + CRITIC, self._of_critic(trace, level, steps)
+        for i, skill in enumerate(level.skills):
+            acts = steps["valid"] & (trace[level.path + "skill"] == i)
+            if i in level.learning:
+                yield level.path + skill.name, self._of_skill(trace, level, skill, acts, end)
+            elif i in level.below:
+                yield from self._of_level(trace, *self._inside(trace, level, i, acts, end))
+
+    @staticmethod
+    def _of_critic(trace: Trace, level: Level, steps: Batch) -> Batch:
+        """Return all steps of a level, for its critic."""
+        acts = steps["valid"]
+        return steps.replace(
+            obs=trace["obs"],
+            action=np.where(acts, trace[level.path + "skill"], 0),
+            steps=np.ones(trace.lead, np.int64),
+            next_obs=trace["next_obs"],
+            valid=None if acts.all() else acts,
+            call_start=acts & (trace[level.path + "call_elapsed"] == 1),
+        )
+
+    def _of_skill(self, trace: Trace, level: Level, skill: Skill, acts: Array, end: Array) -> Batch:
+        """Return what a skill that learns did, judged by its own reward and ends."""
+        path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
+        steps = steps_of(trace, skill, acts, elapsed, end)
+        # Elsewhere it is called again at once.
+        ends = (end == EPISODE) | timed_out(trace, skill, elapsed)
+        steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
+        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record)
+        if "action" not in batch:
+            batch = batch.replace(action=self._no_actions(trace.lead))
+        if path not in self._states:
+            return batch
+        before = self.kept[f"{path}/acted"]
+        goes_on = acts & (trace["call_end"] != EPISODE)
+        starts = ~np.concatenate([before[None], goes_on[:-1]])
+        before[:] = goes_on[-1]
+        return batch.replace(recurrent_state=self._states[path], episode_start=starts)
+
+    def _no_actions(self, lead: tuple[int, int]) -> Array:
+        """Return the actions of a skill that has not acted, (T, N, …) in policy units."""
+        codec = action_codec(self.engine.action_space)  # all skills act in this space
+        units = codec.from_env(np.asarray(codec.space.sample())[None])
+        return np.zeros((*lead, *units.shape[1:]), units.dtype)
+
+    @staticmethod
+    def _inside(
+        trace: Trace, level: Level, i: int, acts: Array, end: Array
+    ) -> tuple[Level, Batch, Array, Array]:
+        """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
+        skill, below = level.skills[i], level.below[i]
+        elapsed = trace[level.path + "call_elapsed"]
+        steps = steps_of(trace, skill, acts, elapsed, end)
+        own = trace[below.path + "call_end"]
+        limited = steps["truncated"] & timed_out(trace, skill, elapsed)
+        closes = (own != RUNNING) | (end == EPISODE) | limited
+        # The hierarchy's own end cuts the calls below it, unless it is called again at once.
+        cut = (own == RUNNING) & (end != RUNNING)
+        inner = np.where(end == EPISODE, np.int8(EPISODE), np.int8(LIMIT))
+        return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
+
+    def _check_lengths(self) -> None:
+        """Raise a SkillError where a call has run for so long that nothing seems to end it."""
+        steps = self.memory["elapsed"]
+        if steps.max() >= LONGEST_EPISODE:
+            row = int(steps.argmax())
+            name = path_of(self.skills.skills[int(self.memory["skill"][row])])
+            raise SkillError(
+                f"skill {name!r} has run for {int(steps[row]):,} steps in environment {row}, and "
+                "neither its termination() nor the episode's end has come: give it max_steps, or "
+                "the hierarchy call_steps"
+            )
