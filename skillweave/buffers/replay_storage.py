@@ -244,7 +244,8 @@ class Columns:
         last = len(valid) - 1 - valid[::-1, column].argmax(0), column
         self.newest[column] = place[last] + 1
         self._open[column] = ~ended[last]
-        return slot[valid]
+        of_valid: Array = slot[valid]
+        return of_valid
 
     def _start(self, name: str) -> None:
         """Start to store "steps", "mask" or "call".
