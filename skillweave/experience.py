@@ -166,6 +166,10 @@ class Trace(Batch):
         rows, envs = self["next_obs"].shape[:2]
         return rows, envs
 
+    def rows(self, part: slice) -> Trace:
+        """Return a slice of the T steps."""
+        return Trace(self.infos[part], {k: v[part] for k, v in self.items()})
+
 
 def side_by_side(batches: Sequence[Batch], members: int) -> Batch:
     """Join batches of several collectors: the environments of each member stand side by side."""

@@ -95,8 +95,8 @@ class Collector:
         for _ in range(request.rows):
             self._step(writer)
         trace = writer.trace()
-        found = self._episodes(trace)
-        batches = self._views(trace)
+        judged, found = self._judge(trace)
+        batches = self._views(trace, judged)
         steps = self.engine.steps_made - before
         episodes = np.concatenate(
             [np.zeros((0, FIRST_INFO + len(self.log_info))), *(x for _, _, x in found)]
@@ -130,7 +130,7 @@ class Collector:
                     playing[ids] = False
                 playing &= ~self._given_up()
             steps += writer.row
-            for _, ids, episodes in self._episodes(writer.trace()):
+            for _, ids, episodes in self._judge(writer.trace())[1]:
                 first = unknown[ids]
                 found[ids[first]], unknown[ids[first]] = episodes[first], False
         found[playing, :3] = self.kept["sums"][playing]
@@ -198,15 +198,17 @@ class Collector:
         """Step every environment, and write what happened."""
         raise NotImplementedError
 
-    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
-        """Judge the steps of a trace; return what ended in them: row, environments, numbers.
+    def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
+        """Judge the steps of a trace.
 
-        ``_count`` makes them; the numbers are (k, 4 + I), as in ``Collected.episodes``.
+        Returns:
+            The steps as those who act are judged by them, and the episodes that ended in them:
+            row, environments, and numbers (k, 4 + I), as in ``Collected.episodes``.
         """
         raise NotImplementedError
 
-    def _views(self, trace: Trace) -> dict[str, Batch]:
-        """Return what each learner did, by path."""
+    def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
+        """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
         raise NotImplementedError
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:

@@ -217,21 +217,21 @@ class HierarchyCollector(Collector):
 
     # They are judged ----------------------------------------------------------------------------
 
-    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+    def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
         every = np.ones(trace.lead, bool)
         reward = trace["env_reward"]
         if self.as_skill is not None:
             reward = rewards_of(trace, self.as_skill, every, trace["elapsed"])
         ends = {name: trace[name] for name in ("terminated", "truncated")}
-        self._steps = Batch(reward=reward, **ends, valid=every)
         each = np.zeros((*trace.lead, 3))
         each[..., 0], each[..., 2] = reward, 1.0
-        return self._count(each)
+        return Batch(reward=reward, **ends, valid=every), self._count(each)
 
-    def _views(self, trace: Trace) -> dict[str, Batch]:
+    def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
         self._check_lengths()
+        self._turn.trace = None  # only learners hold it from here on
         end = trace["call_end"]
-        return dict(self._of_level(trace, self.root, self._steps, end, end != RUNNING))
+        return dict(self._of_level(trace, self.root, steps, end, end != RUNNING))
 
     def _of_level(
         self, trace: Trace, level: Level, steps: Batch, end: Array, closes: Array

@@ -202,10 +202,9 @@ class SkillCollector(Collector):
             end[~playing] = RUNNING
         return end
 
-    def _episodes(self, trace: Trace) -> list[tuple[int, Array, Array]]:
+    def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
         acts, elapsed = trace.valid_rows, trace["call_elapsed"]
         steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"])
-        self._steps = steps.replace(valid=trace.get("valid"))
         each = np.empty((*trace.lead, 3))
         each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
         found = self._count(each)
@@ -213,10 +212,10 @@ class SkillCollector(Collector):
             success = successes_of(trace, self.skill, acts, elapsed)
             for row, ids, episodes in found:
                 episodes[:, SUCCESS] = success[row, ids]
-        return found
+        return steps.replace(valid=trace.get("valid")), found
 
-    def _views(self, trace: Trace) -> dict[str, Batch]:
-        batch = rows_of(trace, self._steps, "", trace["call_elapsed"], self._record)
+    def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
+        batch = rows_of(trace, steps, "", trace["call_elapsed"], self._record)
         if self._before is None:
             return {"": batch}
         starts = np.concatenate([self._starts[None], batch.ended[:-1]])

@@ -19,6 +19,9 @@ from skillweave.skills import Skill
 from skillweave.skills.info_words import missing_key
 from skillweave.types import Array, Step
 
+AT_ONCE = 1 << 26
+"""Bytes of observations that a skill judges at once."""
+
 
 def steps_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array, end: Array) -> Batch:
     """Return the rows in which a skill acted, judged by its own reward and ends.
@@ -78,8 +81,18 @@ def judged(
         SkillweaveError: the skill's method failed, or returned a wrong result; the message is that
             of the first step in which it does.
     """
+    alone = what == "reward" and skill.reward_changes
+    most = 1 if alone else max(1, AT_ONCE // max(1, trace["obs"][0].nbytes))
+    if len(acts) <= most:
+        return _judged(trace, skill, what, acts, elapsed)
+    parts = [slice(first, first + most) for first in range(0, len(acts), most)]
+    found = [_judged(trace.rows(part), skill, what, acts[part], elapsed[part]) for part in parts]
+    return np.concatenate(found)
+
+
+def _judged(trace: Trace, skill: Skill, what: str, acts: Array, elapsed: Array) -> Array:
     steps = np.flatnonzero(acts.any(axis=1))
-    if len(steps) > 1 and not (what == "reward" and skill.reward_changes):
+    if len(steps) > 1:
         step = _together(trace, steps, acts, elapsed)
         ids = np.nonzero(acts)[1]
         try:

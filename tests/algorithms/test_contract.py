@@ -354,8 +354,8 @@ def test_an_end_is_not_bootstrapped(name):
 class TenSteps(SkillCollector):
     """Says of every row that it took ten steps."""
 
-    def _views(self, trace):
-        batches = super()._views(trace)
+    def _views(self, trace, steps):
+        batches = super()._views(trace, steps)
         batches[""]["steps"][:] = 10
         return batches
 

@@ -139,6 +139,21 @@ def test_a_reward_is_called_once_in_a_request(make: Any, path: str) -> None:
 
 
 @pytest.mark.usefixtures("unprobed")
+@pytest.mark.parametrize("pays", [numbers, sometimes])
+def test_large_observations_are_judged_in_parts(pays: Any, monkeypatch: Any) -> None:
+    whole = rewards(alone(skill_of(pays)), ROWS, "")
+    monkeypatch.setattr("skillweave.collecting.views.AT_ONCE", 5 * alone(None).obs.nbytes)
+    sizes: list[int] = []
+
+    def counted(step: Any) -> Any:
+        sizes.append(len(step.reward))
+        return pays(step)
+
+    np.testing.assert_array_equal(rewards(alone(skill_of(counted)), ROWS, ""), whole)
+    assert max(sizes) == 5 * N
+
+
+@pytest.mark.usefixtures("unprobed")
 @pytest.mark.parametrize(("make", "path"), [(alone, ""), (below, "reads")])
 def test_a_reward_that_changes_gets_each_step_once_and_in_order(make: Any, path: str) -> None:
     found = []
