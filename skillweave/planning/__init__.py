@@ -1,12 +1,15 @@
 """Know and plan: tasks without training, logs of calls, and planning on them."""
 
+from skillweave.planning.calls import CallLog, join
 from skillweave.planning.goal import Goal, reached
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, either, in_any_order
 from skillweave.planning.predicates import Predicate, held, successes
+from skillweave.planning.record import record_calls
 from skillweave.planning.task import as_task
 
 __all__ = [
+    "CallLog",
     "Goal",
     "Mission",
     "Predicate",
@@ -15,6 +18,8 @@ __all__ = [
     "either",
     "held",
     "in_any_order",
+    "join",
     "reached",
+    "record_calls",
     "successes",
 ]

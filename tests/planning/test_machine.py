@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from steps import column, step_to
+from planning.steps import column, step_to
 
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.planning import Predicate, RewardMachine, held, successes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from steps import column, step_to
+from planning.steps import column, step_to
 
 from skillweave.errors import DeclarationError
 from skillweave.planning import (
