@@ -2,6 +2,7 @@
 
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.goal import Goal, reached
+from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, either, in_any_order
 from skillweave.planning.predicates import Predicate, held, successes
@@ -9,13 +10,19 @@ from skillweave.planning.record import record_calls
 from skillweave.planning.task import as_task
 
 __all__ = [
+    "CallEnds",
     "CallLog",
+    "Chain",
     "Goal",
+    "HandOver",
     "Mission",
     "Predicate",
     "RewardMachine",
     "as_task",
+    "call_ends",
+    "chain",
     "either",
+    "hand_over",
     "held",
     "in_any_order",
     "join",

@@ -18,7 +18,7 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
 from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.settings import AtLeastOne
+from skillweave.settings import AtLeastOne, Count
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
     obs_dtype,
@@ -54,6 +54,7 @@ class CallsHeader(TypedDict):
     skills: list[str]
     lengths: list[AtLeastOne]
     checksums: list[str]
+    sees: list[list[Count] | None]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
@@ -68,6 +69,7 @@ def write_calls(path: str | Path, columns: Mapping[str, Array], about: Mapping[s
     header = {
         "kind": KIND,
         **{name: list(about[name]) for name in ("skills", "lengths", "checksums")},
+        "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
     }
@@ -100,8 +102,10 @@ def _fields(
     skills, lengths, info = (tuple(header[k]) for k in ("skills", "lengths", "info"))
     if not skills or len(set(skills)) != len(skills) or not all(map(NAME.fullmatch, skills)):
         raise ValueError("its skills have no names, or two the same")
-    if list(lengths) != sorted(set(lengths)) or len(header["checksums"]) != len(skills):
-        raise ValueError("its lengths do not rise, or a skill has no checksum")
+    if list(lengths) != sorted(set(lengths)):
+        raise ValueError("its lengths do not rise")
+    if any(len(header[k]) != len(skills) for k in ("checksums", "sees")):
+        raise ValueError("its header does not have an entry for each skill")
     columns = {name: value.numpy() for name, value in tensors.items()}
     expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
     if columns.keys() != expected:
@@ -126,6 +130,7 @@ def _fields(
             "skills": skills,
             "lengths": lengths,
             "checksums": tuple(header["checksums"]),
+            "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
         }
     )

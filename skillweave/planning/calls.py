@@ -44,6 +44,7 @@ class CallLog:
         skills: names of the skills.
         lengths: lengths that were chosen with the skills; empty: none were.
         checksums: of each skill, what decides its actions and its ends.
+        sees: of each skill, the places in the flat observation that its network sees; None: all.
         observation_space: of the environment.
         action_space: of the environment.
         start: (C, *obs_shape), the observation of the decision.
@@ -66,6 +67,7 @@ class CallLog:
     skills: tuple[str, ...]
     lengths: tuple[int, ...]
     checksums: tuple[str, ...]
+    sees: tuple[tuple[int, ...] | None, ...]
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
     start: Array
@@ -138,9 +140,9 @@ class CallLog:
 
     @property
     def was_cut(self) -> Array:
-        """(C,) bool: the episode's time limit cut the call, so that it could not be completed."""
+        """(C,) bool: the episode's time limit cut the call."""
         cut: Array = self.truncated & ~self.terminated & (self.end_reason == CallEnd.EPISODE)
-        return cut & ~self.succeeded
+        return cut
 
     @cached_property
     def followed_by(self) -> Array:
@@ -333,6 +335,16 @@ def skill_checksums(skills: SkillSet) -> tuple[str, ...]:
         whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
         found.append(checksum(whole.encode()))
     return tuple(found)
+
+
+def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
+    """Return the places that each skill's network sees; None: all, or the policy is no network."""
+    networks = (
+        getattr(getattr(getattr(p, "algorithm", None), "config", None), "network", None)
+        for p in skills.policies
+    )
+    places = (getattr(network, "sees", None) for network in networks)
+    return tuple(None if p is None else tuple(p) for p in places)
 
 
 def columns_of(log: CallLog) -> Mapping[str, Array]:

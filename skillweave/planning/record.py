@@ -18,7 +18,7 @@ from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.messages import short, whole_number
-from skillweave.planning.calls import CallLog, skill_checksums
+from skillweave.planning.calls import CallLog, seen_places, skill_checksums
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector
 from skillweave.skills.info_words import missing_key
@@ -253,6 +253,7 @@ class Recorder:
             tuple(s.name for s in self.skills.skills),
             self.skills.lengths,
             skill_checksums(self.skills),
+            seen_places(self.skills),
             self.engine.observation_space,
             self.engine.action_space,
             start=start,
