@@ -62,6 +62,8 @@ class FeatureMap:
             )
         self._varies = np.flatnonzero(varies)
         self.scale = 1.0 / deviation[varies]
+        self.size = len(self._varies)
+        """F, the number of features."""
 
     def __call__(self, obs: Array) -> Array:
         """Return standardised features, (n, F) float32; constant ones are left out."""

@@ -35,6 +35,10 @@ class LearnsFromCalls(Protocol):
     every: int
     """Steps after which it plans again."""
 
+    def begin(self, choices: int) -> None:
+        """Prepare for a recording of skills with so many choices."""
+        ...
+
     def learn(self, log: CallLog) -> None:
         """Plan on the calls so far."""
         ...
@@ -125,6 +129,8 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
         names = tuple(s.name for s in skills.skills)
         choices = gym.spaces.Discrete(skills.choices)
         return choose.among(names).bind(engine.observation_space, choices, "selector")
+    if isinstance(choose, LearnsFromCalls):
+        choose.begin(skills.choices)
     return choose
 
 

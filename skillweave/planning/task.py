@@ -24,7 +24,8 @@ def as_task(value: Any, predicates: Mapping[str, Any] | None = None) -> Task:
 
     Args:
         value: a ``RewardMachine``, a ``Mission`` or its text, a ``Goal``, a predicate (the task is
-            done where it holds), or a function of a ``Step``, the reward.
+            done where it holds), also a function of observations, or a function of a ``Step``: the
+            reward.
         predicates: by name, for texts.
 
     Raises:
@@ -37,7 +38,10 @@ def as_task(value: Any, predicates: Mapping[str, Any] | None = None) -> Task:
     if isinstance(value, Predicate | Held | Choice | AnyOrder):
         return Mission(value)
     if callable(value) and not isinstance(value, type):
-        return RewardMachine({}, each_step=value)
+        predicate = Predicate(value)
+        return (
+            Mission(predicate) if predicate.reads == "obs" else RewardMachine({}, each_step=value)
+        )
     raise DeclarationError(
         f"the task is {short(value)}; give a Mission or its text, a RewardMachine, a Goal, or a "
         "function of a step that returns the reward"

@@ -293,6 +293,7 @@ def test_a_task_of_anything_that_means_one() -> None:
     assert as_task("a then b", NAMES).state_names == ("a", "b", "done")
     assert as_task(P[0]).state_names == ("a", "done")
     assert as_task(either(P[0], P[1])).state_names == ("a or b", "done")
+    assert as_task(column(0)).state_names == ("a", "done")
     paid = as_task(lambda step: step.next_obs[:, 0])
     assert isinstance(paid, RewardMachine)
     state, reward, done = paid.step(paid.start(2), step_to([[3], [4]]))
