@@ -55,6 +55,7 @@ class CallsHeader(TypedDict):
     lengths: list[AtLeastOne]
     checksums: list[str]
     sees: list[list[Count] | None]
+    recurrent: list[bool]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
@@ -68,7 +69,7 @@ def write_calls(path: str | Path, columns: Mapping[str, Array], about: Mapping[s
     """
     header = {
         "kind": KIND,
-        **{name: list(about[name]) for name in ("skills", "lengths", "checksums")},
+        **{name: list(about[name]) for name in ("skills", "lengths", "checksums", "recurrent")},
         "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
@@ -104,7 +105,7 @@ def _fields(
         raise ValueError("its skills have no names, or two the same")
     if list(lengths) != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
-    if any(len(header[k]) != len(skills) for k in ("checksums", "sees")):
+    if any(len(header[k]) != len(skills) for k in ("checksums", "sees", "recurrent")):
         raise ValueError("its header does not have an entry for each skill")
     columns = {name: value.numpy() for name, value in tensors.items()}
     expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
@@ -130,6 +131,7 @@ def _fields(
             "skills": skills,
             "lengths": lengths,
             "checksums": tuple(header["checksums"]),
+            "recurrent": tuple(header["recurrent"]),
             "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
         }

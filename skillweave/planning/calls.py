@@ -45,6 +45,7 @@ class CallLog:
         lengths: lengths that were chosen with the skills; empty: none were.
         checksums: of each skill, what decides its actions and its ends.
         sees: of each skill, the places in the flat observation that its network sees; None: all.
+        recurrent: of each skill, whether its policy has a memory within a call.
         observation_space: of the environment.
         action_space: of the environment.
         start: (C, *obs_shape), the observation of the decision.
@@ -68,6 +69,7 @@ class CallLog:
     lengths: tuple[int, ...]
     checksums: tuple[str, ...]
     sees: tuple[tuple[int, ...] | None, ...]
+    recurrent: tuple[bool, ...]
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
     start: Array

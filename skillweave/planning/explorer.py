@@ -12,6 +12,7 @@ from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
+from skillweave.planning.states import PlanningStates
 from skillweave.types import Array, Memory, Memoryless
 
 
@@ -66,7 +67,8 @@ class Explorer(Memoryless):
             return
         graph = CallGraph(log, self._features, self._neighbours)
         nothing = RewardMachine({})
-        judged = graph.judge(nothing, nothing.read(log.as_steps()), self._gamma)
+        readings = nothing.read(graph.log.as_steps())
+        judged = graph.judge(nothing, PlanningStates(nothing), readings, self._gamma)
         worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._radius)
         self._graph, self._worth = graph, worth[:, 0]
 
@@ -91,7 +93,7 @@ class Explorer(Memoryless):
             score = rng.random((len(obs), self._choices))
             return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), memory
         near = self._graph.near(obs)
-        q = (self._worth[near.calls] * near.weights).sum(2)
+        q = (self._worth[near.pieces] * near.weights).sum(2)
         q = np.where(near.distance > self._radius, 1.0, q)
         largest = np.maximum(np.abs(q).max(1, keepdims=True), 1e-3)
         score = q / (self._temperature * largest) + rng.gumbel(size=q.shape)

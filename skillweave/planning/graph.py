@@ -1,7 +1,11 @@
-"""The graph of logged calls: from where each call ended, the nearest calls that start there.
+"""The graph of logged calls: from where each call ended, the nearest calls that pass there.
 
 Value iteration on it is kernel-based reinforcement learning (Ormoneit & Sen 2002) over calls
 (Sutton, Precup & Singh 1999): no model is learnt.
+
+A call is a chain of pieces of a few steps. A skill without a memory acts by what it sees, so from
+any piece on, the call is also a call that started there; a logged call says what the skill does
+from everywhere that it passed.
 """
 
 from __future__ import annotations
@@ -21,6 +25,10 @@ from skillweave.planning.neighbours import SOFT, feature_maps, nearest, weights_
 from skillweave.planning.states import PlanningStates
 from skillweave.types import Array
 
+PIECE = 5
+"""Steps of a piece, where that does not give too many."""
+MOST_PIECES = 10_000
+"""The most pieces of a graph; of a longer log they have more steps."""
 MOST_CALLS = 20_000
 """The most calls of a graph; of more, every so-many-th is used."""
 MOST_SWEEPS = 2_000
@@ -30,10 +38,10 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Near:
-    """The nearest calls of each choice to n observations."""
+    """The nearest pieces of each choice to n observations, each of another call."""
 
-    calls: Array
-    """(n, choices, K) int64, rows of the graph."""
+    pieces: Array
+    """(n, choices, K) int64."""
     weights: Array
     """(n, choices, K) float32, they add up to 1 for each choice."""
     distance: Array
@@ -41,26 +49,46 @@ class Near:
     total: Array
     """(n, choices) float32, the sum of the weights before they were normalised."""
 
+    def take(self, rows: Array) -> Near:
+        """Return the neighbours of some observations."""
+        return Near(self.pieces[rows], self.weights[rows], self.distance[rows], self.total[rows])
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """P pieces of calls."""
+
+    call: Array
+    """(P,) int64, the call that each is of."""
+    choice: Array
+    """(P,) int64."""
+    first: Array
+    """(P,) int64, its first step in the log."""
+    stop: Array
+    """(P,) int64, the step behind its last one."""
+    then: Array
+    """(P,) int64, the next piece of the same call; −1: the call ends."""
+
 
 @dataclass(frozen=True)
 class Judged:
-    """The outcome of every call of a graph for a task, from each of its M planning states."""
+    """The outcome of every piece for a task, from each of its M planning states."""
 
     reward: Array
-    """(R, M) float32, Σ γᵏ rₖ within the call."""
+    """(P, M) float32, Σ γᵏ rₖ within the piece."""
     follows: Array
-    """(R, M, J) int64, planning states at the call's end."""
+    """(P, M, J) int32, planning states after it."""
     weights: Array
-    """(R, M, J) float32, of these."""
+    """(P, M, J) float32, of these."""
     discount: Array
-    """(R,) float32, γ^τ, or 0 where the episode terminated."""
+    """(P,) float32, γ to the number of steps; 0 where nothing follows."""
 
 
 class CallGraph:
-    """R calls of a log and their nearest successors.
+    """The pieces of a log's calls, and the nearest pieces to where each call ended.
 
-    Where lengths are chosen, a call also counts as one of each shorter length, up to its own: the
-    steps inside say where it would have ended.
+    Where lengths are chosen, a call also counts as one of each shorter length: the steps inside say
+    where it would have ended.
 
     Args:
         log: the calls.
@@ -87,103 +115,109 @@ class CallGraph:
                 f"the log has {len(log)} call{'s' * (len(log) != 1)}, and nothing can be planned "
                 "from that; record some thousand steps"
             )
-        self.log, self.neighbours, self.skills = log, neighbours, skills
-        self.call, self.tau, self.choice = _rows(log, skills)
-        if len(self.call) > MOST_CALLS:
+        if len(log) > MOST_CALLS:
             notice(
-                f"the log has {len(self.call):,} calls; the plan uses {MOST_CALLS:,} of them, at "
-                "equal distances"
+                f"the log has {len(log):,} calls; the plan uses {MOST_CALLS:,} of them, at equal "
+                "distances"
             )
-            some = np.linspace(0, len(self.call) - 1, MOST_CALLS).astype(np.int64)
-            self.call, self.tau, self.choice = self.call[some], self.tau[some], self.choice[some]
+            log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
+        self.log, self.neighbours, self.skills = log, neighbours, skills
+        self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
         self.maps = feature_maps(log.observation_space, features, log.sees, known, log.skills)
-        self.rows = [np.flatnonzero(self.choice == c) for c in range(log.choices)]
-        """The rows of each choice."""
-        self.known = np.array([len(rows) > 0 for rows in self.rows])
+        self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
+        self.known = np.array([len(rows) > 0 for rows in self._of_choice])
         """(choices,) bool: the log has a call of the choice."""
-        lengths = max(1, len(log.lengths))
-        self.skill_of = np.arange(log.choices) // lengths
-        starts = log.start[self.call]
-        self.starts = [
-            self.maps[self.skill_of[c]](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
-            for c, rows in enumerate(self.rows)
+        self.skill_of = np.arange(log.choices) // max(1, len(log.lengths))
+        starts = log.before[pieces.first]
+        self._starts = [
+            self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
+            for skill, rows in zip(self.skill_of, self._of_choice, strict=True)
         ]
-        """Standardised features of each choice's starts, (n, F) float32."""
-        whole = self.tau == log.tau[self.call]
-        self.ends_call = log.offset[self.call] + self.tau - 1
-        self.end = log.next_obs[self.ends_call]
-        """(R, *obs_shape), the observation at each row's end."""
-        self.terminated = log.terminated[self.call] & whole
-        self.may = self._may(whole)
-        """(R, choices) bool: the choices that may follow."""
-        self._near: Near | None = None
+        last = pieces.then < 0
+        steps, self._end_of = np.unique(pieces.stop[last] - 1, return_inverse=True)
+        self._last = np.flatnonzero(last)
+        self.end = log.next_obs[steps]
+        """(E, *obs_shape), the observations at the ends of calls."""
+        call = log.owner[steps]
+        whole = steps == log.offset[call + 1] - 1
+        self.end_call = call
+        """(E,) int64, the call of each end."""
+        self.terminated = log.terminated[call] & whole
+        """(E,) bool: the episode terminated there."""
+        self.may = log.may_follow[call].copy()
+        """(E, choices) bool: what may follow."""
+        parts = np.flatnonzero(~whole)
+        if len(parts) and skills is not None and skills.restricts:
+            self.may[parts] = skills.startable(self.end[parts])
+        self._depths = _by_depth(pieces.then)
+        self._after: Near | None = None
 
     def near(self, obs: Array) -> Near:
-        """Return the nearest calls of each choice to observations (n, …)."""
+        """Return the nearest pieces of each choice to observations (n, …)."""
         return self.near_features([each(obs) for each in self.maps])
 
     def near_features(self, features: list[Array]) -> Near:
-        """Return the nearest calls to features of each skill, (n, F) each."""
+        """Return the nearest pieces to features of each skill, (n, F) each."""
         n, k = len(features[0]), self.neighbours
         shape = (n, self.log.choices, k)
-        calls, distance = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
-        for c, rows in enumerate(self.rows):
+        pieces, distance = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
+        for c, rows in enumerate(self._of_choice):
             if len(rows):
-                near, far = nearest(self.starts[c], features[self.skill_of[c]], k)
-                calls[:, c], distance[:, c] = rows[near], far
-                if len(rows) < k:  # the others repeat the last
-                    distance[:, c, len(rows) :] = np.inf
+                call = self.pieces.call[rows]
+                near, far = nearest(self._starts[c], features[self.skill_of[c]], k, call)
+                pieces[:, c], distance[:, c] = rows[near], far
         finite = np.where(np.isfinite(distance), distance, 1e9)
         total = (1.0 / (finite + SOFT)).sum(2)
-        return Near(calls, weights_of(finite), distance[:, :, 0], total)
+        return Near(pieces, weights_of(finite), distance[:, :, 0], total)
 
     @property
     def after(self) -> Near:
-        """The nearest calls to the end of each call."""
-        if self._near is None:
-            self._near = self.near(self.end)
-        return self._near
+        """The nearest pieces to the ends of calls."""
+        if self._after is None:
+            self._after = self.near(self.end)
+        return self._after
 
     def judge(
-        self, task: RewardMachine, readings: Readings, gamma: float, over: Array | None = None
+        self,
+        task: RewardMachine,
+        states: PlanningStates,
+        readings: Readings,
+        gamma: float,
+        over: Array | None = None,
     ) -> Judged:
-        """Return what each call pays and leads to, from each planning state of a task.
+        """Return what each piece pays and leads to, from each planning state of a task.
 
         Args:
             task: the machine.
-            readings: the task's, of all steps of the log.
+            states: its planning states.
+            readings: the machine's, of all steps of the log.
             gamma: γ of one step.
-            over: (R,) bool, the calls after which nothing follows; None: where the episode
+            over: (E,) bool, the ends after which nothing follows; None: where the episode
                 terminated.
         """
-        over = self.terminated if over is None else over
-        states = PlanningStates(task)
-        count, slots = states.count, task.slots
-        reward = np.zeros((len(self.call), count), np.float32)
-        final = np.zeros((len(self.call), count, 1 + slots), np.int64)
-        # Rows of one call share its steps; the longest calls come first, so that those which go on
-        # are always a part from the beginning.
-        calls, longest = np.unique(self.call), np.zeros(len(self.log), np.int64)
-        np.maximum.at(longest, self.call, self.tau)
-        calls = calls[np.argsort(-longest[calls], kind="stable")]
-        place = np.zeros(len(self.log), np.int64)
-        place[calls] = np.arange(len(calls))
-        by_tau = np.argsort(self.tau, kind="stable")
-        bounds = np.searchsorted(self.tau[by_tau], np.arange(int(self.tau.max()) + 2))
-        state = np.repeat(states.exact[None], len(calls), 0)
-        paid = np.zeros((len(calls), count))
-        lengths = longest[calls]
-        for k in range(int(self.tau.max())):
-            m = int(np.searchsorted(-lengths, -k, side="left"))  # calls with more than k steps
-            some = readings.take(self.log.offset[calls[:m]] + k)
-            state[:m], now = task.advance(state[:m], some)
+        pieces = self.pieces
+        steps = pieces.stop - pieces.first
+        # The longest come first, so that those which go on are always a part from the beginning.
+        order = np.argsort(-steps, kind="stable")
+        first, lengths = pieces.first[order], steps[order]
+        state = np.repeat(states.exact[None], len(order), 0)
+        paid = np.zeros((len(order), states.count))
+        for k in range(int(lengths[0])):
+            m = int(np.searchsorted(-lengths, -k, side="left"))
+            state[:m], now = task.advance(state[:m], readings.take(first[:m] + k))
             paid[:m] += gamma**k * now
-            rows = by_tau[bounds[k + 1] : bounds[k + 2]]
-            reward[rows], final[rows] = paid[place[self.call[rows]]], state[place[self.call[rows]]]
+        reward, final = np.empty(paid.shape, np.float32), np.empty_like(state)
+        reward[order], final[order] = paid, state
         follows, weights = states.corners(final)
-        discount = gamma ** self.tau.astype(np.float64) * ~over
-        return Judged(reward, follows, weights, discount.astype(np.float32))
+        used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
+        discount = gamma ** steps.astype(np.float64)
+        over = self.terminated if over is None else over
+        discount[self._last] *= ~over[self._end_of]
+        return Judged(
+            reward, follows[..., used].astype(np.int32), weights[..., used],
+            discount.astype(np.float32),
+        )  # fmt: skip
 
     def solve(
         self,
@@ -195,53 +229,57 @@ class CallGraph:
         novel: float | None = None,
         bonus: float = 1.0,
     ) -> tuple[Array, int]:
-        """Return the value of each call from each planning state, (R, M), and the sweeps.
+        """Return the worth of each piece from each planning state, (P, M), and the sweeps.
 
-        The value of a call is y = R + γ^τ V(end), with V the largest, over choices, of the weighted
-        mean of its nearest calls' values.
+        A piece is worth what it pays and what follows: the next piece of its call, or at the call's
+        end the best choice, by the weighted mean of its nearest pieces' worth.
 
         Args:
-            judged: what calls pay and lead to.
-            near: the nearest calls to the ends.
-            may: (R, choices) bool, what may follow.
-            caution: share by which a value falls for each unit of distance to the nearest call.
+            judged: what pieces pay and lead to.
+            near: the nearest pieces to the ends.
+            may: (E, choices) bool, what may follow.
+            caution: share by which a value falls for each unit of distance to the nearest piece.
             novel: distance from which on a choice is new, and worth ``bonus``; None: none is.
             bonus: its value.
         """
-        rows = np.arange(len(self.call))[:, None, None]
-        value = np.zeros(judged.reward.shape, np.float32)
-        y = judged.reward
+        count = judged.reward.shape[1]
+        value = np.zeros((len(self.end), count), np.float32)
         trust = 1.0 / (1.0 + caution * near.distance)
-        chosen = [c for c in range(self.log.choices) if self.known[c] or novel is not None]
-        sweeps = 0
-        for sweep in range(MOST_SWEEPS):
-            following = (value[rows, judged.follows] * judged.weights).sum(2)
-            y = judged.reward + judged.discount[:, None] * following
+        choices = [c for c in range(self.log.choices) if self.known[c] or novel is not None]
+        for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
+            worth = self._worth(judged, value)
             best = np.full_like(value, -np.inf)
-            for c in chosen:
-                q = self._mean(y, near, c)
+            for c in choices:
+                q = np.zeros_like(value)
+                for k in range(self.neighbours):
+                    q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
                     q = np.where((near.distance[:, c] > novel)[:, None], np.float32(bonus), q)
                 np.maximum(best, q, out=best, where=may[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
-            change = np.abs(best - value).max(initial=0.0)
-            value, sweeps = best, sweep + 1
-            if change <= TOLERANCE * max(np.abs(value).max(initial=0.0), 1e-12):
+            change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)
+            value = best
+            if change <= TOLERANCE * largest:
                 break
-        following = (value[rows, judged.follows] * judged.weights).sum(2)
-        y = judged.reward + judged.discount[:, None] * following
-        return y.astype(np.float32), sweeps
+        return self._worth(judged, value), sweeps
 
-    def _mean(self, y: Array, near: Near, choice: int) -> Array:
-        """Return the weighted mean of a choice's nearest calls, (R, M)."""
-        total = np.zeros((len(near.calls), y.shape[1]), np.float32)
-        for k in range(near.calls.shape[2]):
-            total += near.weights[:, choice, k, None] * y[near.calls[:, choice, k]]
-        return total
+    def _worth(self, judged: Judged, value: Array) -> Array:
+        """Return the worth of pieces, (P, M), where the ends of calls have a ``value`` (E, M)."""
+        worth = np.zeros(judged.reward.shape, np.float32)
+
+        def put(rows: Array, following: Array, place: Array) -> None:
+            after = following[place[:, None, None], judged.follows[rows]]
+            mean = (after * judged.weights[rows]).sum(2)
+            worth[rows] = judged.reward[rows] + judged.discount[rows, None] * mean
+
+        put(self._last, value, self._end_of)
+        for rows in self._depths:
+            put(rows, worth, self.pieces.then[rows])
+        return worth
 
     def for_goal(self, goal: Goal, place: Array) -> tuple[Near, Array]:
-        """Return neighbours of the calls' ends, and what may follow, where the goal is ``place``.
+        """Return the nearest pieces to the ends, and what may follow, where the goal is ``place``.
 
         They differ from the usual ones only for skills that see the goal.
         """
@@ -256,26 +294,47 @@ class CallGraph:
             may = self.skills.startable(end)
         return (self.after if same else self.near_features(features)), may
 
-    def _may(self, whole: Array) -> Array:
-        may = self.log.may_follow[self.call].copy()
-        part = np.flatnonzero(~whole)
-        if len(part) and self.skills is not None and self.skills.restricts:
-            may[part] = self.skills.startable(self.end[part])
-        return may
+
+def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:
+    """Return the pieces of calls; where lengths are chosen, calls and their beginnings."""
+    if log.lengths:
+        return _beginnings(log, skills)
+    steps = max(PIECE, -(-log.steps // MOST_PIECES))
+    # A skill with a memory would act otherwise if it was called in the middle.
+    forgets = ~np.array(log.recurrent, bool)[log.skill]
+    counts = np.where(forgets, -(-log.tau // steps), 1)
+    call = np.repeat(np.arange(len(log)), counts)
+    number = np.arange(len(call)) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = log.offset[call] + number * steps
+    last = number == counts[call] - 1
+    stop = np.where(last, log.offset[call + 1], first + steps)
+    then = np.where(last, -1, np.arange(len(call)) + 1)
+    return Pieces(call, log.choice[call], first, stop, then)
 
 
-def _rows(log: CallLog, skills: SkillSet | None) -> tuple[Array, Array, Array]:
-    """Return the call, the steps and the choice of each row: calls, and their beginnings.
+def _beginnings(log: CallLog, skills: SkillSet | None) -> Pieces:
+    """Return calls, and their beginnings as calls of shorter lengths.
 
-    A beginning counts as a call of a shorter length only where it is known what may follow.
+    A beginning counts only where it is known what may follow.
     """
-    call, tau, choice = np.arange(len(log)), log.tau, log.choice
-    if not log.lengths or (skills is None and not log.may_follow.all()):
-        return call, tau, choice
-    rows = [(call, tau, choice)]
+    parts = [(np.arange(len(log)), log.tau, log.choice)]
     count, length = len(log.lengths), log.choice % len(log.lengths)
-    for i, steps in enumerate(log.lengths):
-        longer = np.flatnonzero(length > i)
-        rows.append((longer, np.minimum(tau[longer], steps), log.skill[longer] * count + i))
-    joined = [np.concatenate(parts) for parts in zip(*rows, strict=True)]
-    return joined[0], joined[1], joined[2]
+    if skills is not None or log.may_follow.all():
+        for i, steps in enumerate(log.lengths):
+            longer = np.flatnonzero(length > i)
+            tau = np.minimum(log.tau[longer], steps)
+            parts.append((longer, tau, log.skill[longer] * count + i))
+    call, tau, choice = (np.concatenate(column) for column in zip(*parts, strict=True))
+    first = log.offset[call]
+    return Pieces(call, choice, first, first + tau, np.full(len(call), -1))
+
+
+def _by_depth(then: Array) -> list[Array]:
+    """Return pieces before the last of a call: those whose next one is known come first."""
+    depth = np.zeros(len(then), np.int64)
+    rows = np.flatnonzero(then >= 0)
+    for row in rows[::-1]:  # the next piece has the next number
+        depth[row] = depth[then[row]] + 1
+    order = rows[np.argsort(depth[rows], kind="stable")]
+    bounds = np.flatnonzero(np.diff(depth[order])) + 1
+    return [part for part in np.split(order, bounds) if len(part)]

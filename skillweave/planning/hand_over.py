@@ -215,7 +215,8 @@ def chain(
     chance = won[rows[-1]].astype(np.float64)
     for i in reversed(range(len(skills) - 1)):
         here = maps[numbers[i + 1]]
-        near, distance = nearest(here(log.start[rows[i + 1]]), here(log.end[rows[i]]), NEIGHBOURS)
+        starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
+        near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
         follows = (weights_of(distance) * chance[near]).sum(1)
         chance = np.where(won[rows[i]] & ~log.terminated[rows[i]], follows, 0.0)
     matrix = hand_over(log, done)

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from skillweave.errors import DeclarationError, RunError
+from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, error_text, short
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
@@ -18,6 +18,8 @@ BLOCK = 4_000_000
 """Distances that are computed at once."""
 SOFT = 0.01
 """Distance that is added before weights are inverse distances: two equal calls count equally."""
+AHEAD = 8
+"""Points that are looked at for each one that is wanted, as several may be of one group."""
 CONSTANT = 1e-6
 """A feature whose deviation is less, relative to its size, is constant."""
 
@@ -137,35 +139,38 @@ def feature_maps(
     return maps
 
 
-def nearest(points: Array, to: Array, count: int) -> tuple[Array, Array]:
-    """Return the ``count`` nearest of ``points`` (m, F) to each row of ``to`` (n, F).
+def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, Array]:
+    """Return the ``count`` nearest points to each row of ``to``, each of another group.
+
+    Args:
+        points: (m, F) float32.
+        to: (n, F) float32.
+        count: how many.
+        group: (m,) the group of each point; of a group only the nearest point counts.
 
     Returns:
         Their rows (n, count) int64, the nearest first, and distances (n, count) float32. Where
-        ``points`` are fewer, the last one is repeated.
-
-    Raises:
-        RunError: there are no points.
+        there are fewer groups, the distance is infinite.
     """
-    if not len(points):
-        raise RunError("a skill has no call in the log; record some")
-    found = min(count, len(points))
+    tries = min(len(points), count * AHEAD if len(np.unique(group)) < len(group) else count)
     y, x = torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(to))
     squares = (y * y).sum(1)[None]
     rows = []
     step = max(1, BLOCK // len(points))
     for first in range(0, len(to), step):
         far = torch.addmm(squares, x[first : first + step], y.T, alpha=-2.0)
-        rows.append(far.topk(found, 1, largest=False).indices)
-    near = torch.cat(rows).numpy() if rows else np.zeros((0, found), np.int64)
+        rows.append(far.topk(tries, 1, largest=False).indices)
+    near = torch.cat(rows).numpy() if rows else np.zeros((0, tries), np.int64)
     # Differences again: those of squares are wrong by rounding where points are near.
     distance = np.sqrt(((points[near] - to[:, None]) ** 2).sum(2))
-    order = np.argsort(distance, 1, kind="stable")
-    near, distance = np.take_along_axis(near, order, 1), np.take_along_axis(distance, order, 1)
-    if found < count:
-        more = np.minimum(np.arange(count), found - 1)
-        near, distance = near[:, more], distance[:, more]
-    return near, distance
+    groups, each = group[near], np.arange(len(to))
+    chosen = np.zeros((len(to), count), np.int64)
+    far_away = np.full((len(to), count), np.inf, np.float32)
+    for k in range(min(count, tries)):
+        at = distance.argmin(1)
+        chosen[:, k], far_away[:, k] = near[each, at], distance[each, at]
+        distance[groups == groups[each, at][:, None]] = np.inf
+    return chosen, far_away
 
 
 def weights_of(distance: Array) -> Array:

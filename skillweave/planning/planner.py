@@ -38,7 +38,7 @@ class Plan:
     """A solved task."""
 
     worth: Array
-    """(R, M) float32, of each logged call from each planning state."""
+    """(P, M) float32, of each piece of a logged call from each planning state."""
     sweeps: int
     """Sweeps of value iteration."""
 
@@ -140,12 +140,12 @@ class Planner(ReadySelector):
     def _solve(self, task: RewardMachine, place: Array | None = None) -> Plan:
         """Plan a task; ``place`` is its goal, if it is one."""
         graph = self.graph
-        readings = task.read(self.log.as_steps())
-        check_possible(task, readings, self.log)
+        readings = task.read(self.graph.log.as_steps())
+        check_possible(task, readings, self.graph.log)
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, Goal):
             near, may = graph.for_goal(self.task, place)
-        judged = graph.judge(task, readings, self._gamma, self._own_end)
+        judged = graph.judge(task, self._states, readings, self._gamma, self._own_end)
         worth, sweeps = graph.solve(judged, near, may, caution=self._caution)
         return Plan(worth, sweeps)
 
@@ -182,14 +182,13 @@ class Planner(ReadySelector):
         unique, which = np.unique(goals, axis=0, return_inverse=True)
         for i, goal in enumerate(unique):
             rows = np.flatnonzero(which.reshape(-1) == i)
-            part = Near(near.calls[rows], near.weights[rows], near.distance[rows], near.total[rows])
-            found[rows] = self._values_in(self._plan_of(goal), part, state[rows])
+            found[rows] = self._values_in(self._plan_of(goal), near.take(rows), state[rows])
         return found
 
     def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
         place, share = self._states.corners(state)
         # (n, choices, K, J): the worth of each neighbour at each corner.
-        worth = plan.worth[near.calls[..., None], place[:, None, None, :]]
+        worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
         q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
@@ -295,7 +294,7 @@ def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
 
 
 def _own_end(task: Task, graph: CallGraph) -> Array | None:
-    """Return the calls after which nothing follows, (R,) bool; None: where the episode terminated.
+    """Return the ends after which nothing follows, (E,) bool; None: where the episode terminated.
 
     An episode that ended at its own goal would go on there for another one.
     """
@@ -303,7 +302,7 @@ def _own_end(task: Task, graph: CallGraph) -> Array | None:
         return None
     over: Array = graph.terminated.copy()
     rows = np.flatnonzero(over)
-    own = task.of(graph.log.start[graph.call[rows]])
+    own = task.of(graph.log.start[graph.end_call[rows]])
     over[rows] = ~task.holds(graph.end[rows], own)
     return over
 

@@ -260,6 +260,7 @@ class Recorder:
             self.skills.lengths,
             skill_checksums(self.skills),
             seen_places(self.skills),
+            tuple(bool(policy.start(1)) for policy in self.skills.policies),
             self.engine.observation_space,
             self.engine.action_space,
             start=start,

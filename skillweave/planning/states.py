@@ -10,9 +10,12 @@ from skillweave.errors import DeclarationError
 from skillweave.planning.machine import RewardMachine
 from skillweave.types import Array
 
-LEVELS = 12
+LEVELS = 128
 """The most levels of a counter. Between two levels values are interpolated, so that calls which
 are shorter than a level also lead on."""
+FEWEST_LEVELS = 8
+ENOUGH_STATES = 256
+"""Counters have fewer levels where there would be more states."""
 MOST_STATES = 3_000
 MOST_COUNTERS = 4
 
@@ -34,7 +37,10 @@ class PlanningStates:
                 f"at most {MOST_COUNTERS} can be planned"
             )
         used = task.counter_steps < np.iinfo(np.int64).max
-        self._levels = np.where(used, np.minimum(task.counter_steps, LEVELS), 1)
+        most = LEVELS
+        while most > FEWEST_LEVELS and _levels(task, most).prod(1).sum() > ENOUGH_STATES:
+            most //= 2
+        self._levels = _levels(task, most)
         steps = np.where(used, task.counter_steps, 1)
         self._spacing = np.where(used, (steps - 1) / np.maximum(self._levels - 1, 1), 1.0)
         sizes = self._levels.prod(1)
@@ -86,3 +92,9 @@ class PlanningStates:
         places, weights = self.corners(state)
         nearest = weights.argmax(-1)[..., None]
         return np.take_along_axis(places, nearest, -1)[..., 0]
+
+
+def _levels(task: RewardMachine, most: int) -> Array:
+    """Return the number of levels of each counter, (Q, H); 1 where it is not used."""
+    used = task.counter_steps < np.iinfo(np.int64).max
+    return np.where(used, np.minimum(task.counter_steps, most), 1)

@@ -45,6 +45,7 @@ def log_of(
         tuple(lengths),
         ("",) * len(skills),
         (None,) * len(skills),
+        (False,) * len(skills),
         gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
         gym.spaces.Discrete(2),
         start=np.array(columns["start"], np.float32).reshape(calls, size),

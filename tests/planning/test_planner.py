@@ -28,6 +28,7 @@ from skillweave.planning import (
     held,
     record_calls,
 )
+from skillweave.planning.neighbours import nearest
 from skillweave.planning.states import LEVELS, PlanningStates
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
@@ -172,14 +173,16 @@ def test_only_what_may_follow_counts() -> None:
 
 
 def test_a_counter_that_is_longer_than_a_call_leads_on() -> None:
-    """The levels of a counter lie 9 steps apart, and a call has 3."""
-    task = Mission(held(at(10), 100))
-    planner = Planner(line(), task, neighbours=1, gamma=0.99, caution=0.0)
-    states = PlanningStates(task)
-    assert states.count == LEVELS + 1
-    q = planner.values(np.float32([[10]] * 4), np.array([[0, 0], [0, 33], [0, 66], [0, 97]]))
-    assert (q[:, 1] > q[:, 0] + 0.01).all()
-    np.testing.assert_allclose(q[:, 1], 0.99 ** np.array([99, 66, 33, 2]), rtol=0.08)
+    """The levels of a long counter lie several steps apart, and a call has 3."""
+    at_end = np.float32([[10]] * 4)
+    for steps in (100, 1_000):
+        task = Mission(held(at(10), steps))
+        planner = Planner(line(), task, neighbours=1, gamma=0.999, caution=0.0)
+        assert PlanningStates(task).count == min(steps, LEVELS) + 1
+        counted = np.array([0, steps // 3, steps // 2, steps - 3])
+        q = planner.values(at_end, np.stack([0 * counted, counted], 1))
+        assert (q[:, 1] > q[:, 0]).all()
+        np.testing.assert_allclose(q[:, 1], 0.999 ** (steps - 1 - counted), rtol=0.03)
 
 
 def test_levels_of_counters() -> None:
@@ -188,7 +191,7 @@ def test_levels_of_counters() -> None:
         accepting={"c"},
     )
     states = PlanningStates(task)
-    assert states.count == 4 + LEVELS * 3 + 1
+    assert states.count == 4 + 64 * 3 + 1  # fewer levels, as there would be too many
     assert states.exact[:5].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0], [0, 3, 0], [1, 0, 0]]
     rng = np.random.default_rng(0)
     state = np.stack([np.ones(50, int), rng.integers(100, size=50), rng.integers(3, size=50)], 1)
@@ -402,7 +405,43 @@ def test_more_calls_than_a_graph_holds(log: CallLog, monkeypatch: Any) -> None:
     monkeypatch.setattr("skillweave.planning.graph.MOST_CALLS", 50)
     with pytest.warns(UserWarning, match="the plan uses 50 of them"):
         planner = Planner(log, has_key)
-    assert len(planner.graph.call) == 50
+    assert len(planner.graph.log) == 50
+
+
+def long_calls() -> CallLog:
+    """Two calls that cross the whole line, and sit there."""
+    right = [*range(1, LINE + 1), *[LINE] * 30]
+    left = [LINE - x for x in right]
+    return log_of(
+        ["left", "right"], [(0, [(1, right, True, "limit")]), (LINE, [(0, left, True, "limit")])]
+    )
+
+
+def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed() -> None:
+    log = long_calls()
+    planner = Planner(log, Mission(at(8), at(2)), neighbours=1, gamma=GAMMA, caution=0.0)
+    # From 5, which is passed in the middle of both calls: "right" reaches 8 after 3 steps, the end
+    # of the call after 30 more, and from there "left" reaches 2 after 8.
+    pieces = planner.graph.pieces
+    assert (pieces.choice == 1).sum() == 8
+    q = planner.values(np.float32([[5], [10]]), np.array([[0], [1]]))
+    assert q[0, 1] == pytest.approx(GAMMA**2 / 2 + GAMMA ** (35 + 7) / 2, rel=1e-3)
+    assert q[1, 0] == pytest.approx(GAMMA**7 / 2, rel=1e-3)
+    # The counters of a task go on from piece to piece.
+    sits = Planner(log, Mission(held(at(10), 20)), neighbours=1, gamma=GAMMA, caution=0.0)
+    assert sits.values(np.float32([[0]]))[0, 1] == pytest.approx(GAMMA**28, rel=1e-3)
+    # A skill with a memory does something else if it is called in the middle.
+    whole = Planner(replace(log, recurrent=(True, False)), at(8))
+    assert np.bincount(whole.graph.pieces.choice).tolist() == [1, 8]
+
+
+def test_neighbours_are_of_other_calls_each() -> None:
+    points = np.float32([[0], [0.1], [0.2], [1], [5], [6]])
+    group = np.array([7, 7, 7, 8, 9, 9])
+    near, far = nearest(points, np.float32([[0.12], [5.9]]), 4, group)
+    assert near[:, :3].tolist() == [[1, 3, 4], [5, 3, 0]] or near[1, 2] == 2
+    np.testing.assert_allclose(far[0, :3], [0.02, 0.88, 4.88], atol=1e-6)
+    assert np.isinf(far[:, 3]).all()
 
 
 def test_a_skill_without_a_call_is_never_called(log: CallLog) -> None:
