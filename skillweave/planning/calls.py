@@ -329,14 +329,14 @@ def skill_checksums(skills: SkillSet) -> tuple[str, ...]:
 
     Functions of the user enter by their names.
     """
-    found = []
+    checksums = []
     for i, policy in enumerate(skills.policies):
         source = source_of(policy)
         acts = source.get("sha256") or source.get("name")
         reflexes = [reflex.name for reflex in skills.reflexes]
         whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
-        found.append(checksum(whole.encode()))
-    return tuple(found)
+        checksums.append(checksum(whole.encode()))
+    return tuple(checksums)
 
 
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:

@@ -76,18 +76,18 @@ def _nearest(predicate: Predicate, log: CallLog) -> str:
     if wanted is None:
         return ""
     scale = np.maximum(obs.std(0), 1e-9)
-    step, found = 0, np.inf
+    step, least = 0, np.inf
     for first in range(0, len(obs), 4_096):  # so that no large array is made
         part = (obs[first : first + 4_096, None] - wanted[None]) / scale
         far = np.square(part).mean(2).min(1)
-        if far.min() < found:
-            found, step = float(far.min()), first + int(far.argmin())
+        if far.min() < least:
+            least, step = float(far.min()), first + int(far.argmin())
     name = log.skills[int(log.skill[log.owner[step]])]
     return f"{name!r} comes nearest, in observation {observed(obs[step])}"
 
 
 def _example(predicate: Predicate, obs: Array) -> Array | None:
-    """Return observations (k, D) in which a predicate holds, found at random; None: none were."""
+    """Return observations (k, D) in which a predicate holds, made up at random; None: in none."""
     rng = np.random.default_rng(0)
     low, high = obs.min(0), obs.max(0)
     span = np.maximum(high - low, 1e-3)

@@ -199,6 +199,10 @@ class RewardMachine:
         self.failing = np.isin(np.arange(count), list(plan.failing))
         """The states in which it has failed, (Q,) bool."""
 
+    def arrows_from(self, state: int) -> list[Arrow]:
+        """Return the transitions from a state, in the order in which they are checked."""
+        return self._by_state[state]
+
     def _event(self, predicate: Predicate) -> int:
         """Return the number of a predicate among the events; the same function has one number."""
         for i, known in enumerate(self.events):
@@ -381,7 +385,7 @@ def _automaton_arrows(
     task: RewardMachine, arrows: Sequence[Arrow], name: str, counters: Sequence[Counter], count: int
 ) -> dict[tuple[str, str], Callable[[Step], Any]]:
     """Return an automaton's transitions from one state, whose counter stands at ``count``."""
-    found: dict[tuple[str, str], list[Callable[[Step], Any]]] = {}
+    events: dict[tuple[str, str], list[Callable[[Step], Any]]] = {}
     here = _counted_name(name, count)
 
     def add(target: str, atoms: Sequence[Predicate], wanted: bool = True) -> None:
@@ -390,18 +394,24 @@ def _automaton_arrows(
             return holds if wanted else ~holds
 
         event.__name__ = ("" if wanted else "not ") + " and ".join(p.name for p in atoms)
-        found.setdefault((here, target), []).append(event)
+        events.setdefault((here, target), []).append(event)
 
     for arrow in arrows:
         full = all(count + 1 >= a.steps for a in arrow.atoms if isinstance(a, Counter))
-        if full:
-            add(task.state_names[arrow.target], [_predicate(a) for a in arrow.atoms])
+        if not full:
+            continue
+        target, atoms = task.state_names[arrow.target], [_predicate(a) for a in arrow.atoms]
+        for counter in counters:
+            goes_on = counter.slot in _counters(task.arrows_from(arrow.target))
+            if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
+                add(_counted_name(target, count + 1), [*atoms, counter.predicate])
+        add(target, atoms)
     for counter in counters:
         if count + 1 < counter.steps:
             add(_counted_name(name, count + 1), [counter.predicate])
         if count:
             add(name, [counter.predicate], wanted=False)
-    return {pair: _any_of(events) for pair, events in found.items()}
+    return {pair: _any_of(some) for pair, some in events.items()}
 
 
 def _any_of(events: Sequence[Callable[[Step], Any]]) -> Callable[[Step], Any]:

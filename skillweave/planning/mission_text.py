@@ -148,15 +148,15 @@ class _Parser:
 
     def avoided(self) -> list[Predicate]:
         """Parse the names after ``avoid``."""
-        found: list[Predicate] = []
+        predicates: list[Predicate] = []
         while True:
             token = self.now
             event = self.event()
             if isinstance(event, Held):
                 self.fail("what is avoided must be a predicate of one step", token)
-            found.append(event)
+            predicates.append(event)
             if not (self.takes("or") or self.takes("and")):
-                return found
+                return predicates
 
     @property
     def now(self) -> _Token:
@@ -198,7 +198,7 @@ class _Parser:
         raise DeclarationError(f"mission: {reason}\n  {line}\n  {pointer}")
 
     def _tokens(self) -> list[_Token]:
-        found: list[_Token] = []
+        tokens: list[_Token] = []
         place, end = 0, len(self.text.rstrip())
         while place < end:
             match = _TOKEN.match(self.text, place)
@@ -207,6 +207,6 @@ class _Parser:
                 wrong = _Token("sign", self.text[place + skipped], place + skipped)
                 self.fail("this sign has no meaning in a mission", wrong)
             kind = str(match.lastgroup)
-            found.append(_Token(kind, match[kind], match.start(kind)))
+            tokens.append(_Token(kind, match[kind], match.start(kind)))
             place = match.end()
-        return [*found, _Token("end", "", end)]
+        return [*tokens, _Token("end", "", end)]

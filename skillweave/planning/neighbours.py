@@ -80,8 +80,8 @@ class FeatureMap:
     def _raw(self, obs: Array) -> Array:
         if self._codec is not None:
             vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
-            found: Array = vector[:, self._places].astype(np.float64)
-            return found
+            features: Array = vector[:, self._places].astype(np.float64)
+            return features
         try:
             value = np.asarray(self._features(obs), np.float64)
         except (Exception, SystemExit) as error:

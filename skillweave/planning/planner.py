@@ -178,12 +178,12 @@ class Planner(ReadySelector):
         if not isinstance(self.task, Goal):
             return self._values_in(self._plan, near, state)
         goals = self.task.of(obs)
-        found = np.empty((len(obs), self.log.choices), np.float32)
+        values = np.empty((len(obs), self.log.choices), np.float32)
         unique, which = np.unique(goals, axis=0, return_inverse=True)
         for i, goal in enumerate(unique):
             rows = np.flatnonzero(which.reshape(-1) == i)
-            found[rows] = self._values_in(self._plan_of(goal), near.take(rows), state[rows])
-        return found
+            values[rows] = self._values_in(self._plan_of(goal), near.take(rows), state[rows])
+        return values
 
     def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
         place, share = self._states.corners(state)
@@ -284,13 +284,13 @@ def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
     """Return the skills, compared with the log; None: none were given."""
     if skills is None:
         return None
-    found = skills if isinstance(skills, SkillSet) else skills_below(skills)
-    if found is None:
+    skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
+    if skill_set is None:
         raise DeclarationError(
             f"Planner: skills is {short(skills)}; give a policy with skills: run.policy"
         )
-    log.check_skills(found)
-    return found
+    log.check_skills(skill_set)
+    return skill_set
 
 
 def _own_end(task: Task, graph: CallGraph) -> Array | None:

@@ -1,6 +1,7 @@
 """The calls of a running episode, which count beside the logged ones when a plan acts.
 
-A call that failed would else be chosen again and again: it is not in the log.
+A call that failed would else be chosen again and again: it is not in the log. Stands alone because
+it is a memory, and planning is a function of the log.
 """
 
 from __future__ import annotations

@@ -9,7 +9,15 @@ import pytest
 from planning.steps import column, step_to
 
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.planning import Predicate, RewardMachine, held, successes
+from skillweave.planning import (
+    Mission,
+    Predicate,
+    RewardMachine,
+    held,
+    in_any_order,
+    successes,
+)
+from skillweave.selectors import LastCall
 from skillweave.skills import Skill
 
 A, B, C = (column(i) for i in range(3))
@@ -128,8 +136,8 @@ def test_what_a_policy_sees_of_a_task() -> None:
     assert all(task.observation_space.contains(row) for row in seen)
 
 
-def test_its_automaton_is_in_the_same_states() -> None:
-    task = RewardMachine(
+TASKS = {
+    "several transitions": RewardMachine(
         {
             ("a", "bad"): C,
             ("a", "b"): A,
@@ -138,18 +146,21 @@ def test_its_automaton_is_in_the_same_states() -> None:
         },
         accepting={"done"},
         failing={"bad"},
-    )
+    ),
+    "a counter that goes on": Mission(in_any_order(A, held(B, 6)), column(3), avoid=C),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_its_automaton_is_in_the_same_states(name: str) -> None:
+    task = TASKS[name]
     skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
     automaton = task.automaton(skills)
-    assert automaton.states["a"] == ("go_a",)
-    assert automaton.states["b"] == automaton.states["b (2 steps held)"] == ("go_b", "wait", "go_d")
-    assert automaton.states["done"] == ("go_a", "go_b", "wait", "no", "go_d")
-    from skillweave.selectors import LastCall
-
     n = 200
     rng = np.random.default_rng(0)
     state, memory = task.start(n), automaton.start(n)
     last = LastCall(np.zeros(n, int), np.zeros(n, np.int8), np.zeros(n, bool))
+    seen = set()
     for _ in range(40):
         step = step_to(rng.random((n, 5)) < [0.3, 0.8, 0.03, 0.05, 0.05])
         state, _, _ = task.step(state, step)
@@ -160,7 +171,16 @@ def test_its_automaton_is_in_the_same_states() -> None:
             for name, count in zip(states(task, state), state[:, 1], strict=True)
         ]
         assert names == wanted
-    assert len(set(names)) > 4
+        seen.update(names)
+    assert len(seen) > 5
+
+
+def test_the_skills_of_its_automaton() -> None:
+    skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
+    automaton = TASKS["several transitions"].automaton(skills)
+    assert automaton.states["a"] == ("go_a",)
+    assert automaton.states["b"] == automaton.states["b (2 steps held)"] == ("go_b", "wait", "go_d")
+    assert automaton.states["done"] == ("go_a", "go_b", "wait", "no", "go_d")
 
 
 def wrong(make: Any, message: str) -> Any:
