@@ -150,6 +150,7 @@ class CallGraph:
         parts = np.flatnonzero(~whole)
         if len(parts) and skills is not None and skills.restricts:
             self.may[parts] = skills.startable(self.end[parts])
+        self._end_features = [each(self.end) for each in self.maps]
         self._depths = _by_depth(pieces.then)
         self._after: Near | None = None
 
@@ -175,7 +176,7 @@ class CallGraph:
     def after(self) -> Near:
         """The nearest pieces to the ends of calls."""
         if self._after is None:
-            self._after = self.near(self.end)
+            self._after = self.near_features(self._end_features)
         return self._after
 
     def judge(
@@ -287,8 +288,7 @@ class CallGraph:
             return self.after, self.may
         end = goal.put(self.end, place)
         features = [each(end) for each in self.maps]
-        usual = [each(self.end) for each in self.maps]
-        same = all(np.array_equal(a, b) for a, b in zip(features, usual, strict=True))
+        same = all(np.array_equal(a, b) for a, b in zip(features, self._end_features, strict=True))
         may = self.may
         if self.skills is not None and self.skills.restricts:
             may = self.skills.startable(end)

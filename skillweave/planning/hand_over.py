@@ -14,6 +14,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
 from skillweave.planning.calls import CallLog
+from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbours import feature_maps, nearest, weights_of
 from skillweave.planning.predicates import as_event
@@ -293,7 +294,7 @@ def calls_done(log: CallLog, done: Mapping[str, Any] | None) -> Array:
 def happened(log: CallLog, event: Any) -> Array:
     """Return the calls within which an event happened, (C,) bool."""
     task = Mission(event)
-    readings = task.read(log.as_steps())
+    readings = read_log(task, log)
     tau, over = log.tau, np.zeros(len(log), bool)
     state = task.start(len(log))
     for k in range(int(tau.max(initial=0))):

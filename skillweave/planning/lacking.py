@@ -1,7 +1,4 @@
-"""Sentences on tasks that a log of calls cannot lead to.
-
-Stands alone because it is diagnosis: planning does not need it where the log suffices.
-"""
+"""Tasks that a log of calls does not suffice for, in sentences."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skillweave.errors import RunError, SkillweaveError
+from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.messages import observed
 from skillweave.planning.calls import CallLog
 from skillweave.planning.machine import Counter, Readings, RewardMachine
@@ -18,6 +15,26 @@ from skillweave.types import Array
 
 TRIES = 20_000
 """Observations that are made up, to find one in which a predicate holds."""
+
+
+def read_log(task: RewardMachine, log: CallLog) -> Readings:
+    """Evaluate a task's events and rewards on all steps of a log.
+
+    Raises:
+        RunError: the task reads a key of ``info`` that was not recorded.
+        SkillError: an event or a reward failed, or returned another shape or type.
+    """
+    try:
+        return task.read(log.as_steps())
+    except SkillError as error:
+        cause = error.__cause__
+        key = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
+        if not isinstance(key, str) or key in log.info:
+            raise
+        raise RunError(
+            f"the task reads info[{key!r}], which the log does not have; record it: "
+            f"record_calls(..., info=[{key!r}])"
+        ) from error
 
 
 def check_possible(task: RewardMachine, readings: Readings, log: CallLog) -> None:

@@ -20,7 +20,7 @@ from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
 from skillweave.planning.goal import Goal
 from skillweave.planning.graph import CallGraph, Near
-from skillweave.planning.lacking import check_possible
+from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.states import PlanningStates
 from skillweave.planning.task import Task, as_task
@@ -130,6 +130,12 @@ class Planner(ReadySelector):
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
             if not known:
                 notice(f"the log has no call of {name!r}, so the planner never calls it")
+        if any(log.recurrent):
+            names = ", ".join(n for n, r in zip(log.skills, log.recurrent, strict=True) if r)
+            notice(
+                f"these skills have a memory: {names}. The planner compares their calls by "
+                "observations alone"
+            )
         if isinstance(self.task, RewardMachine):
             self._plan = self._solve(self.task)
         elif self.task.goal is not None:
@@ -140,7 +146,7 @@ class Planner(ReadySelector):
     def _solve(self, task: RewardMachine, place: Array | None = None) -> Plan:
         """Plan a task; ``place`` is its goal, if it is one."""
         graph = self.graph
-        readings = task.read(self.graph.log.as_steps())
+        readings = read_log(task, self.graph.log)
         check_possible(task, readings, self.graph.log)
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, Goal):

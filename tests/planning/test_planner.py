@@ -25,6 +25,7 @@ from skillweave.planning import (
     Predicate,
     RewardMachine,
     either,
+    hand_over,
     held,
     record_calls,
 )
@@ -431,7 +432,8 @@ def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed() -> Non
     sits = Planner(log, Mission(held(at(10), 20)), neighbours=1, gamma=GAMMA, caution=0.0)
     assert sits.values(np.float32([[0]]))[0, 1] == pytest.approx(GAMMA**28, rel=1e-3)
     # A skill with a memory does something else if it is called in the middle.
-    whole = Planner(replace(log, recurrent=(True, False)), at(8))
+    with pytest.warns(UserWarning, match="these skills have a memory: left. The planner"):
+        whole = Planner(replace(log, recurrent=(True, False)), at(8))
     assert np.bincount(whole.graph.pieces.choice).tolist() == [1, 8]
 
 
@@ -465,6 +467,18 @@ def test_a_log_that_does_not_lead_there_says_so(log: CallLog) -> None:
         Planner(log, either(never, Predicate(beyond) & at_three))
     # What is avoided need not happen, and neither need one part of a choice.
     Planner(log, Mission(either(never, has_key), avoid=beyond))
+
+
+def test_a_key_of_info_that_was_not_recorded_is_named(log: CallLog) -> None:
+    def opened(step: Any) -> Any:
+        return step.info["door"] == 1
+
+    with pytest.raises(RunError, match=r"reads info\['door'\].*record it: .*info=\['door'\]"):
+        Planner(log, Predicate(opened))
+    with pytest.raises(RunError, match="which the log does not have"):
+        hand_over(log, {"wait": opened})
+    known = record_calls(SPEC, skill_set(), 500, info=["door"])
+    assert Planner(known, Predicate(opened)).values(known.start[:1]).max() > 0
 
 
 def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
