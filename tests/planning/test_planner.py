@@ -12,7 +12,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
 
-from skillweave import EnvSpec, HierarchyPolicy, Lengths, evaluate
+from skillweave import EnvSpec, Hierarchy, HierarchyPolicy, Lengths, evaluate
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError
@@ -538,3 +538,16 @@ def test_its_checksum_is_of_log_and_task(log: CallLog) -> None:
         source(log, has_key, gamma=0.5),
     ]
     assert len({first, *others}) == 4
+
+
+def test_it_is_declared_as_a_selector(log: CallLog, tmp_path: Any) -> None:
+
+    def declared(task: Any) -> Hierarchy:
+        return Hierarchy(SPEC, list(SKILLS), selector=Planner(log, task), call_steps=None)
+
+    task = Mission(has_key, at_end)
+    run = declared(task).train(tmp_path / "run", seed=0, quiet=True)
+    assert np.mean(run.evaluate(5).returns) == 1.0
+    assert declared(task).load(tmp_path / "run").policy is not None
+    with pytest.raises(RunError, match="the selector had the policy planner"):
+        declared(has_key).load(tmp_path / "run")
