@@ -40,6 +40,7 @@ TYPES = {
     "truncated": np.bool_,
     "episode": np.int64,
     "order": np.int64,
+    "age": np.int64,
     "may_follow": np.bool_,
     "offset": np.int64,
     "reward": np.float32,
@@ -169,6 +170,7 @@ def _check_values(columns: dict[str, Array], steps: int, choices: int) -> None:
         "choice": bool(((choice >= 0) & (choice < choices)).all()),
         "end_reason": bool(np.isin(columns["end_reason"], list(CallEnd)[1:]).all()),
         "order": bool((columns["order"] >= 0).all()),
+        "age": bool(((columns["age"] >= 0) & (columns["age"] < 2**31)).all()),
         "episode": bool(((columns["episode"] >= 0) & (columns["episode"] < 2**62)).all()),
         "reward": bool((np.abs(columns["reward"]) <= LARGEST_REWARD).all()),
     }

@@ -29,6 +29,7 @@ PER_CALL = (
     "truncated",
     "episode",
     "order",
+    "age",
     "may_follow",
 )
 """Columns with a row for each call."""
@@ -57,6 +58,7 @@ class CallLog:
         truncated: (C,) bool, the episode's time limit cut the call.
         episode: (C,) int64, the number of the episode.
         order: (C,) int64, the call's number in its episode, from 0.
+        age: (C,) int64, the steps of the episode before the call.
         may_follow: (C, choices) bool, the choices that may start at the call's end.
         offset: (C + 1,) int64, the first step of each call; its last one is before the next call's.
         next_obs: (T, *obs_shape), the observation after each step.
@@ -80,6 +82,7 @@ class CallLog:
     truncated: Array
     episode: Array
     order: Array
+    age: Array
     may_follow: Array
     offset: Array
     next_obs: Array
@@ -165,7 +168,7 @@ class CallLog:
     def as_steps(self) -> Step:
         """Return all steps as one ``Step`` of T rows, to judge tasks by.
 
-        ``elapsed`` counts the steps of the call.
+        ``elapsed`` counts the steps of the episode, as it does where a task is followed.
         """
         last = np.zeros(self.steps, bool)
         last[self.offset[1:] - 1] = True
@@ -177,7 +180,7 @@ class CallLog:
             terminated=last & self.terminated[self.owner],
             truncated=last & self.truncated[self.owner],
             timed_out=np.zeros(self.steps, bool),
-            elapsed=self.elapsed,
+            elapsed=self.age[self.owner] + self.elapsed,
             info=self.info,
         )
 

@@ -147,7 +147,7 @@ def _play(
         decides = rows[memory["end"][rows] != CallEnd.RUNNING]
         here = obs[rows]
         action = player.act(memory, rows, here, allowed_rows(engine.mask(), rows), turn)
-        recorder.begin(decides, obs[decides], memory)
+        recorder.begin(decides, obs[decides], memory, turn.age[decides])
         raw = engine.step(action, rows)
         turn.age[rows] += 1
         step = raw.seen(here, action, turn.age[rows])
@@ -201,8 +201,11 @@ class Recorder:
         """The number of calls that have ended."""
         return sum(len(part[0]) for part in self._ended)
 
-    def begin(self, rows: Array, obs: Array, memory: Memory) -> None:
-        """Begin the calls that were chosen in environments ``rows`` (k,), at ``obs`` (k, …)."""
+    def begin(self, rows: Array, obs: Array, memory: Memory, age: Array) -> None:
+        """Begin the calls that were chosen in environments ``rows`` (k,), at ``obs`` (k, …).
+
+        ``age`` (k,) are the steps of their episodes so far.
+        """
         if not len(rows):
             return
         fresh = rows[self._episode[rows] < 0]
@@ -215,7 +218,7 @@ class Recorder:
         if lengths:
             choice = choice * len(lengths) + np.searchsorted(lengths, memory["limit"][rows])
         episode, order = self._episode[rows].copy(), self._order[rows].copy()
-        self._begun.append((call, obs.copy(), choice, episode, order))
+        self._begun.append((call, obs.copy(), choice, episode, order, age.copy()))
         self._order[rows] += 1
 
     def add(self, rows: Array, action: Array, raw: RawStep) -> None:
@@ -252,7 +255,7 @@ class Recorder:
         rows = np.flatnonzero(np.isin(of, known))
         rows = rows[np.argsort(of[rows], kind="stable")]
         counts = np.bincount(of, minlength=self._calls)[known]
-        _, start, choice, episode, order = (c[known] for c in begun)
+        _, start, choice, episode, order, age = (c[known] for c in begun)
         end_reason, succeeded, terminated, truncated, may = ended[1:]
         _, next_obs, action, reward, *info = (c[rows] for c in steps)
         return CallLog(
@@ -271,6 +274,7 @@ class Recorder:
             truncated=truncated,
             episode=episode,
             order=order,
+            age=age,
             may_follow=may,
             offset=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
             next_obs=next_obs,

@@ -24,20 +24,20 @@ def log_of(
     number, or several.
     """
     columns: dict[str, list[Any]] = {
-        name: [] for name in ("start", "choice", "why", "won", "episode", "order", "inside")
+        name: [] for name in ("start", "choice", "why", "won", "episode", "order", "age", "inside")
     }
     offset, choices = [0], len(skills) * max(1, len(lengths))
     for e, (first, calls) in enumerate(episodes):
-        here = first
+        here, age = first, 0
         for order, (choice, inside, won, why) in enumerate(calls):
             for name, value in (
                 ("start", here), ("choice", choice), ("why", why), ("won", won), ("episode", e),
-                ("order", order),
+                ("order", order), ("age", age),
             ):  # fmt: skip
                 columns[name].append(value)
             columns["inside"] += inside
             offset.append(offset[-1] + len(inside))
-            here = inside[-1]
+            here, age = inside[-1], age + len(inside)
     calls, steps = len(columns["choice"]), offset[-1]
     why = np.array(columns["why"])
     return CallLog(
@@ -56,6 +56,7 @@ def log_of(
         truncated=why == "cut",
         episode=np.array(columns["episode"], np.int64),
         order=np.array(columns["order"], np.int64),
+        age=np.array(columns["age"], np.int64),
         may_follow=np.ones((calls, choices), bool),
         offset=np.array(offset, np.int64),
         next_obs=np.array(columns["inside"], np.float32).reshape(steps, size),

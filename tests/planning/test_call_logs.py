@@ -81,6 +81,7 @@ def test_every_call_is_that_of_a_loop_by_hand(log: CallLog) -> None:
         assert inside.tolist() == [list(map(float, s)) for s in steps]
         assert log.end_reason[c] == why
         assert (log.terminated[c], log.truncated[c]) == (terminated, truncated)
+        assert log.age[c] == ages.get(episode, 0)
         ages[episode] = ages.get(episode, 0) + len(steps)
         ends[episode] = log.end[c]
         won = steps[-1][DOOR] == 1 if skill == 1 else why == CallEnd.OWN
@@ -112,7 +113,8 @@ def test_what_follows_from_the_columns(log: CallLog) -> None:
     inner = np.setdiff1d(np.arange(log.steps), log.offset[:-1])
     assert (step.obs[inner] == log.next_obs[inner - 1]).all()
     assert step.terminated.sum() == log.terminated.sum()
-    assert (step.elapsed[log.offset[1:] - 1] == log.tau).all()
+    assert (step.elapsed[log.offset[1:] - 1] == log.age + log.tau).all()
+    assert (log.elapsed[log.offset[1:] - 1] == log.tau).all()
     some = log.take(np.array([5, 2]))
     assert some.steps == log.tau[5] + log.tau[2]
     assert (some.end == log.end[[5, 2]]).all()
