@@ -37,7 +37,7 @@ BASE = {
     "paths",
 }
 LEARNING = BASE | {"ops", "spaces", "skills", "networks", "envs", "buffers", "algorithms", "runs"}
-LEARNING |= {"collecting", "selectors"}
+LEARNING |= {"collecting", "selectors", "planning"}
 EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "export"}
 EVERYTHING |= {"shipped", "api"}
 ROOMS: dict[str, set[str]] = {
@@ -68,6 +68,7 @@ ROOMS: dict[str, set[str]] = {
     "collecting": BASE | {"spaces", "skills", "envs", "algorithms"},
     "selectors": BASE | {"spaces", "skills", "collecting"},
     "runs": BASE | {"algorithms", "skills"},
+    "planning": BASE | {"spaces", "skills", "envs", "collecting", "selectors", "runs"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from skillweave.selectors import tree
-from skillweave.selectors.automaton import Automaton
 from skillweave.selectors.base import ReadySelector
 from skillweave.selectors.function import FunctionSelector
 from skillweave.selectors.tree_policy import TreeSelector
 
-ReadyValue = Callable[..., Any] | Automaton | tree.Composite
-"""A function of observations, an automaton, or a behaviour tree."""
+ReadyValue = Callable[..., Any] | ReadySelector | tree.Composite
+"""A function of observations, an automaton or another ready selector, or a behaviour tree."""
 
 
 def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
@@ -22,7 +21,7 @@ def ready_selector(value: Any, skills: tuple[str, ...]) -> ReadySelector | None:
         DeclarationError: it names another skill.
     """
     selector: ReadySelector
-    if isinstance(value, Automaton):
+    if isinstance(value, ReadySelector):
         selector = value
     elif isinstance(value, tree.Composite):
         selector = TreeSelector(value)

@@ -1,0 +1,36 @@
+"""Know and plan: tasks without training, logs of calls, and planning on them."""
+
+from skillweave.planning.calls import CallLog, join
+from skillweave.planning.explorer import Explorer
+from skillweave.planning.goal import Goal, reached
+from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
+from skillweave.planning.machine import RewardMachine
+from skillweave.planning.mission import Mission, either, in_any_order
+from skillweave.planning.planner import Planner
+from skillweave.planning.predicates import Predicate, held, successes
+from skillweave.planning.record import record_calls
+from skillweave.planning.task import as_task
+
+__all__ = [
+    "CallEnds",
+    "CallLog",
+    "Chain",
+    "Explorer",
+    "Goal",
+    "HandOver",
+    "Mission",
+    "Planner",
+    "Predicate",
+    "RewardMachine",
+    "as_task",
+    "call_ends",
+    "chain",
+    "either",
+    "hand_over",
+    "held",
+    "in_any_order",
+    "join",
+    "reached",
+    "record_calls",
+    "successes",
+]

@@ -1,0 +1,100 @@
+"""Exploring: calls are chosen that lead to where a skill was not called yet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.errors import DeclarationError
+from skillweave.messages import short, whole_number
+from skillweave.planning.calls import CallLog
+from skillweave.planning.graph import CallGraph
+from skillweave.planning.machine import RewardMachine
+from skillweave.planning.states import PlanningStates
+from skillweave.types import Array, Memory, Memoryless
+
+
+@checked_names
+class Explorer(Memoryless):
+    """A selector for ``record_calls`` that seeks calls unlike those of the log.
+
+    Where the nearest logged call of a skill is further than ``radius``, calling it is worth the
+    most that can be, 1; other calls are worth what they lead to (R-max: Brafman & Tennenholtz
+    2002). It plans again on the calls so far every ``every`` steps, and chooses at random before.
+
+    Args:
+        radius: in standard deviations of the features, over all of them.
+        features: as for ``Planner``; what makes two calls alike, a place for example.
+        neighbours: K.
+        gamma: γ of one step.
+        temperature: as for ``Planner``.
+        every: steps after which it plans again.
+
+    Raises:
+        DeclarationError: a number is out of its range.
+    """
+
+    def __init__(
+        self,
+        radius: float = 0.25,
+        *,
+        features: Any = None,
+        neighbours: int = 3,
+        gamma: float = 0.997,
+        temperature: float = 0.03,
+        every: int = 4_000,
+    ) -> None:
+        real = isinstance(radius, int | float) and not isinstance(radius, bool)
+        if not real or not 0 < radius < np.inf:
+            raise DeclarationError(f"Explorer: radius is {short(radius)}; it must be positive")
+        self.every = whole_number(every, "Explorer: every", 1)
+        self._radius, self._features, self._gamma = radius, features, gamma
+        self._neighbours = whole_number(neighbours, "Explorer: neighbours", 1)
+        self._temperature = temperature
+        self._choices = 0
+        self._graph: CallGraph | None = None
+        self._worth: Array = np.zeros(0)
+
+    def begin(self, choices: int) -> None:
+        """Prepare for a recording of skills with so many choices."""
+        self._choices = choices
+
+    def learn(self, log: CallLog) -> None:
+        """Plan on the calls so far."""
+        if len(log) < 2:
+            return
+        graph = CallGraph(log, self._features, self._neighbours)
+        nothing = RewardMachine({})
+        readings = nothing.read(graph.log.as_steps())
+        judged = graph.judge(nothing, PlanningStates(nothing), readings, self._gamma)
+        worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._radius)
+        self._graph, self._worth = graph, worth[:, 0]
+
+    def new_share(self) -> float:
+        """Return the share of (end of a call, choice) pairs that are new; 1 before planning."""
+        if self._graph is None:
+            return 1.0
+        return float((self._graph.after.distance > self._radius)[self._graph.may].mean())
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return choices (n,), sampled."""
+        rng = rng or np.random.default_rng()
+        if self._graph is None:
+            score = rng.random((len(obs), self._choices))
+            return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), memory
+        near = self._graph.near(obs)
+        q = (self._worth[near.pieces] * near.weights).sum(2)
+        q = np.where(near.distance > self._radius, 1.0, q)
+        largest = np.maximum(np.abs(q).max(1, keepdims=True), 1e-3)
+        score = q / (self._temperature * largest) + rng.gumbel(size=q.shape)
+        return (score if mask is None else np.where(mask, score, -np.inf)).argmax(1), memory

@@ -1,0 +1,138 @@
+"""Goals as tasks: one planner serves every goal that an observation may hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.errors import DeclarationError
+from skillweave.messages import short
+from skillweave.planning.machine import RewardMachine
+from skillweave.planning.predicates import Predicate
+from skillweave.selectors.base import function_name
+from skillweave.skills.answers import checked
+from skillweave.skills.outputs import called
+from skillweave.types import Array, Step, read_only
+
+
+@checked_names
+class Goal:
+    """A task that pays 1 where a goal is reached, and ends there.
+
+    ```python
+    import numpy as np
+
+    from skillweave.planning import Goal
+
+
+    def near(obs, goal):
+        return np.hypot(*(obs[:, :2] - goal).T) < 0.45
+
+
+    to_a_point = Goal(near, goal=[3.0, -1.0])
+    as_observed = Goal(near, columns=(4, 5))  # each episode's observations hold its goal
+    ```
+
+    Args:
+        reached: of observations (n, …) and goals (n, G), or one goal (G,): (n,) bool.
+        goal: (G,), one goal for all episodes; or give ``columns``.
+        columns: the places of the goal in observations, which are vectors.
+
+    Raises:
+        DeclarationError: not exactly one of ``goal`` and ``columns`` is given, or it has a wrong
+            type.
+    """
+
+    def __init__(
+        self,
+        reached: Callable[[Array, Array], Any],
+        *,
+        goal: Any = None,
+        columns: tuple[int, ...] | slice | None = None,
+    ) -> None:
+        if not callable(reached) or isinstance(reached, type):
+            raise DeclarationError(
+                f"a Goal's reached is {short(reached)}; give a function of observations and goals"
+            )
+        if (goal is None) == (columns is None):
+            raise DeclarationError("a Goal needs either goal= or columns=")
+        self.reached, self.columns = reached, columns
+        self.goal = None if goal is None else _goal(goal)
+        # A slice or a list: both are indices of an axis.
+        self._at: Any = list(columns) if isinstance(columns, tuple | list) else columns
+
+    def of(self, obs: Array) -> Array:
+        """Return the goals of observations (n, …), (n, G) float64."""
+        if self.goal is not None:
+            return np.broadcast_to(self.goal, (len(obs), len(self.goal)))
+        if obs.ndim != 2:
+            raise DeclarationError(
+                f"a Goal's columns are places in vectors, but observations have shape "
+                f"{obs.shape[1:]}; give goal= and a function that reads it"
+            )
+        try:
+            goals: Array = obs[:, self._at].astype(np.float64)
+        except (IndexError, TypeError) as error:
+            raise DeclarationError(
+                f"a Goal's columns are {short(self.columns)}, but observations have "
+                f"{obs.shape[1]} numbers"
+            ) from error
+        return goals
+
+    def put(self, obs: Array, goal: Array) -> Array:
+        """Return observations (n, …) that hold another ``goal`` (G,), where they hold one."""
+        if self.columns is None:
+            return obs
+        changed = obs.copy()
+        changed[:, self._at] = goal
+        return changed
+
+    def holds(self, obs: Array, goal: Array) -> Array:
+        """Return where ``goal``, (G,) or (n, G), is reached in ``obs`` (n, …), (n,) bool."""
+        who, name = "goal", function_name(self.reached)
+        value = called(lambda some: self.reached(some, goal), read_only(obs), f"{who}: {name}()")
+        return checked(value, len(obs), bool, who, name)
+
+    def at(self, goal: Array) -> RewardMachine:
+        """Return the task of one goal (G,) as a reward machine."""
+        there = Predicate(lambda obs: self.holds(obs, goal), "the goal", "obs")
+        return RewardMachine({("on the way", "there"): (there, 1.0)}, accepting={"there"})
+
+    def own(self) -> RewardMachine:
+        """Return the task whose goal is the one that each observation holds."""
+        there = Predicate(lambda step: self.arrives(step), "the goal", "step")
+        return RewardMachine({("on the way", "there"): (there, 1.0)}, accepting={"there"})
+
+    def arrives(self, step: Step) -> Array:
+        """Return where a step reaches the goal that its first observation holds, (n,) bool."""
+        return self.holds(step.next_obs, self.of(step.obs))
+
+
+@checked_names
+def reached(function: Callable[[Array, Array], Any], goal: Any) -> Predicate:
+    """Return the predicate that a goal is reached, for missions.
+
+    Args:
+        function: of observations (n, …) and one goal (G,): (n,) bool.
+        goal: (G,) numbers.
+
+    Raises:
+        DeclarationError: the goal is not finite numbers.
+    """
+    task = Goal(function, goal=goal)
+    fixed = _goal(goal)
+    place = ", ".join(f"{x:g}" for x in fixed[:4])
+    return Predicate(lambda obs: task.holds(obs, fixed), f"{function_name(function)}({place})")
+
+
+def _goal(value: Any) -> Array:
+    try:
+        goal = np.atleast_1d(np.asarray(value, np.float64))
+    except (TypeError, ValueError) as error:
+        raise DeclarationError(f"a goal is {short(value)}; give numbers: [3.0, -1.0]") from error
+    if goal.ndim != 1 or not len(goal) or not np.isfinite(goal).all():
+        raise DeclarationError(f"a goal is {short(value)}; give one row of finite numbers")
+    return goal

@@ -1,0 +1,340 @@
+"""The graph of logged calls: from where each call ended, the nearest calls that pass there.
+
+Value iteration on it is kernel-based reinforcement learning (Ormoneit & Sen 2002) over calls
+(Sutton, Precup & Singh 1999): no model is learnt.
+
+A call is a chain of pieces of a few steps. A skill without a memory acts by what it sees, so from
+any piece on, the call is also a call that started there; a logged call says what the skill does
+from everywhere that it passed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import RunError
+from skillweave.notices import notice
+from skillweave.planning.calls import CallLog
+from skillweave.planning.goal import Goal
+from skillweave.planning.machine import Readings, RewardMachine
+from skillweave.planning.neighbours import SOFT, feature_maps, nearest, weights_of
+from skillweave.planning.states import PlanningStates
+from skillweave.types import Array
+
+PIECE = 5
+"""Steps of a piece, where that does not give too many."""
+MOST_PIECES = 10_000
+"""The most pieces of a graph; of a longer log they have more steps."""
+MOST_CALLS = 20_000
+"""The most calls of a graph; of more, every so-many-th is used."""
+MOST_SWEEPS = 2_000
+TOLERANCE = 1e-4
+"""Value iteration ends where no value changes by more than this share of the largest."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """The nearest pieces of each choice to n observations, each of another call."""
+
+    pieces: Array
+    """(n, choices, K) int64."""
+    weights: Array
+    """(n, choices, K) float32, they add up to 1 for each choice."""
+    distance: Array
+    """(n, choices) float32, to the nearest."""
+    total: Array
+    """(n, choices) float32, the sum of the weights before they were normalised."""
+
+    def take(self, rows: Array) -> Near:
+        """Return the neighbours of some observations."""
+        return Near(self.pieces[rows], self.weights[rows], self.distance[rows], self.total[rows])
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """P pieces of calls."""
+
+    call: Array
+    """(P,) int64, the call that each is of."""
+    choice: Array
+    """(P,) int64."""
+    first: Array
+    """(P,) int64, its first step in the log."""
+    stop: Array
+    """(P,) int64, the step behind its last one."""
+    then: Array
+    """(P,) int64, the next piece of the same call; −1: the call ends."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The outcome of every piece for a task, from each of its M planning states."""
+
+    reward: Array
+    """(P, M) float32, Σ γᵏ rₖ within the piece."""
+    follows: Array
+    """(P, M, J) int32, planning states after it."""
+    weights: Array
+    """(P, M, J) float32, of these."""
+    discount: Array
+    """(P,) float32, γ to the number of steps; 0 where nothing follows."""
+
+
+class CallGraph:
+    """The pieces of a log's calls, and the nearest pieces to where each call ended.
+
+    Where lengths are chosen, a call also counts as one of each shorter length: the steps inside say
+    where it would have ended.
+
+    Args:
+        log: the calls.
+        features: for all skills or by skill: places, or a function of observations; None: what each
+            skill sees.
+        neighbours: K.
+        skills: for initiation sets in observations that are not in the log; None: those that were
+            recorded at the ends of calls.
+
+    Raises:
+        RunError: the log has less than two calls.
+        DeclarationError: features are constant or not finite, or have a wrong shape.
+    """
+
+    def __init__(
+        self,
+        log: CallLog,
+        features: Any = None,
+        neighbours: int = 5,
+        skills: SkillSet | None = None,
+    ) -> None:
+        if len(log) < 2:
+            raise RunError(
+                f"the log has {len(log)} call{'s' * (len(log) != 1)}, and nothing can be planned "
+                "from that; record some thousand steps"
+            )
+        if len(log) > MOST_CALLS:
+            notice(
+                f"the log has {len(log):,} calls; the plan uses {MOST_CALLS:,} of them, at equal "
+                "distances"
+            )
+            log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
+        self.log, self.neighbours, self.skills = log, neighbours, skills
+        self.pieces = pieces = _pieces(log, skills)
+        known = np.concatenate([log.start, log.end])
+        self.maps = feature_maps(log.observation_space, features, log.sees, known, log.skills)
+        self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
+        self.known = np.array([len(rows) > 0 for rows in self._of_choice])
+        """(choices,) bool: the log has a call of the choice."""
+        self.skill_of = np.arange(log.choices) // max(1, len(log.lengths))
+        starts = log.before[pieces.first]
+        self._starts = [
+            self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
+            for skill, rows in zip(self.skill_of, self._of_choice, strict=True)
+        ]
+        last = pieces.then < 0
+        steps, self._end_of = np.unique(pieces.stop[last] - 1, return_inverse=True)
+        self._last = np.flatnonzero(last)
+        self.end = log.next_obs[steps]
+        """(E, *obs_shape), the observations at the ends of calls."""
+        call = log.owner[steps]
+        whole = steps == log.offset[call + 1] - 1
+        self.end_call = call
+        """(E,) int64, the call of each end."""
+        self.terminated = log.terminated[call] & whole
+        """(E,) bool: the episode terminated there."""
+        self.may = log.may_follow[call].copy()
+        """(E, choices) bool: what may follow."""
+        parts = np.flatnonzero(~whole)
+        if len(parts) and skills is not None and skills.restricts:
+            self.may[parts] = skills.startable(self.end[parts])
+        self._end_features = [each(self.end) for each in self.maps]
+        self._depths = _by_depth(pieces.then)
+        self._after: Near | None = None
+
+    def near(self, obs: Array) -> Near:
+        """Return the nearest pieces of each choice to observations (n, …)."""
+        return self.near_features([each(obs) for each in self.maps])
+
+    def near_features(self, features: list[Array]) -> Near:
+        """Return the nearest pieces to features of each skill, (n, F) each."""
+        n, k = len(features[0]), self.neighbours
+        shape = (n, self.log.choices, k)
+        pieces, distance = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
+        for c, rows in enumerate(self._of_choice):
+            if len(rows):
+                call = self.pieces.call[rows]
+                near, far = nearest(self._starts[c], features[self.skill_of[c]], k, call)
+                pieces[:, c], distance[:, c] = rows[near], far
+        finite = np.where(np.isfinite(distance), distance, 1e9)
+        total = (1.0 / (finite + SOFT)).sum(2)
+        return Near(pieces, weights_of(finite), distance[:, :, 0], total)
+
+    @property
+    def after(self) -> Near:
+        """The nearest pieces to the ends of calls."""
+        if self._after is None:
+            self._after = self.near_features(self._end_features)
+        return self._after
+
+    def judge(
+        self,
+        task: RewardMachine,
+        states: PlanningStates,
+        readings: Readings,
+        gamma: float,
+        over: Array | None = None,
+    ) -> Judged:
+        """Return what each piece pays and leads to, from each planning state of a task.
+
+        Args:
+            task: the machine.
+            states: its planning states.
+            readings: the machine's, of all steps of the log.
+            gamma: γ of one step.
+            over: (E,) bool, the ends after which nothing follows; None: where the episode
+                terminated.
+        """
+        pieces = self.pieces
+        steps = pieces.stop - pieces.first
+        # The longest come first, so that those which go on are always a part from the beginning.
+        order = np.argsort(-steps, kind="stable")
+        first, lengths = pieces.first[order], steps[order]
+        state = np.repeat(states.exact[None], len(order), 0)
+        paid = np.zeros((len(order), states.count))
+        for k in range(int(lengths[0])):
+            m = int(np.searchsorted(-lengths, -k, side="left"))
+            state[:m], now = task.advance(state[:m], readings.take(first[:m] + k))
+            paid[:m] += gamma**k * now
+        reward, final = np.empty(paid.shape, np.float32), np.empty_like(state)
+        reward[order], final[order] = paid, state
+        follows, weights = states.corners(final)
+        used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
+        discount = gamma ** steps.astype(np.float64)
+        over = self.terminated if over is None else over
+        discount[self._last] *= ~over[self._end_of]
+        return Judged(
+            reward, follows[..., used].astype(np.int32), weights[..., used],
+            discount.astype(np.float32),
+        )  # fmt: skip
+
+    def solve(
+        self,
+        judged: Judged,
+        near: Near,
+        may: Array,
+        *,
+        caution: float = 0.0,
+        novel: float | None = None,
+        bonus: float = 1.0,
+    ) -> tuple[Array, int]:
+        """Return the worth of each piece from each planning state, (P, M), and the sweeps.
+
+        A piece is worth what it pays and what follows: the next piece of its call, or at the call's
+        end the best choice, by the weighted mean of its nearest pieces' worth.
+
+        Args:
+            judged: what pieces pay and lead to.
+            near: the nearest pieces to the ends.
+            may: (E, choices) bool, what may follow.
+            caution: share by which a value falls for each unit of distance to the nearest piece.
+            novel: distance from which on a choice is new, and worth ``bonus``; None: none is.
+            bonus: its value.
+        """
+        count = judged.reward.shape[1]
+        value = np.zeros((len(self.end), count), np.float32)
+        trust = 1.0 / (1.0 + caution * near.distance)
+        choices = [c for c in range(self.log.choices) if self.known[c] or novel is not None]
+        for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
+            worth = self._worth(judged, value)
+            best = np.full_like(value, -np.inf)
+            for c in choices:
+                q = np.zeros_like(value)
+                for k in range(self.neighbours):
+                    q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
+                q = np.where(q > 0, q * trust[:, c, None], q)
+                if novel is not None:
+                    q = np.where((near.distance[:, c] > novel)[:, None], np.float32(bonus), q)
+                np.maximum(best, q, out=best, where=may[:, c, None])
+            best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
+            change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)
+            value = best
+            if change <= TOLERANCE * largest:
+                break
+        return self._worth(judged, value), sweeps
+
+    def _worth(self, judged: Judged, value: Array) -> Array:
+        """Return the worth of pieces, (P, M), where the ends of calls have a ``value`` (E, M)."""
+        worth = np.zeros(judged.reward.shape, np.float32)
+
+        def put(rows: Array, following: Array, place: Array) -> None:
+            after = following[place[:, None, None], judged.follows[rows]]
+            mean = (after * judged.weights[rows]).sum(2)
+            worth[rows] = judged.reward[rows] + judged.discount[rows, None] * mean
+
+        put(self._last, value, self._end_of)
+        for rows in self._depths:
+            put(rows, worth, self.pieces.then[rows])
+        return worth
+
+    def for_goal(self, goal: Goal, place: Array) -> tuple[Near, Array]:
+        """Return the nearest pieces to the ends, and what may follow, where the goal is ``place``.
+
+        They differ from the usual ones only for skills that see the goal.
+        """
+        if goal.columns is None:
+            return self.after, self.may
+        end = goal.put(self.end, place)
+        features = [each(end) for each in self.maps]
+        same = all(np.array_equal(a, b) for a, b in zip(features, self._end_features, strict=True))
+        may = self.may
+        if self.skills is not None and self.skills.restricts:
+            may = self.skills.startable(end)
+        return (self.after if same else self.near_features(features)), may
+
+
+def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:
+    """Return the pieces of calls; where lengths are chosen, calls and their beginnings."""
+    if log.lengths:
+        return _beginnings(log, skills)
+    steps = max(PIECE, -(-log.steps // MOST_PIECES))
+    # A skill with a memory would act otherwise if it was called in the middle.
+    forgets = ~np.array(log.recurrent, bool)[log.skill]
+    counts = np.where(forgets, -(-log.tau // steps), 1)
+    call = np.repeat(np.arange(len(log)), counts)
+    number = np.arange(len(call)) - np.repeat(np.cumsum(counts) - counts, counts)
+    first = log.offset[call] + number * steps
+    last = number == counts[call] - 1
+    stop = np.where(last, log.offset[call + 1], first + steps)
+    then = np.where(last, -1, np.arange(len(call)) + 1)
+    return Pieces(call, log.choice[call], first, stop, then)
+
+
+def _beginnings(log: CallLog, skills: SkillSet | None) -> Pieces:
+    """Return calls, and their beginnings as calls of shorter lengths.
+
+    A beginning counts only where it is known what may follow.
+    """
+    parts = [(np.arange(len(log)), log.tau, log.choice)]
+    count, length = len(log.lengths), log.choice % len(log.lengths)
+    if skills is not None or log.may_follow.all():
+        for i, steps in enumerate(log.lengths):
+            longer = np.flatnonzero(length > i)
+            tau = np.minimum(log.tau[longer], steps)
+            parts.append((longer, tau, log.skill[longer] * count + i))
+    call, tau, choice = (np.concatenate(column) for column in zip(*parts, strict=True))
+    first = log.offset[call]
+    return Pieces(call, choice, first, first + tau, np.full(len(call), -1))
+
+
+def _by_depth(then: Array) -> list[Array]:
+    """Return pieces before the last of a call: those whose next one is known come first."""
+    depth = np.zeros(len(then), np.int64)
+    rows = np.flatnonzero(then >= 0)
+    for row in rows[::-1]:  # the next piece has the next number
+        depth[row] = depth[then[row]] + 1
+    order = rows[np.argsort(depth[rows], kind="stable")]
+    bounds = np.flatnonzero(np.diff(depth[order])) + 1
+    return [part for part in np.split(order, bounds) if len(part)]

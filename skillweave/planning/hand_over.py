@@ -1,0 +1,322 @@
+"""Hand-over: how often each skill succeeds after each other one, and chains of skills."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.collecting.call_end import CallEnd
+from skillweave.errors import DeclarationError, RunError
+from skillweave.messages import short
+from skillweave.notebooks import table
+from skillweave.planning.calls import CallLog
+from skillweave.planning.lacking import read_log
+from skillweave.planning.mission import Mission
+from skillweave.planning.neighbours import feature_maps, nearest, weights_of
+from skillweave.planning.predicates import as_event
+from skillweave.spaces import obs_codec, to_tensor
+from skillweave.types import Array
+
+START = "start"
+"""The row of calls that begin an episode."""
+Z = 1.96
+"""Standard deviations of a 95 % interval."""
+NEIGHBOURS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class HandOver:
+    """Counts of calls and of those that were done, by the skill before.
+
+    Attributes:
+        skills: names, the columns.
+        before: "start" and the skills, the rows.
+        calls: (S + 1, S) int64.
+        done: (S + 1, S) int64.
+        cut: (S,) int64, calls of each skill that were left out, as the episode's time limit cut
+            them.
+    """
+
+    skills: tuple[str, ...]
+    calls: Array
+    done: Array
+    cut: Array
+
+    @property
+    def before(self) -> tuple[str, ...]:
+        """The skills before, and "start" in front of them."""
+        return (START, *self.skills)
+
+    @property
+    def rate(self) -> Array:
+        """The share of calls that were done, (S + 1, S); NaN where there were none."""
+        with np.errstate(invalid="ignore"):
+            rate: Array = self.done / np.where(self.calls > 0, self.calls, np.nan)
+        return rate
+
+    @property
+    def interval(self) -> tuple[Array, Array]:
+        """The bounds of 95 % intervals of the rates, (S + 1, S) each (Wilson 1927)."""
+        return wilson(self.done, self.calls)
+
+    def of(self, skill: str, after: str = START) -> tuple[float, int]:
+        """Return the rate of a skill after another one (or after "start"), and the calls.
+
+        Raises:
+            DeclarationError: the log has no skill of these names.
+        """
+        for name, known in ((skill, self.skills), (after, self.before)):
+            if name not in known:
+                raise DeclarationError(
+                    f"the log has no skill {short(name)}; its skills are: {', '.join(self.skills)}"
+                )
+        place = self.before.index(after), self.skills.index(skill)
+        return float(self.rate[place]), int(self.calls[place])
+
+    def weakest(self, least: int = 20) -> list[str]:
+        """Return sentences on skills that are done much less often after one skill than elsewhere.
+
+        Args:
+            least: the fewest calls after a skill that count.
+        """
+        sentences = []
+        high = self.interval[1]
+        for j, skill in enumerate(self.skills):
+            for i, before in enumerate(self.before):
+                others = np.delete(np.arange(len(self.before)), i)
+                calls, done = self.calls[others, j].sum(), self.done[others, j].sum()
+                if self.calls[i, j] < least or calls < least:
+                    continue
+                elsewhere_low = wilson(done, calls)[0]
+                if high[i, j] < elsewhere_low:
+                    where = "at the start of an episode" if i == 0 else f"after {before!r}"
+                    sentences.append(
+                        f"{skill!r} succeeds in {self.rate[i, j]:.0%} of the calls {where}; "
+                        f"{done / calls:.0%} elsewhere"
+                    )
+        return sentences
+
+    def __str__(self) -> str:
+        """Return the matrix as a table of text: rates, and the number of calls."""
+        width = max(map(len, self.before))
+        cells = [["after", *self.skills], *self._rows()]
+        widths = [max(width, 5), *(max(len(s), 12) for s in self.skills)]
+        return "\n".join(
+            "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
+            for row in cells
+        )
+
+    def _repr_html_(self) -> str:
+        return table(["after", *self.skills], self._rows())
+
+    def _rows(self) -> list[list[str]]:
+        return [
+            [
+                name,
+                *(
+                    f"{rate:.0%} ({calls})" if calls else "–"
+                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
+                ),
+            ]
+            for i, name in enumerate(self.before)
+        ]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The chance that skills are done one after another, a call each."""
+
+    skills: tuple[str, ...]
+    estimate: float
+    """Along logged calls: from where each call ended, the nearest calls of the next skill."""
+    product: float
+    """The product of the rates of the hand-over matrix; NaN where a pair has no call."""
+    rates: tuple[float, ...]
+    """The factors of the product."""
+    calls: tuple[int, ...]
+    """The number of calls that each factor was counted from."""
+
+
+@checked_names
+def hand_over(
+    log: CallLog, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
+) -> HandOver:
+    """Count how often each skill is done after each other one.
+
+    A row counts the calls that follow a call of its skill. Calls that the episode's time limit cut
+    before they were done are left out.
+
+    Args:
+        log: calls; of a random selector all pairs have some.
+        done: by skill, the event that its calls are for, in place of the skill's ``success``:
+            a predicate, a function of observations or of a ``Step``, or ``held(...)``; a call is
+            done if it happened within the call.
+        only_after_done: leave out calls that follow a call that was not done.
+
+    Raises:
+        DeclarationError: ``done`` names an unknown skill, or holds no event.
+    """
+    count = len(log.skills)
+    won = calls_done(log, done)
+    counts = ~log.was_cut | won
+    before = np.full(len(log), -1)  # the skill before; −1: none counts
+    following = log.followed_by
+    first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
+    before[following[first]] = log.skill[first] + 1
+    before[log.order == 0] = 0
+    calls, did = np.zeros((count + 1, count), np.int64), np.zeros((count + 1, count), np.int64)
+    rows = np.flatnonzero(counts & (before >= 0))
+    np.add.at(calls, (before[rows], log.skill[rows]), 1)
+    np.add.at(did, (before[rows], log.skill[rows]), won[rows])
+    cut = np.bincount(log.skill[~counts], minlength=count)
+    return HandOver(log.skills, calls, did, cut)
+
+
+@checked_names
+def chain(
+    log: CallLog, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
+) -> Chain:
+    """Estimate how often skills are done one after another, a call each, from an episode's start.
+
+    The estimate follows logged calls: from where a call ended, the nearest calls of the next skill
+    count, by distance. So it knows that a skill ends elsewhere after another one, which the product
+    of rates does not.
+
+    Args:
+        log: calls.
+        skills: names, in their order.
+        done: as for ``hand_over``.
+        features: as for ``Planner``.
+
+    Raises:
+        DeclarationError: no skill is named, or one that is unknown.
+        RunError: the log has no call of a skill, or none of the first at an episode's start.
+    """
+    if not skills:
+        raise DeclarationError("chain() needs the names of skills: chain(log, 'left', 'right')")
+    numbers = [log.number(name) for name in skills]
+    won = calls_done(log, done)
+    counts = ~log.was_cut | won
+    rows = [np.flatnonzero(counts & (log.skill == number)) for number in numbers]
+    rows[0] = rows[0][log.order[rows[0]] == 0]
+    for name, some in zip(skills, rows, strict=True):
+        if not len(some):
+            where = " at the start of an episode" if some is rows[0] else ""
+            raise RunError(
+                f"the log has no complete call of {name!r}{where}; record more calls, chosen at "
+                "random"
+            )
+    known = np.concatenate([log.start, log.end])
+    maps = feature_maps(log.observation_space, features, log.sees, known, log.skills)
+    # From the last skill back: the chance that the rest of the chain is done after each call.
+    chance = won[rows[-1]].astype(np.float64)
+    for i in reversed(range(len(skills) - 1)):
+        here = maps[numbers[i + 1]]
+        starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
+        near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
+        follows = (weights_of(distance) * chance[near]).sum(1)
+        chance = np.where(won[rows[i]] & ~log.terminated[rows[i]], follows, 0.0)
+    matrix = hand_over(log, done)
+    pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
+    rates = tuple(rate for rate, _ in pairs)
+    return Chain(
+        tuple(skills),
+        float(chance.mean()),
+        float(np.prod(rates)),
+        rates,
+        tuple(count for _, count in pairs),
+    )
+
+
+@dataclass(frozen=True)
+class CallEnds:
+    """The ends of one skill's calls."""
+
+    skill: str
+    calls: int
+    reasons: dict[str, int]
+    """Calls by the reason of their end: own, limit, interrupted, episode."""
+    steps: float
+    """Mean steps of a call."""
+    succeeded: float
+    """Share of calls that succeeded."""
+    quantiles: Array
+    """(3, F) numbers of the flat observation that 10, 50 and 90 % of the calls end below."""
+
+
+@checked_names
+def call_ends(log: CallLog, skill: str) -> CallEnds:
+    """Return where the calls of a skill end, and why.
+
+    Args:
+        log: calls.
+        skill: its name.
+
+    Raises:
+        DeclarationError: the log has no skill of this name.
+        RunError: the log has no call of it.
+    """
+    some = log.of(skill)
+    if not len(some):
+        raise RunError(f"the log has no call of {skill!r}; record some")
+    names = {end: end.name.lower() for end in list(CallEnd)[1:]}
+    reasons = {name: int((some.end_reason == end).sum()) for end, name in names.items()}
+    vector = obs_codec(log.observation_space).split(to_tensor(some.end))[0].numpy()
+    return CallEnds(
+        skill,
+        len(some),
+        reasons,
+        float(some.tau.mean()),
+        float(some.succeeded.mean()),
+        np.quantile(vector.reshape(len(some), -1), (0.1, 0.5, 0.9), axis=0),
+    )
+
+
+def calls_done(log: CallLog, done: Mapping[str, Any] | None) -> Array:
+    """Return which calls were done, (C,) bool: by an event inside, or by the skill's success."""
+    won = log.succeeded.copy()
+    if done is None:
+        return won
+    if not isinstance(done, Mapping):
+        raise DeclarationError(
+            f"done is {short(done)}; give events by skill: done={{'hover': in_box}}"
+        )
+    for name, event in done.items():
+        rows = np.flatnonzero(log.skill == log.number(name))
+        won[rows] = happened(log.take(rows), as_event(event, f"done of {name!r}"))
+    return won
+
+
+def happened(log: CallLog, event: Any) -> Array:
+    """Return the calls within which an event happened, (C,) bool."""
+    task = Mission(event)
+    readings = read_log(task, log)
+    tau, over = log.tau, np.zeros(len(log), bool)
+    state = task.start(len(log))
+    for k in range(int(tau.max(initial=0))):
+        rows = np.flatnonzero((tau > k) & ~over)
+        if not len(rows):
+            break
+        state[rows], _ = task.advance(state[rows], readings.take(log.offset[rows] + k))
+        over[rows] = task.is_over(state[rows])
+    return over
+
+
+def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
+    """Return the bounds of 95 % intervals of shares (Wilson 1927, "Probable inference").
+
+    Args:
+        successes: counts.
+        trials: counts; where 0, the interval is 0 to 1.
+    """
+    n = np.asarray(trials, np.float64)
+    safe = np.maximum(n, 1.0)
+    share = np.asarray(successes) / safe
+    middle = (share + Z * Z / (2 * safe)) / (1 + Z * Z / safe)
+    half = Z / (1 + Z * Z / safe) * np.sqrt(share * (1 - share) / safe + (Z / (2 * safe)) ** 2)
+    low = np.where(n > 0, np.clip(middle - half, 0.0, 1.0), 0.0)
+    return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)

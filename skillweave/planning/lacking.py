@@ -1,0 +1,120 @@
+"""Tasks that a log of calls does not suffice for, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skillweave.errors import RunError, SkillError, SkillweaveError
+from skillweave.messages import observed
+from skillweave.planning.calls import CallLog
+from skillweave.planning.machine import Counter, Readings, RewardMachine
+from skillweave.planning.predicates import Predicate
+from skillweave.types import Array
+
+TRIES = 20_000
+"""Observations that are made up, to find one in which a predicate holds."""
+
+
+def read_log(task: RewardMachine, log: CallLog) -> Readings:
+    """Evaluate a task's events and rewards on all steps of a log.
+
+    Raises:
+        RunError: the task reads a key of ``info`` that was not recorded.
+        SkillError: an event or a reward failed, or returned another shape or type.
+    """
+    try:
+        return task.read(log.as_steps())
+    except SkillError as error:
+        cause = error.__cause__
+        key = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
+        if not isinstance(key, str) or key in log.info:
+            raise
+        raise RunError(
+            f"the task reads info[{key!r}], which the log does not have; record it: "
+            f"record_calls(..., info=[{key!r}])"
+        ) from error
+
+
+def check_possible(task: RewardMachine, readings: Readings, log: CallLog) -> None:
+    """Raise a RunError where no logged step lets the task go on, though it is not over.
+
+    The error names the predicates that never hold, and the skill that comes nearest to one.
+    """
+    holds = readings.events[:, : len(task.events)].max(0, initial=False).tolist()
+    number = {id(event): i for i, event in enumerate(task.events)}
+
+    def happens(predicate: Predicate) -> bool:
+        i = number.get(id(predicate))
+        if i is None:  # another object of the same function
+            i = next(j for j, e in enumerate(task.events) if e.function == predicate.function)
+        return bool(holds[i])
+
+    reached, queue = {task.plan.start}, [task.plan.start]
+    missing: dict[str, Predicate] = {}
+    pays = any(task.plan.each_step.values())
+    while queue:
+        state = queue.pop()
+        for arrow in task.plan.arrows:
+            if arrow.origin != state:
+                continue
+            atoms = [a.predicate if isinstance(a, Counter) else a for a in arrow.atoms]
+            absent = [a for a in atoms if not happens(a)]
+            if absent and not task.failing[arrow.target]:
+                missing |= {a.name: a for a in absent}
+            if not absent:
+                pays |= callable(arrow.reward) or arrow.reward > 0
+                if arrow.target not in reached:
+                    reached.add(arrow.target)
+                    queue.append(arrow.target)
+    accepted = not task.accepting.any() or bool(task.accepting[list(reached)].any())
+    if (accepted and pays) or not missing:
+        return
+    raise RunError(_sentence(list(missing.values()), log))
+
+
+def _sentence(missing: Sequence[Predicate], log: CallLog) -> str:
+    names = " and ".join(repr(p.name) for p in missing[:3])
+    verb = "holds" if len(missing) == 1 else "hold"
+    text = f"{names} never {verb} in the {log.steps:,} steps of the log, so no plan leads there"
+    for predicate in missing:
+        if near := _nearest(predicate, log):
+            return f"{text}; {near}. Record more steps, or add a skill that leads there"
+    return f"{text}; check the predicate, record more steps, or add a skill that leads there"
+
+
+def _nearest(predicate: Predicate, log: CallLog) -> str:
+    """Return a clause on the skill that comes nearest to where a predicate holds; "": unknown."""
+    obs = log.next_obs
+    if predicate.reads != "obs" or obs.ndim != 2 or obs.dtype.kind != "f":
+        return ""
+    wanted = _example(predicate, obs)
+    if wanted is None:
+        return ""
+    scale = np.maximum(obs.std(0), 1e-9)
+    step, least = 0, np.inf
+    for first in range(0, len(obs), 4_096):  # so that no large array is made
+        part = (obs[first : first + 4_096, None] - wanted[None]) / scale
+        far = np.square(part).mean(2).min(1)
+        if far.min() < least:
+            least, step = float(far.min()), first + int(far.argmin())
+    name = log.skills[int(log.skill[log.owner[step]])]
+    return f"{name!r} comes nearest, in observation {observed(obs[step])}"
+
+
+def _example(predicate: Predicate, obs: Array) -> Array | None:
+    """Return observations (k, D) in which a predicate holds, made up at random; None: in none."""
+    rng = np.random.default_rng(0)
+    low, high = obs.min(0), obs.max(0)
+    span = np.maximum(high - low, 1e-3)
+    made = obs[rng.integers(len(obs), size=TRIES)].astype(np.float64)
+    free = rng.uniform(low - span, high + span, made.shape)
+    # In half of them all numbers are free, in the others one to three.
+    share = np.where(np.arange(TRIES) % 2, 1.0, rng.integers(1, 4, TRIES) / obs.shape[1])
+    made = np.where(rng.random(made.shape) < share[:, None], free, made).astype(obs.dtype)
+    try:
+        holds = predicate.at(made)
+    except SkillweaveError:
+        return None
+    return made[holds][:64] if holds.any() else None

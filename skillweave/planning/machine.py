@@ -1,0 +1,557 @@
+"""Reward machines: tasks as states, with transitions by events, and rewards.
+
+Toro Icarte, Klassen, Valenzano & McIlraith 2018, "Using Reward Machines for High-Level Task
+Specification". An event that must hold for n steps has a counter, so n states are not written out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from skillweave.arguments import checked_names
+from skillweave.errors import DeclarationError
+from skillweave.messages import close_matches, short
+from skillweave.planning.predicates import Event, Held, Predicate, as_event
+from skillweave.selectors import Automaton
+from skillweave.selectors.base import function_name, listed
+from skillweave.skills.answers import answer
+from skillweave.types import Array, Step
+
+MOST_STATES = 10_000
+"""The most states of a machine."""
+MOST_AUTOMATON = 2_000
+"""The most states of the automaton that is made of a machine, whose counters become states."""
+_NEVER = np.iinfo(np.int64).max
+
+Reward = float | Callable[[Step], Any]
+"""A number, or a function of a ``Step`` that returns (n,) numbers."""
+
+
+@dataclass(frozen=True)
+class Counter:
+    """A counter of the steps in which a predicate has been true without a gap."""
+
+    slot: int
+    """Its column in a task's state, after the first."""
+    predicate: Predicate
+    steps: int
+
+
+Atom = Predicate | Counter
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A transition: it is taken where all its atoms hold."""
+
+    origin: int
+    target: int
+    atoms: tuple[Atom, ...]
+    reward: Reward = 0.0
+    keeps: frozenset[int] = frozenset()
+    """Slots of counters that go on counting after the transition."""
+
+
+@dataclass
+class Plan:
+    """The parts of a machine, before they become arrays."""
+
+    names: tuple[str, ...]
+    start: int
+    arrows: list[Arrow]
+    accepting: frozenset[int] = frozenset()
+    failing: frozenset[int] = frozenset()
+    each_step: dict[int, Reward] = field(default_factory=dict)
+    """The reward of every step in a state."""
+
+
+class Readings:
+    """Truths and rewards that a machine reads from n steps, whatever its states.
+
+    Args:
+        events: (n, E) bool.
+        values: (n, F) float64, rewards that are functions of a step.
+    """
+
+    def __init__(self, events: Array, values: Array) -> None:
+        n = len(events)
+        # Two columns that pad lists of atoms: one is never true, the other always.
+        self.events = np.concatenate([events, np.zeros((n, 1), bool), np.ones((n, 1), bool)], 1)
+        self.values = np.concatenate([np.zeros((n, 1)), values], 1)
+
+    def take(self, rows: Any) -> Readings:
+        """Return the readings of some steps."""
+        some = object.__new__(Readings)
+        some.events, some.values = self.events[rows], self.values[rows]
+        return some
+
+
+@checked_names
+class RewardMachine:
+    """A task: states, transitions by events, and rewards.
+
+    ```python
+    from skillweave.planning import RewardMachine, held
+
+
+    def at_left(obs):
+        return obs[:, 0] < -0.5
+
+
+    def high(obs):
+        return obs[:, 1] > 0.8
+
+
+    task = RewardMachine(
+        {
+            ("to left", "to top"): (at_left, 0.5),
+            ("to top", "done"): (held(high, 20), 0.5),
+        },
+        accepting={"done"},
+    )
+    ```
+
+    After every step the transitions of the current state are checked in the order of declaration;
+    the first whose event holds is taken, and no other in this step. Accepting and failing states
+    end the task. A counter of ``held`` starts at 0 where its state is entered.
+
+    Args:
+        transitions: by (from, to), the event: a predicate, a function of observations or of a
+            ``Step``, or ``held(...)``; or (event, reward), the reward a number or a function of a
+            ``Step``; or a list of these.
+        start: the first state; None: the first that is named.
+        accepting: states in which the task has succeeded.
+        failing: states in which it has failed.
+        each_step: the reward of every step outside accepting and failing states: a number, a
+            function of a ``Step``, or such by state.
+
+    Raises:
+        DeclarationError: a state is unknown, an accepting or failing state has transitions, or a
+            value has a wrong type.
+    """
+
+    def __init__(
+        self,
+        transitions: Mapping[tuple[str, str], Any],
+        *,
+        start: str | None = None,
+        accepting: Collection[str] = (),
+        failing: Collection[str] = (),
+        each_step: Any = 0.0,
+    ) -> None:
+        self._build(_declared(transitions, start, accepting, failing, each_step))
+
+    def _build(self, plan: Plan) -> None:
+        """Turn the parts of a machine into arrays, one row for each state."""
+        if len(plan.names) > MOST_STATES:
+            raise DeclarationError(
+                f"the task has {len(plan.names):,} states; at most {MOST_STATES:,} are possible: "
+                "repeat it less often, or combine fewer sequences by 'and' or 'or'"
+            )
+        self.plan, self.state_names = plan, plan.names
+        by_state: list[list[Arrow]] = [[] for _ in plan.names]
+        for arrow in plan.arrows:
+            by_state[arrow.origin].append(arrow)
+        counters = [_counters(arrows) for arrows in by_state]
+        self.slots = max((slot + 1 for some in counters for slot in some), default=0)
+        """Counters side by side."""
+        self.events: list[Predicate] = []
+        self.rewards: list[Callable[[Step], Any]] = []
+        self._by_state = by_state
+        count, most = len(plan.names), max(1, *(len(a) for a in by_state))
+        atoms = max([1, *(len(a.atoms) for a in plan.arrows)])
+        for arrow in plan.arrows:
+            for atom in arrow.atoms:
+                self._event(_predicate(atom))
+        # Two columns behind those of the events: one is never true, the other always.
+        never, always = len(self.events), len(self.events) + 1
+        self._counted = np.full((count, self.slots), never)
+        self.counter_steps = np.full((count, self.slots), _NEVER)
+        """Steps for which each counter must count, (Q, H); the largest number: it is not used."""
+        for q, some in enumerate(counters):
+            for slot, counter in some.items():
+                self._counted[q, slot] = self._event(counter.predicate)
+                self.counter_steps[q, slot] = counter.steps
+        self._atoms = np.full((count, most, atoms), always)
+        self._atoms[:, :, 0] = never
+        self._target = np.arange(count)[:, None].repeat(most, 1)
+        self._paid, self._paid_by = np.zeros((count, most)), np.zeros((count, most), np.int64)
+        self._keeps = np.zeros((count, most, self.slots), bool)
+        for q, arrows in enumerate(by_state):
+            for t, arrow in enumerate(arrows):
+                self._atoms[q, t, : len(arrow.atoms)] = [
+                    always + 1 + atom.slot if isinstance(atom, Counter) else self._event(atom)
+                    for atom in arrow.atoms
+                ]
+                self._target[q, t] = arrow.target
+                self._paid[q, t], self._paid_by[q, t] = self._reward(arrow.reward)
+                self._keeps[q, t, list(arrow.keeps)] = True
+        self._each, self._each_by = np.zeros(count), np.zeros(count, np.int64)
+        for q, reward in plan.each_step.items():
+            self._each[q], self._each_by[q] = self._reward(reward)
+        self.accepting = np.isin(np.arange(count), list(plan.accepting))
+        """The states in which the task has succeeded, (Q,) bool."""
+        self.failing = np.isin(np.arange(count), list(plan.failing))
+        """The states in which it has failed, (Q,) bool."""
+
+    def arrows_from(self, state: int) -> list[Arrow]:
+        """Return the transitions from a state, in the order in which they are checked."""
+        return self._by_state[state]
+
+    def _event(self, predicate: Predicate) -> int:
+        """Return the number of a predicate among the events; the same function has one number."""
+        for i, known in enumerate(self.events):
+            same = known.function is predicate.function or known.function == predicate.function
+            if same and known.reads == predicate.reads:
+                return i
+        self.events.append(predicate)
+        return len(self.events) - 1
+
+    def _reward(self, reward: Reward) -> tuple[float, int]:
+        """Return a reward as a number, and the column of its value; 0: none."""
+        if not callable(reward):
+            return float(reward), 0
+        if reward not in self.rewards:
+            self.rewards.append(reward)
+        return 0.0, self.rewards.index(reward) + 1
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {listed(self.state_names)}>"
+
+    def start(self, n: int) -> Array:
+        """Return the state of ``n`` environments at the start of the task, (n, 1 + H) int64.
+
+        Column 0 is the number of the machine's state, the others are its counters.
+        """
+        state = np.zeros((n, 1 + self.slots), np.int64)
+        state[:, 0] = self.plan.start
+        return state
+
+    def step(self, state: Array, step: Step) -> tuple[Array, Array, Array]:
+        """Return the state after a ``step``, the reward, and where the task is over.
+
+        Args:
+            state: (n, 1 + H), from ``start`` or the step before.
+            step: of n environments.
+
+        Returns:
+            The next state (n, 1 + H), rewards (n,) float64, and (n,) bool: accepted or failed.
+
+        Raises:
+            SkillError: a predicate or a reward failed, or returned another shape or type.
+        """
+        after, reward = self.advance(state, self.read(step))
+        return after, reward, self.is_over(after)
+
+    def read(self, step: Step) -> Readings:
+        """Evaluate all events and rewards on n steps."""
+        n = len(step.reward)
+        events = [event.holds(step) for event in self.events]
+        values = [
+            answer(reward, step, n, np.float64, "task", function_name(reward), step.elapsed)
+            for reward in self.rewards
+        ]
+        return Readings(
+            np.stack(events, 1) if events else np.zeros((n, 0), bool),
+            np.stack(values, 1) if values else np.zeros((n, 0)),
+        )
+
+    def advance(self, state: Array, readings: Readings) -> tuple[Array, Array]:
+        """Return the next states and rewards, from several states at once if wanted.
+
+        Args:
+            state: (n, …, 1 + H).
+            readings: of n steps.
+
+        Returns:
+            (n, …, 1 + H), and (n, …).
+        """
+        q = state[..., 0]
+        rows = np.arange(len(q)).reshape(-1, *(1,) * (q.ndim - 1))
+        after = np.empty_like(state)
+        full = np.zeros((*q.shape, self.slots), bool)
+        for slot in range(self.slots):
+            goes_on = readings.events[rows, self._counted[q, slot]]
+            count = np.where(goes_on, state[..., 1 + slot] + 1, 0)
+            full[..., slot] = count >= self.counter_steps[q, slot]
+            after[..., 1 + slot] = count
+        taken = np.full(q.shape, -1)
+        for t in reversed(range(self._atoms.shape[1])):
+            holds = self._holds(self._atoms[q, t], readings.events, rows, full)
+            taken = np.where(holds, t, taken)
+        arrow = np.maximum(taken, 0)
+        moves = taken >= 0
+        after[..., 0] = np.where(moves, self._target[q, arrow], q)
+        if self.slots:
+            after[..., 1:][moves[..., None] & ~self._keeps[q, arrow]] = 0
+        paid, each = np.where(moves, self._paid[q, arrow], 0.0), self._each[q]
+        reward: Array = paid + each
+        if self.rewards:
+            reward += np.where(moves, readings.values[rows, self._paid_by[q, arrow]], 0.0)
+            reward += readings.values[rows, self._each_by[q]]
+        return after, reward
+
+    def _holds(self, atoms: Array, events: Array, rows: Array, full: Array) -> Array:
+        """Return where all atoms (n, …, A) of an arrow hold, (n, …) bool."""
+        plain = events.shape[1]
+        holds: Array = np.ones(atoms.shape[:-1], bool)
+        for a in range(atoms.shape[-1]):
+            atom = atoms[..., a]
+            true = events[rows, np.minimum(atom, plain - 1)]
+            if self.slots:
+                slot = np.clip(atom - plain, 0, self.slots - 1)
+                counted = np.take_along_axis(full, slot[..., None], -1)[..., 0]
+                true = np.where(atom >= plain, counted, true)
+            holds &= true
+        return holds
+
+    def is_over(self, state: Array) -> Array:
+        """Return where the task is over, (n, …) bool."""
+        over: Array = (self.accepting | self.failing)[state[..., 0]]
+        return over
+
+    def has_succeeded(self, state: Array) -> Array:
+        """Return where the task has succeeded, (n, …) bool."""
+        succeeded: Array = self.accepting[state[..., 0]]
+        return succeeded
+
+    @property
+    def observation_space(self) -> Box:
+        """The space of ``observe``: one number for each state, and one for each counter."""
+        return Box(0.0, 1.0, (len(self.state_names) + self.slots,), np.float32)
+
+    def observe(self, state: Array) -> Array:
+        """Return a task's state for a policy to see, (n, Q + H) float32.
+
+        The machine's state is one-hot; a counter is its share of the steps that it must count.
+        """
+        q = state[:, 0]
+        one_hot = q[:, None] == np.arange(len(self.state_names))
+        share = state[:, 1:] / self.counter_steps[q].astype(np.float64)
+        return np.concatenate([one_hot, share], 1, dtype=np.float32)
+
+    def automaton(self, skills: Mapping[str, Any], after: Any = None) -> Automaton:
+        """Return the task as a ready selector that calls a skill for each event.
+
+        In each state it calls the skills of the events that lead on, but not to a failing state.
+        Counters become states.
+
+        Args:
+            skills: by the name of a predicate, a skill's name or several.
+            after: the skills that are called when the task is over; None: all of ``skills``.
+
+        Raises:
+            DeclarationError: an event has no skill, a state waits for two ``held`` events, or the
+                automaton would have more than 2,000 states.
+        """
+        every = [name for some in skills.values() for name in _names(some)]
+        after = list(dict.fromkeys(every)) if after is None else after
+        states: dict[str, Any] = {}
+        transitions: dict[tuple[str, str], Any] = {}
+        for q, name in enumerate(self.state_names):
+            arrows = self._by_state[q]
+            calls = [_skills_of(a, skills) for a in arrows if not self.failing[a.target]]
+            chosen = list(dict.fromkeys(skill for some in calls for skill in some))
+            counters = list(_counters(arrows).values())
+            if len(counters) > 1:
+                raise DeclarationError(
+                    f"in the state {name!r} the task waits for two events that must hold for "
+                    "several steps, which no automaton can follow: plan the task instead"
+                )
+            steps = counters[0].steps if counters else 1
+            if len(states) + steps > MOST_AUTOMATON:
+                raise DeclarationError(
+                    f"the automaton would have more than {MOST_AUTOMATON:,} states, as each step "
+                    "of held() becomes one: plan the task instead"
+                )
+            over = self.accepting[q] or self.failing[q]
+            for i in range(steps):
+                states[_counted_name(name, i)] = after if over or not chosen else chosen
+            for i in range(steps):
+                transitions |= _automaton_arrows(self, arrows, name, counters, i)
+        return Automaton(states, transitions, self.state_names[self.plan.start])
+
+
+def _counted_name(name: str, count: int) -> str:
+    return name if count == 0 else f"{name} ({count} steps held)"
+
+
+def _automaton_arrows(
+    task: RewardMachine, arrows: Sequence[Arrow], name: str, counters: Sequence[Counter], count: int
+) -> dict[tuple[str, str], Callable[[Step], Any]]:
+    """Return an automaton's transitions from one state, whose counter stands at ``count``."""
+    events: dict[tuple[str, str], list[Callable[[Step], Any]]] = {}
+    here = _counted_name(name, count)
+
+    def add(target: str, atoms: Sequence[Predicate], wanted: bool = True) -> None:
+        def event(step: Step) -> Array:
+            holds: Array = np.logical_and.reduce([p.holds(step) for p in atoms])
+            return holds if wanted else ~holds
+
+        event.__name__ = ("" if wanted else "not ") + " and ".join(p.name for p in atoms)
+        events.setdefault((here, target), []).append(event)
+
+    for arrow in arrows:
+        full = all(count + 1 >= a.steps for a in arrow.atoms if isinstance(a, Counter))
+        if not full:
+            continue
+        target, atoms = task.state_names[arrow.target], [_predicate(a) for a in arrow.atoms]
+        for counter in counters:
+            goes_on = counter.slot in _counters(task.arrows_from(arrow.target))
+            if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
+                add(_counted_name(target, count + 1), [*atoms, counter.predicate])
+        add(target, atoms)
+    for counter in counters:
+        if count + 1 < counter.steps:
+            add(_counted_name(name, count + 1), [counter.predicate])
+        if count:
+            add(name, [counter.predicate], wanted=False)
+    return {pair: _any_of(some) for pair, some in events.items()}
+
+
+def _any_of(events: Sequence[Callable[[Step], Any]]) -> Callable[[Step], Any]:
+    if len(events) == 1:
+        return events[0]
+
+    def event(step: Step) -> Array:
+        holds: Array = np.logical_or.reduce([e(step) for e in events])
+        return holds
+
+    event.__name__ = " or ".join(e.__name__ for e in events)
+    return event
+
+
+def _names(skills: Any) -> list[str]:
+    return [skills] if isinstance(skills, str) else list(skills)
+
+
+def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
+    """Return the skills of an arrow's events."""
+    chosen: list[str] = []
+    for atom in arrow.atoms:
+        name = _predicate(atom).name
+        if name not in skills:
+            raise DeclarationError(
+                f"automaton(): the event {name!r} has no skill; give one: "
+                f"automaton({{{name!r}: 'a_skill', ...}}).{close_matches(name, skills)}"
+            )
+        chosen += _names(skills[name])
+    return chosen
+
+
+def _predicate(atom: Atom) -> Predicate:
+    return atom.predicate if isinstance(atom, Counter) else atom
+
+
+def _counters(arrows: Sequence[Arrow]) -> dict[int, Counter]:
+    """Return the counters that the arrows of one state wait for, by slot."""
+    return {a.slot: a for arrow in arrows for a in arrow.atoms if isinstance(a, Counter)}
+
+
+def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_step: Any) -> Plan:
+    """Check the arguments of a machine, and return its parts."""
+    if not isinstance(transitions, Mapping):
+        raise DeclarationError(
+            f"a RewardMachine's transitions are {short(transitions)}; write "
+            "{('from', 'to'): event}"
+        )
+    named: dict[str, int] = {}
+    for pair in transitions:
+        if not isinstance(pair, tuple) or len(pair) != 2:
+            raise DeclarationError(
+                f"a RewardMachine's transition is from {short(pair)}; write ('from', 'to'): event"
+            )
+        for state in pair:
+            if not isinstance(state, str) or not state:
+                raise DeclarationError(
+                    f"a RewardMachine's state is named {short(state)}; it must be text"
+                )
+            named.setdefault(state, len(named))
+    if not named:
+        named[start if isinstance(start, str) and start else "always"] = 0
+    ends = [
+        frozenset(_number(name, named, what) for name in _states(states, what))
+        for states, what in ((accepting, "accepting"), (failing, "failing"))
+    ]
+    if both := ends[0] & ends[1]:
+        name = list(named)[min(both)]
+        raise DeclarationError(
+            f"RewardMachine: the state {name!r} is both accepting and failing; choose one"
+        )
+    plan = Plan(
+        tuple(named), 0 if start is None else _number(start, named, "start"), [], ends[0], ends[1]
+    )
+    slots: dict[int, int] = {}
+    for pair, value in transitions.items():
+        origin, target = named[pair[0]], named[pair[1]]
+        if origin in ends[0] | ends[1]:
+            raise DeclarationError(
+                f"RewardMachine: the state {pair[0]!r} ends the task, so it has no transition; "
+                f"leave out {pair}"
+            )
+        for one in value if isinstance(value, list) else [value]:
+            event, reward = _event_and_reward(one, f"RewardMachine: transition {pair}")
+            slot = slots.get(origin, 0)
+            slots[origin] = slot + isinstance(event, Held)
+            plan.arrows.append(Arrow(origin, target, (atom_of(event, slot),), reward))
+    over = ends[0] | ends[1]
+    for state, reward in _each_step(each_step, named).items():
+        if state not in over:
+            plan.each_step[state] = reward
+    return plan
+
+
+def atom_of(event: Event, slot: int) -> Atom:
+    """Return an event as an atom; ``slot`` is that of its counter, if it needs one."""
+    return Counter(slot, event.predicate, event.steps) if isinstance(event, Held) else event
+
+
+def _event_and_reward(value: Any, where: str) -> tuple[Event, Reward]:
+    reward: Any = 0.0
+    if isinstance(value, tuple):
+        if len(value) != 2:
+            raise DeclarationError(f"{where} is {short(value)}; write an event, or (event, reward)")
+        value, reward = value
+    return as_event(value, where), _checked_reward(reward, where)
+
+
+def _checked_reward(reward: Any, where: str) -> Reward:
+    number = isinstance(reward, int | float | np.integer | np.floating)
+    if number and not isinstance(reward, bool) and np.isfinite(reward):
+        return float(reward)
+    if callable(reward) and not isinstance(reward, type):
+        function: Callable[[Step], Any] = reward
+        return function
+    raise DeclarationError(
+        f"{where}: its reward is {short(reward)}; give a finite number, or a function of a step"
+    )
+
+
+def _each_step(value: Any, named: Mapping[str, int]) -> dict[int, Reward]:
+    where = "RewardMachine: each_step"
+    if isinstance(value, Mapping):
+        return {_number(k, named, "each_step"): _checked_reward(v, where) for k, v in value.items()}
+    reward = _checked_reward(value, where)
+    return {} if reward == 0.0 else dict.fromkeys(named.values(), reward)
+
+
+def _states(value: Any, what: str) -> list[Any]:
+    if isinstance(value, str) or not isinstance(value, Collection):
+        raise DeclarationError(
+            f"RewardMachine: {what} is {short(value)}; give a set of states: {what}={{'done'}}"
+        )
+    return list(value)
+
+
+def _number(name: Any, named: Mapping[str, int], what: str) -> int:
+    if name not in named:
+        raise DeclarationError(
+            f"RewardMachine: {what} names the state {short(name)}, which no transition names; the "
+            f"states are: {listed(tuple(named))}"
+        )
+    return named[name]

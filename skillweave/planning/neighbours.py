@@ -1,0 +1,180 @@
+"""The nearest logged calls of each choice, by what the skill sees at the start of a call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from skillweave.errors import DeclarationError
+from skillweave.messages import close_matches, error_text, short
+from skillweave.spaces import obs_codec, to_tensor
+from skillweave.types import Array
+
+BLOCK = 4_000_000
+"""Distances that are computed at once."""
+SOFT = 0.01
+"""Distance that is added before weights are inverse distances: two equal calls count equally."""
+AHEAD = 8
+"""Points that are looked at for each one that is wanted, as several may be of one group."""
+CONSTANT = 1e-6
+"""A feature whose deviation is less, relative to its size, is constant."""
+
+Features = Callable[[Array], Any] | Sequence[int]
+"""Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
+
+
+class FeatureMap:
+    """Standardised features of observations for one skill.
+
+    Args:
+        space: of the observations.
+        features: a function, or places; None: all numbers.
+        known: (n, *obs_shape), logged observations, by which features are standardised.
+        who: the skill, for messages.
+
+    Raises:
+        DeclarationError: features have a wrong shape, are not finite, or are all constant.
+    """
+
+    def __init__(self, space: gym.Space[Any], features: Any, known: Array, who: str) -> None:
+        self._space, self._features, self._who = space, features, who
+        self._codec = None if callable(features) else obs_codec(space)
+        if self._codec is not None:
+            if self._codec.images and features is None:
+                raise DeclarationError(
+                    f"{who} sees images, and images have no distance that means something; give "
+                    "features=, a function from observations to numbers"
+                )
+            self._places = self._checked_places(features, self._codec.size)
+        raw = self._raw(known)
+        if wrong := np.flatnonzero(~np.isfinite(raw).all(0)).tolist():
+            raise DeclarationError(
+                f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
+            )
+        self.mean, deviation = raw.mean(0), raw.std(0)
+        varies = deviation > CONSTANT * np.maximum(1.0, np.abs(self.mean))
+        if not varies.any():
+            raise DeclarationError(
+                f"all features of {who} are constant in the log, so no call is nearer than "
+                "another; give features= that change, or record calls from other states"
+            )
+        self._varies = np.flatnonzero(varies)
+        self.scale = 1.0 / deviation[varies]
+        self.size = len(self._varies)
+        """F, the number of features."""
+
+    def __call__(self, obs: Array) -> Array:
+        """Return standardised features, (n, F) float32; constant ones are left out."""
+        raw = self._raw(obs)
+        if not np.isfinite(raw).all():
+            raise DeclarationError(
+                f"a feature of {self._who} is not finite in an observation; clip it"
+            )
+        standard = (raw[:, self._varies] - self.mean[self._varies]) * self.scale
+        return np.asarray(standard, np.float32)
+
+    def _raw(self, obs: Array) -> Array:
+        if self._codec is not None:
+            vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
+            features: Array = vector[:, self._places].astype(np.float64)
+            return features
+        try:
+            value = np.asarray(self._features(obs), np.float64)
+        except (Exception, SystemExit) as error:
+            raise DeclarationError(
+                f"features() of {self._who} raised {error_text(error)}; it must be a function of "
+                "observations (n, …)"
+            ) from error
+        if value.ndim == 1 and len(value) == len(obs):
+            value = value[:, None]
+        if value.ndim != 2 or len(value) != len(obs) or not value.shape[1]:
+            raise DeclarationError(
+                f"features() of {self._who} returned shape {value.shape}, but ({len(obs)}, F) was "
+                "expected: a row for each observation"
+            )
+        return value
+
+    def _checked_places(self, places: Any, size: int) -> list[int]:
+        if places is None:
+            return list(range(size))
+        whole = [p for p in places if isinstance(p, int | np.integer) and 0 <= p < size]
+        if len(whole) != len(places) or not whole or len(set(whole)) != len(whole):
+            raise DeclarationError(
+                f"features of {self._who} are {short(places)}; give places from 0 to {size - 1}, "
+                "each once, or a function of observations"
+            )
+        return [int(p) for p in whole]
+
+
+def feature_maps(
+    space: gym.Space[Any],
+    features: Any,
+    sees: Sequence[Sequence[int] | None],
+    known: Array,
+    skills: Sequence[str],
+) -> list[FeatureMap]:
+    """Return the features of each skill.
+
+    Args:
+        features: for all skills, or by skill; None: what each skill sees.
+        sees: the places that each skill sees; None: all.
+        known: logged observations.
+        skills: names.
+    """
+    by_skill = features if isinstance(features, Mapping) else dict.fromkeys(skills, features)
+    for name in by_skill:
+        if name not in skills:
+            raise DeclarationError(
+                f"features= names {short(name)}, which is no skill of the log; its skills are: "
+                f"{', '.join(skills)}.{close_matches(str(name), skills)}"
+            )
+    maps: list[FeatureMap] = []
+    for name, places in zip(skills, sees, strict=True):
+        given = by_skill.get(name)
+        maps.append(FeatureMap(space, places if given is None else given, known, f"skill {name!r}"))
+    return maps
+
+
+def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, Array]:
+    """Return the ``count`` nearest points to each row of ``to``, each of another group.
+
+    Args:
+        points: (m, F) float32.
+        to: (n, F) float32.
+        count: how many.
+        group: (m,) the group of each point; of a group only the nearest point counts.
+
+    Returns:
+        Their rows (n, count) int64, the nearest first, and distances (n, count) float32. Where
+        there are fewer groups, the distance is infinite.
+    """
+    tries = min(len(points), count * AHEAD if len(np.unique(group)) < len(group) else count)
+    y, x = torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(to))
+    squares = (y * y).sum(1)[None]
+    rows = []
+    step = max(1, BLOCK // len(points))
+    for first in range(0, len(to), step):
+        far = torch.addmm(squares, x[first : first + step], y.T, alpha=-2.0)
+        rows.append(far.topk(tries, 1, largest=False).indices)
+    near = torch.cat(rows).numpy() if rows else np.zeros((0, tries), np.int64)
+    # Differences again: those of squares are wrong by rounding where points are near.
+    distance = np.sqrt(((points[near] - to[:, None]) ** 2).sum(2))
+    groups, each = group[near], np.arange(len(to))
+    chosen = np.zeros((len(to), count), np.int64)
+    far_away = np.full((len(to), count), np.inf, np.float32)
+    for k in range(min(count, tries)):
+        at = distance.argmin(1)
+        chosen[:, k], far_away[:, k] = near[each, at], distance[each, at]
+        distance[groups == groups[each, at][:, None]] = np.inf
+    return chosen, far_away
+
+
+def weights_of(distance: Array) -> Array:
+    """Return weights (…, K) of neighbours at these distances; they add up to 1."""
+    weights = 1.0 / (distance + SOFT)
+    normalised: Array = weights / weights.sum(-1, keepdims=True)
+    return normalised

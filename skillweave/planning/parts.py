@@ -1,0 +1,239 @@
+"""Parts of missions, and the machine that they compile to."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from skillweave.errors import DeclarationError
+from skillweave.planning.machine import MOST_STATES, Arrow, Counter, Plan, atom_of
+from skillweave.planning.predicates import Event, Held, Predicate
+
+DONE = "done"
+FAILED = "failed"
+MOST_TOGETHER = 6
+"""The most parts of one choice, or of one group in any order."""
+
+
+@dataclass(frozen=True)
+class InOrder:
+    """Parts that must be done one after another."""
+
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Parts of which one must be done."""
+
+    parts: tuple[Part, ...]
+
+
+@dataclass(frozen=True)
+class AnyOrder:
+    """Parts that must all be done, in any order."""
+
+    parts: tuple[Part, ...]
+
+
+Part = Event | InOrder | Choice | AnyOrder
+
+
+def sequence(parts: Sequence[Part]) -> Part:
+    """Return parts one after another; sequences among them are joined."""
+    flat: list[Part] = []
+    for part in parts:
+        flat += part.parts if isinstance(part, InOrder) else [part]
+    return flat[0] if len(flat) == 1 else InOrder(tuple(flat))
+
+
+@dataclass(frozen=True)
+class _Fragment:
+    """A machine in the making: state 0 is its start, the last one its end.
+
+    Args:
+        arrows: the arrows that leave each state but the last.
+        worth: of each state, from 0 to 1 at the end: the share that has been done.
+        waits: the events in words that each state waits for.
+        slots: counters side by side.
+    """
+
+    arrows: tuple[tuple[Arrow, ...], ...]
+    worth: tuple[float, ...]
+    waits: tuple[str, ...]
+    slots: int
+
+    @property
+    def end(self) -> int:
+        return len(self.arrows)
+
+
+def compile_mission(legs: Part, avoid: Sequence[Predicate], repeat: int | None) -> Plan:
+    """Return the parts of the machine of a mission."""
+    whole = sequence([legs] * (repeat or 1))
+    _check_successions(whole, again=repeat is None)
+    fragment = _fragment(whole)
+    end, names = fragment.end, _unique(fragment.waits)
+    done, failed = end, end + 1
+    arrows: list[Arrow] = []
+    for state, leaving in enumerate(fragment.arrows):
+        arrows += [Arrow(state, failed, (bad,)) for bad in avoid]
+        for arrow in leaving:
+            reward = fragment.worth[arrow.target] - fragment.worth[state]
+            target = 0 if repeat is None and arrow.target == end else arrow.target
+            keeps = arrow.keeps if arrow.target != end else frozenset[int]()
+            arrows.append(replace(arrow, target=target, reward=reward, keeps=keeps))
+    if repeat is None:  # the end is the start of the next round
+        if avoid:
+            arrows = [replace(a, target=end) if a.target == failed else a for a in arrows]
+            return Plan((*names, FAILED), 0, arrows, frozenset(), frozenset({end}))
+        return Plan(names, 0, arrows)
+    failing = frozenset({failed}) if avoid else frozenset[int]()
+    ends = (DONE, FAILED) if avoid else (DONE,)
+    return Plan((*names, *ends), 0, arrows, frozenset({done}), failing)
+
+
+def _unique(waits: Sequence[str]) -> tuple[str, ...]:
+    """Return names of states: what each waits for, with a number where two wait for the same."""
+    names: list[str] = []
+    for wait in waits:
+        name, number = wait, 2
+        while name in names or name in (DONE, FAILED):
+            name, number = f"{wait} #{number}", number + 1
+        names.append(name)
+    return tuple(names)
+
+
+def _fragment(part: Part) -> _Fragment:
+    if isinstance(part, InOrder):
+        return _in_sequence([_fragment(p) for p in part.parts])
+    if isinstance(part, Choice | AnyOrder):
+        return _together([_fragment(p) for p in part.parts], isinstance(part, Choice))
+    arrow = Arrow(0, 1, (atom_of(part, 0),))
+    return _Fragment(((arrow,),), (0.0, 1.0), (part.name,), int(isinstance(part, Held)))
+
+
+def _in_sequence(parts: Sequence[_Fragment]) -> _Fragment:
+    """Join the end of each fragment to the start of the next; all use the same counters."""
+    _check_size(sum(p.end for p in parts))
+    arrows: list[tuple[Arrow, ...]] = []
+    worth: list[float] = []
+    for i, part in enumerate(parts):
+        first = len(arrows)
+        for leaving in part.arrows:
+            arrows.append(
+                tuple(
+                    replace(
+                        a,
+                        origin=a.origin + first,
+                        target=a.target + first,
+                        # Counters that the next part uses start again.
+                        keeps=frozenset() if a.target == part.end else a.keeps,
+                    )
+                    for a in leaving
+                )
+            )
+        worth += [(i + w) / len(parts) for w in part.worth[:-1]]
+    waits = tuple(w for part in parts for w in part.waits)
+    return _Fragment(tuple(arrows), (*worth, 1.0), waits, max(p.slots for p in parts))
+
+
+def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
+    """Run fragments side by side, each with counters of its own, until one or all have ended."""
+    offsets = [0, *itertools.accumulate(p.slots for p in parts)]
+    start = (0,) * len(parts)
+    numbers = {start: 0}
+    queue, leaving = [start], list[list[tuple[tuple[int, ...], Arrow]]]()
+
+    def is_over(places: tuple[int, ...]) -> bool:
+        at_end = [at == p.end for at, p in zip(places, parts, strict=True)]
+        return any(at_end) if first_ends else all(at_end)
+
+    while len(leaving) < len(queue):
+        places = queue[len(leaving)]
+        leaving.append(list(_joint_arrows(places, parts, offsets)))
+        for target, _ in leaving[-1]:
+            if not is_over(target) and target not in numbers:
+                numbers[target] = len(queue)
+                queue.append(target)
+                _check_size(len(queue))
+    end = len(queue)
+    arrows = tuple(
+        tuple(
+            replace(a, origin=i, target=end if is_over(target) else numbers[target])
+            for target, a in some
+        )
+        for i, some in enumerate(leaving)
+    )
+    shares = [[p.worth[at] for at, p in zip(places, parts, strict=True)] for places in queue]
+    worth = [max(s) if first_ends else sum(s) / len(s) for s in shares]
+    word = " or " if first_ends else " and "
+    waits = tuple(
+        word.join(p.waits[at] for at, p in zip(places, parts, strict=True) if at < p.end)
+        for places in queue
+    )
+    return _Fragment(arrows, (*worth, 1.0), waits, offsets[-1])
+
+
+def _joint_arrows(
+    places: tuple[int, ...], parts: Sequence[_Fragment], offsets: Sequence[int]
+) -> Any:
+    """Yield (target, arrow) from a state of fragments side by side.
+
+    Several fragments may go on in the same step, so arrows of more fragments come first.
+    """
+    choices: list[list[Arrow | None]] = []
+    for at, part in zip(places, parts, strict=True):
+        choices.append([*(part.arrows[at] if at < part.end else ()), None])
+    combined = [c for c in itertools.product(*choices) if any(a is not None for a in c)]
+    combined.sort(key=lambda c: -sum(a is not None for a in c))
+    for arrows in combined:
+        atoms, keeps, target = [], set[int](), []
+        for i, (arrow, part) in enumerate(zip(arrows, parts, strict=True)):
+            own = range(offsets[i], offsets[i] + part.slots)
+            if arrow is None:
+                keeps.update(own)
+                target.append(places[i])
+                continue
+            atoms += [
+                replace(a, slot=a.slot + offsets[i]) if isinstance(a, Counter) else a
+                for a in arrow.atoms
+            ]
+            keeps.update(slot + offsets[i] for slot in arrow.keeps)
+            target.append(arrow.target)
+        yield tuple(target), Arrow(0, 0, tuple(atoms), 0.0, frozenset(keeps))
+
+
+def _check_size(states: int) -> None:
+    if states > MOST_STATES:
+        raise DeclarationError(
+            f"the mission has more than {MOST_STATES:,} states: repeat it less often, or combine "
+            "fewer sequences by 'and' or 'or'"
+        )
+
+
+def _check_successions(whole: Part, again: bool) -> None:
+    """Raise a DeclarationError where one visit would do two legs at once."""
+    parts = list(whole.parts) if isinstance(whole, InOrder) else [whole]
+    for a, b in itertools.pairwise([*parts, parts[0]] if again else parts):
+        if _is_one_visit(a, b):
+            raise DeclarationError(
+                f"the mission has {a.name!r} twice in a row, and one visit would do both; put a "
+                f"leg between them, ~{a.name} for example ('not {a.name}' in a text)"
+            )
+    for part in parts:
+        if isinstance(part, Choice | AnyOrder):
+            for inner in part.parts:
+                _check_successions(inner, again=False)
+
+
+def _is_one_visit(a: Part, b: Part) -> bool:
+    """Return whether one step would do both parts: the same predicate of observations.
+
+    A predicate of a step may mean a change, which does not happen twice.
+    """
+    if not isinstance(a, Predicate) or not isinstance(b, Predicate):
+        return False
+    return a.reads == b.reads == "obs" and a.function == b.function

@@ -1,0 +1,326 @@
+"""Planning on logged calls: a selector for a new task, without training."""
+
+from __future__ import annotations
+
+import json
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.collecting.guide import LastCall
+from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.errors import DeclarationError, RunError
+from skillweave.messages import short, whole_number
+from skillweave.notices import notice
+from skillweave.planning.calls import CallLog, columns_of
+from skillweave.planning.goal import Goal
+from skillweave.planning.graph import CallGraph, Near
+from skillweave.planning.lacking import check_possible, read_log
+from skillweave.planning.machine import RewardMachine
+from skillweave.planning.states import PlanningStates
+from skillweave.planning.task import Task, as_task
+from skillweave.planning.tried import Tried
+from skillweave.selectors.base import ReadySelector
+from skillweave.skills.foreign_policy import checksum
+from skillweave.types import Array, Memory, Step
+
+MOST_GOALS = 256
+"""Goals whose plans are kept."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A solved task."""
+
+    worth: Array
+    """(P, M) float32, of each piece of a logged call from each planning state."""
+    sweeps: int
+    """Sweeps of value iteration."""
+
+
+@checked_names
+class Planner(ReadySelector):
+    """A selector that plans a task on logged calls; nothing is trained.
+
+    ```python
+    import numpy as np
+
+    from skillweave.planning import Mission, Planner, record_calls
+
+
+    def right(obs):
+        return obs[:, 0] > 0.5
+
+
+    def left(obs):
+        return obs[:, 0] < -0.5
+
+
+    def plan(run):
+        log = record_calls(run.hierarchy.spec, run.policy, steps=20_000)
+        return Planner(log, Mission(right, left), skills=run.policy)
+    ```
+
+    The value of a call is what it pays by the task, judged over the steps inside it, and what
+    follows at its end: the best choice there, by the K nearest logged calls of each choice. At a
+    decision the choice is best whose nearest calls are worth most. Calls of the running episode
+    count as well, so a call that failed is not repeated forever.
+
+    Args:
+        log: calls of these skills in this environment.
+        task: a ``Mission`` or its text, a ``RewardMachine``, a ``Goal``, a predicate, or a function
+            of a ``Step`` that returns the reward.
+        predicates: by name, for a text.
+        skills: a policy with the skills, or its ``SkillSet``; the log is compared with them. None:
+            nothing is compared, and initiation sets are those that were recorded.
+        features: by what calls are near one another: places in the flat observation, or a function
+            of observations (n, …) to (n, F); or a dict of these by skill. None: what each skill
+            sees. They are standardised by the log.
+        neighbours: K.
+        gamma: γ of one step.
+        caution: the share by which a value falls for each unit of distance to the nearest call.
+        temperature: choices are sampled by exp(Q / (temperature · the largest |Q|)); 0: the best is
+            chosen.
+
+    Raises:
+        DeclarationError: an argument is wrong, or features are constant or not finite.
+        RunError: the log is of other skills, has too few calls, or no step of it does what the task
+            needs; the message says which skill comes nearest.
+    """
+
+    kind = "planner"
+
+    def __init__(
+        self,
+        log: CallLog,
+        task: Any,
+        *,
+        predicates: Mapping[str, Any] | None = None,
+        skills: Any = None,
+        features: Any = None,
+        neighbours: int = 5,
+        gamma: float = 0.999,
+        caution: float = 0.05,
+        temperature: float = 0.0,
+    ) -> None:
+        super().__init__("planner")
+        _check_number("gamma", gamma, 0.0, 1.0)
+        _check_number("caution", caution, 0.0, 10.0)
+        _check_number("temperature", temperature, 0.0, 10.0)
+        if not isinstance(log, CallLog):
+            raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
+        self.log, self.task = log, as_task(task, predicates)
+        self.graph = CallGraph(
+            log,
+            features,
+            whole_number(neighbours, "Planner: neighbours", 1),
+            _skill_set(log, skills),
+        )
+        self._gamma, self._caution, self._temperature = gamma, caution, temperature
+        self._tried = Tried(self.graph)
+        self._plans: OrderedDict[bytes, Plan] = OrderedDict()
+        self._own_end = _own_end(self.task, self.graph)
+        self._machine = self.task.own() if isinstance(self.task, Goal) else self.task
+        self._states = PlanningStates(self._machine)
+        for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
+            if not known:
+                notice(f"the log has no call of {name!r}, so the planner never calls it")
+        if any(log.recurrent):
+            names = ", ".join(n for n, r in zip(log.skills, log.recurrent, strict=True) if r)
+            notice(
+                f"these skills have a memory: {names}. The planner compares their calls by "
+                "observations alone"
+            )
+        if isinstance(self.task, RewardMachine):
+            self._plan = self._solve(self.task)
+        elif self.task.goal is not None:
+            self._plan_of(self.task.goal)
+
+    # Planning
+
+    def _solve(self, task: RewardMachine, place: Array | None = None) -> Plan:
+        """Plan a task; ``place`` is its goal, if it is one."""
+        graph = self.graph
+        readings = read_log(task, self.graph.log)
+        check_possible(task, readings, self.graph.log)
+        near, may = graph.after, graph.may
+        if place is not None and isinstance(self.task, Goal):
+            near, may = graph.for_goal(self.task, place)
+        judged = graph.judge(task, self._states, readings, self._gamma, self._own_end)
+        worth, sweeps = graph.solve(judged, near, may, caution=self._caution)
+        return Plan(worth, sweeps)
+
+    def _plan_of(self, goal: Array) -> Plan:
+        """Return the plan of a goal (G,), solved when it is first needed."""
+        assert isinstance(self.task, Goal)
+        key = np.asarray(goal, np.float64).tobytes()
+        if key in self._plans:
+            self._plans.move_to_end(key)
+        else:
+            self._plans[key] = self._solve(self.task.at(goal), goal)
+            if len(self._plans) > MOST_GOALS:
+                self._plans.popitem(last=False)
+        return self._plans[key]
+
+    def values(self, obs: Array, state: Array | None = None) -> Array:
+        """Return the value of each choice in observations, (n, choices) float32.
+
+        Args:
+            obs: (n, *obs_shape).
+            state: (n, 1 + H) of the task; None: its start.
+
+        Returns:
+            Values; −infinity for choices of which the log has no call.
+        """
+        state = self._machine.start(len(obs)) if state is None else state
+        return self._values(self.graph.near(obs), obs, state)
+
+    def _values(self, near: Near, obs: Array, state: Array) -> Array:
+        if not isinstance(self.task, Goal):
+            return self._values_in(self._plan, near, state)
+        goals = self.task.of(obs)
+        values = np.empty((len(obs), self.log.choices), np.float32)
+        unique, which = np.unique(goals, axis=0, return_inverse=True)
+        for i, goal in enumerate(unique):
+            rows = np.flatnonzero(which.reshape(-1) == i)
+            values[rows] = self._values_in(self._plan_of(goal), near.take(rows), state[rows])
+        return values
+
+    def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
+        place, share = self._states.corners(state)
+        # (n, choices, K, J): the worth of each neighbour at each corner.
+        worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
+        q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
+        q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
+        return np.where(self.graph.known, q, -np.inf).astype(np.float32)
+
+    # A ready selector
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """Return a copy that chooses among the skills of these names.
+
+        Raises:
+            RunError: the log is of other skills.
+        """
+        if tuple(skills) != self.log.skills:
+            raise RunError(
+                f"the planner's log is of the skills {', '.join(self.log.skills)}, but the "
+                f"hierarchy has {', '.join(skills)}; record a log of these skills"
+            )
+        return super().among(skills)
+
+    def bind(
+        self, observation_space: gym.Space[Any], action_space: gym.Space[Any], who: str
+    ) -> Self:
+        """Return a copy for these spaces; ``who`` begins messages.
+
+        Raises:
+            RunError: the log has other observations.
+        """
+        self.log.check_spaces(observation_space, self.log.action_space)
+        return super().bind(observation_space, action_space, who)
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of ``n`` environments: the task's state, and no call so far."""
+        state = self._machine.start(n)
+        return {"state": state[:, 0], "counters": state[:, 1:], **self._tried.start(n)}
+
+    @property
+    def ranges(self) -> dict[str, range]:
+        """Return the range of the task's states."""
+        return {"state": range(len(self._machine.state_names))}
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` (n, choices) allows."""
+        may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
+        features = [each(obs) for each in self.graph.maps]
+        near, state = self.graph.near_features(features), _state(memory)
+        logged, place = self._values(near, obs, state), self._states.place(state)
+        seen = self._tried.padded(features)
+        memory = memory | self._tried.end(memory, seen, logged, near, place, may)
+        q = self._tried.corrected(memory, seen, logged, near, place)
+        choice = self._choose(q, may, rng)
+        return choice, memory | self._tried.begin(memory, seen, choice, place)
+
+    def _choose(self, q: Array, may: Array, rng: np.random.Generator | None) -> Array:
+        """Return the best choices, or samples."""
+        score = np.where(may, np.maximum(q, -1e30), -np.inf)  # one without a call comes last
+        if self._temperature:
+            largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max(1, keepdims=True)
+            score = score / (self._temperature * np.maximum(largest, 1e-12))
+            score = score + (rng or np.random.default_rng()).gumbel(size=q.shape)
+        choice: Array = score.argmax(1)
+        return choice
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Return the memory after a ``step``: the task's state goes on."""
+        after, reward, _ = self._machine.step(_state(memory), step)
+        changed = {"state": after[:, 0], "counters": after[:, 1:]}
+        return memory | changed | self._tried.pay(memory, reward, self._gamma)
+
+    def source(self) -> dict[str, Any]:
+        """Return the checksum of its log, with the names of its task's states."""
+        digest = [
+            checksum(np.ascontiguousarray(x).tobytes()) for x in columns_of(self.log).values()
+        ]
+        about = [digest, self._machine.state_names, self._gamma, self._caution, self._temperature]
+        whole = json.dumps(about)
+        return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+
+def _state(memory: Memory) -> Array:
+    """Return the task's state in a memory, (n, 1 + H)."""
+    return np.concatenate([memory["state"][:, None], memory["counters"]], 1)
+
+
+def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
+    """Return the skills, compared with the log; None: none were given."""
+    if skills is None:
+        return None
+    skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
+    if skill_set is None:
+        raise DeclarationError(
+            f"Planner: skills is {short(skills)}; give a policy with skills: run.policy"
+        )
+    log.check_skills(skill_set)
+    return skill_set
+
+
+def _own_end(task: Task, graph: CallGraph) -> Array | None:
+    """Return the ends after which nothing follows, (E,) bool; None: where the episode terminated.
+
+    An episode that ended at its own goal would go on there for another one.
+    """
+    if not isinstance(task, Goal) or task.columns is None:
+        return None
+    over: Array = graph.terminated.copy()
+    rows = np.flatnonzero(over)
+    own = task.of(graph.log.start[graph.end_call[rows]])
+    over[rows] = ~task.holds(graph.end[rows], own)
+    return over
+
+
+def _known_skills(graph: CallGraph) -> list[bool]:
+    """Return whether the log has a call of each skill."""
+    return [bool(graph.known[graph.skill_of == i].any()) for i in range(len(graph.log.skills))]
+
+
+def _check_number(name: str, value: Any, low: float, high: float) -> None:
+    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
+    if not real or not low <= value <= high:
+        raise DeclarationError(
+            f"Planner: {name} is {short(value)}; it must be from {low:g} to {high:g}"
+        )

@@ -1,0 +1,224 @@
+"""Predicates: named yes-or-no functions of observations or steps, of which tasks are made."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from skillweave.arguments import checked_names
+from skillweave.errors import DeclarationError
+from skillweave.messages import short, whole_number
+from skillweave.selectors.base import function_name
+from skillweave.skills import Skill
+from skillweave.skills.answers import answer
+from skillweave.types import Array, Step
+
+Reads = Literal["obs", "step"]
+LONGEST_HOLD = 100_000
+"""The most steps of ``held``: no episode is longer."""
+
+
+@checked_names
+class Predicate:
+    """A named yes-or-no function, evaluated after every step.
+
+    Combine predicates with ``&``, ``|`` and ``~``.
+
+    Args:
+        function: of observations (n, *obs_shape), which are those after the step, or of a ``Step``;
+            it returns (n,) bool.
+        name: used in messages and texts; default: the function's name.
+        reads: "obs" or "step", the function's argument. None: "step" if its first argument is
+            named ``step`` or annotated ``Step``, else "obs".
+
+    Raises:
+        DeclarationError: it is not a function, or ``reads`` is another word.
+    """
+
+    def __init__(
+        self, function: Callable[[Any], Any], name: str = "", reads: Reads | None = None
+    ) -> None:
+        if not callable(function) or isinstance(function, type):
+            raise DeclarationError(
+                f"a predicate is {short(function)}; give a function of observations or of a step"
+            )
+        if reads not in (None, "obs", "step"):
+            raise DeclarationError(
+                f"a predicate's reads is {short(reads)}; it must be 'obs' or 'step'"
+            )
+        self.function = function
+        self.name = name or function_name(function)
+        self.reads: Reads = reads or _argument(function)
+
+    def __repr__(self) -> str:
+        return f"<Predicate {self.name!r} of {self.reads}>"
+
+    def __and__(self, other: Any) -> Predicate:
+        return _joined(self, other, "and", np.logical_and)
+
+    def __or__(self, other: Any) -> Predicate:
+        return _joined(self, other, "or", np.logical_or)
+
+    def __invert__(self) -> Predicate:
+        if self.reads == "obs":
+            return Predicate(lambda obs: ~self.at(obs), f"not {self.name}", "obs")
+        return Predicate(lambda step: ~self.holds(step), f"not {self.name}", "step")
+
+    def holds(self, step: Step) -> Array:
+        """Return where the predicate is true after a ``step``, (n,) bool.
+
+        Raises:
+            SkillError: the function failed, or returned another shape or type.
+        """
+        if self.reads == "obs":
+            return self.at(step.next_obs)
+        return answer(self.function, step, len(step.reward), bool, "task", self.name, step.elapsed)
+
+    def at(self, obs: Array) -> Array:
+        """Return where a predicate of observations is true, (n,) bool, for ``obs`` (n, …).
+
+        Raises:
+            DeclarationError: the predicate reads steps.
+            SkillError: the function failed, or returned another shape or type.
+        """
+        if self.reads != "obs":
+            raise DeclarationError(
+                f"the predicate {self.name!r} reads a step, but only an observation is known here"
+            )
+        return answer(self.function, obs, len(obs), bool, "task", self.name)
+
+
+@dataclass(frozen=True)
+class Held:
+    """The event that a predicate has been true in each of the latest ``steps`` steps."""
+
+    predicate: Predicate
+    steps: int
+
+    @property
+    def name(self) -> str:
+        """The event in words."""
+        return f"{self.predicate.name} for {self.steps} steps"
+
+    def __and__(self, other: Any) -> Any:
+        raise self._not_combined()
+
+    __rand__ = __or__ = __ror__ = __and__
+
+    def __invert__(self) -> Any:
+        raise self._not_combined()
+
+    def _not_combined(self) -> DeclarationError:
+        return DeclarationError(
+            f"held({self.predicate.name}, {self.steps}) cannot be combined with &, | or ~; combine "
+            "predicates inside it: held(a & b, 100)"
+        )
+
+
+Event = Predicate | Held
+
+
+@checked_names
+def held(predicate: Any, steps: int) -> Event:
+    """Return the event that a predicate has been true for a number of steps without a gap.
+
+    The steps count from the moment at which the task waits for the event.
+
+    Args:
+        predicate: a ``Predicate``, or a function of observations or of a step.
+        steps: at least 1.
+
+    Raises:
+        DeclarationError: the predicate is no function, or the number is not whole.
+    """
+    predicate = as_predicate(predicate, "held()")
+    steps = whole_number(steps, "held(): steps", 1)
+    if steps > LONGEST_HOLD:
+        raise DeclarationError(
+            f"held(): steps is {steps:,}; an episode has at most {LONGEST_HOLD:,} steps"
+        )
+    return predicate if steps == 1 else Held(predicate, steps)
+
+
+def as_predicate(value: Any, where: str) -> Predicate:
+    """Convert a predicate, or a function, to a ``Predicate``; ``where`` begins messages."""
+    if isinstance(value, Predicate):
+        return value
+    if isinstance(value, Held):
+        raise DeclarationError(
+            f"{where}: {value.name} is an event over several steps; give a predicate"
+        )
+    if not callable(value) or isinstance(value, type):
+        raise DeclarationError(
+            f"{where}: {short(value)} is no predicate; give a function of observations or of a step"
+        )
+    return Predicate(value)
+
+
+def as_event(value: Any, where: str) -> Event:
+    """Convert a predicate, a function or ``held(...)`` to an event; ``where`` begins messages."""
+    return value if isinstance(value, Held) else as_predicate(value, where)
+
+
+def named_predicates(values: Mapping[str, Any], where: str) -> dict[str, Event]:
+    """Return events by the names under which a text refers to them."""
+    if not isinstance(values, Mapping):
+        raise DeclarationError(
+            f"{where}: the predicates are {short(values)}; give a dict by name: {{'left': is_left}}"
+        )
+    named: dict[str, Event] = {}
+    for name, value in values.items():
+        event = as_event(value, f"{where}: {short(name)}")
+        if not isinstance(name, str) or not re.fullmatch(r"[^\W\d][\w-]*", name):
+            raise DeclarationError(
+                f"{where}: a predicate is named {short(name)}; a name is one word that begins with "
+                "a letter"
+            )
+        if isinstance(event, Predicate) and event.name != name:
+            event = Predicate(event.function, name, event.reads)
+        named[name] = event
+    return named
+
+
+@checked_names
+def successes(skills: Iterable[Skill]) -> dict[str, Predicate]:
+    """Return the ``success`` of each skill that defines it, as predicates by the skills' names.
+
+    Args:
+        skills: of a hierarchy, ``hierarchy.skills``.
+
+    Returns:
+        Predicates of a step, for ``Mission.from_text`` and for hand-over matrices.
+    """
+    return {
+        skill.name: Predicate(skill.success, skill.name, "step")
+        for skill in skills
+        if skill.defines("success")
+    }
+
+
+def _joined(
+    a: Predicate, other: Any, word: str, join: Callable[[Array, Array], Array]
+) -> Predicate:
+    b = as_predicate(other, f"{a.name} {word} …")
+    name = f"({a.name} {word} {b.name})"
+    if a.reads == b.reads == "obs":
+        return Predicate(lambda obs: join(a.at(obs), b.at(obs)), name, "obs")
+    return Predicate(lambda step: join(a.holds(step), b.holds(step)), name, "step")
+
+
+def _argument(function: Callable[[Any], Any]) -> Reads:
+    """Return what a function reads, by the name or annotation of its first argument."""
+    try:
+        first = next(iter(inspect.signature(function).parameters.values()), None)
+    except (TypeError, ValueError):
+        return "obs"
+    if first is None:
+        return "obs"
+    annotated = first.annotation in (Step, "Step", "sw.Step", "skillweave.Step")
+    return "step" if first.name == "step" or annotated else "obs"

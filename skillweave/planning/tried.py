@@ -1,0 +1,162 @@
+"""The calls of a running episode, which count beside the logged ones when a plan acts.
+
+A call that failed would else be chosen again and again: it is not in the log. Stands alone because
+it is a memory, and planning is a function of the log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from skillweave.planning.graph import CallGraph, Near
+from skillweave.planning.neighbours import SOFT
+from skillweave.types import Array, Memory
+
+LATEST = 8
+"""The calls of an episode that are remembered."""
+
+
+class Tried:
+    """The latest calls of n episodes, as arrays of a selector's memory.
+
+    Each has the choice, the features of its start (for its skill), those of its end (for every
+    skill), what it paid, γ^τ, the task's planning states before and after it, and what the log says
+    at its end.
+
+    Args:
+        graph: the logged calls.
+    """
+
+    def __init__(self, graph: CallGraph) -> None:
+        self._skill_of, self._choices = graph.skill_of, graph.log.choices
+        self._skills = len(graph.maps)
+        self._size = max(each.size for each in graph.maps)
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of ``n`` episodes without a call."""
+        calls = (n, LATEST)
+        return {
+            "tried.count": np.zeros(n, np.int64),
+            "tried.choice": np.full(calls, -1),
+            "tried.start": np.zeros((*calls, self._size), np.float32),
+            "tried.end": np.zeros((*calls, self._skills, self._size), np.float32),
+            "tried.reward": np.zeros(calls),
+            "tried.discount": np.ones(calls),
+            "tried.from": np.full(calls, -1),
+            "tried.to": np.full(calls, -1),
+            "tried.q": np.zeros((*calls, self._choices), np.float32),
+            "tried.total": np.zeros((*calls, self._choices), np.float32),
+            "tried.may": np.zeros((*calls, self._choices), bool),
+        }
+
+    def padded(self, features: list[Array]) -> Array:
+        """Return the features of each skill, (n, F) each, as one array (n, S, F)."""
+        whole = np.zeros((len(features[0]), self._skills, self._size), np.float32)
+        for skill, some in enumerate(features):
+            whole[:, skill, : some.shape[1]] = some
+        return whole
+
+    def begin(self, memory: Memory, features: Array, choice: Array, place: Array) -> Memory:
+        """Add the calls that were chosen, (n,), in the task's planning states ``place`` (n,)."""
+        rows, slot = np.arange(len(choice)), memory["tried.count"] % LATEST
+        new = {
+            "tried.choice": choice,
+            "tried.start": features[rows, self._skill_of[choice]],
+            "tried.reward": 0.0,
+            "tried.discount": 1.0,
+            "tried.from": place,
+            "tried.to": -1,
+        }
+        return _put(memory, new, rows, slot) | {"tried.count": memory["tried.count"] + 1}
+
+    def pay(self, memory: Memory, reward: Array, gamma: float) -> Memory:
+        """Add a step's rewards (n,) of the task to the running calls."""
+        rows, slot = np.arange(len(reward)), (memory["tried.count"] - 1) % LATEST
+        discount = memory["tried.discount"][rows, slot]
+        new = {
+            "tried.reward": memory["tried.reward"][rows, slot] + discount * reward,
+            "tried.discount": discount * gamma,
+        }
+        return _put(memory, new, rows, slot)
+
+    def end(
+        self, memory: Memory, features: Array, q: Array, near: Near, place: Array, may: Array
+    ) -> Memory:
+        """Complete the latest calls, where they end in an observation.
+
+        Args:
+            features: (n, S, F) of the observation.
+            q: (n, choices), what the log says there.
+            near: the nearest logged calls.
+            place: (n,) planning states of the task.
+            may: (n, choices) bool, what may be chosen.
+        """
+        slot = (memory["tried.count"] - 1) % LATEST
+        rows = np.flatnonzero(memory["tried.count"] > 0)
+        new = {
+            "tried.end": features[rows],
+            "tried.to": place[rows],
+            "tried.q": q[rows],
+            "tried.total": near.total[rows],
+            "tried.may": may[rows],
+        }
+        return _put(memory, new, rows, slot[rows])
+
+    def corrected(
+        self, memory: Memory, features: Array, q: Array, near: Near, place: Array
+    ) -> Array:
+        """Return values (n, choices) for which the episode's own calls count as logged ones.
+
+        Args:
+            features: (n, S, F) of the present observation.
+            q: (n, choices), what the log says there.
+            near: the nearest logged calls.
+            place: (n,) planning states of the task.
+        """
+        choice, n = memory["tried.choice"], len(q)
+        # Ends of calls, and last the present: there values are wanted.
+        where = np.concatenate([memory["tried.end"], features[:, None]], 1)
+        states = np.concatenate([memory["tried.to"], place[:, None]], 1)
+        same = (states[:, :, None] == memory["tried.from"][:, None]) & (choice >= 0)[:, None]
+        if not same[:, -1].any():
+            return q
+        skill = self._skill_of[np.maximum(choice, 0)]
+        to = where[np.arange(n)[:, None], :, skill].swapaxes(1, 2)  # (n, ends, calls, F)
+        far = np.sqrt(np.square(to - memory["tried.start"][:, None]).sum(3))
+        weight = np.where(same, 1.0 / (far + SOFT), 0.0)
+        one_hot = choice[:, :, None] == np.arange(self._choices)
+        own = np.einsum("nec,nck->nek", weight, one_hot)
+        logged = np.concatenate([memory["tried.q"], q[:, None]], 1)
+        total = np.concatenate([memory["tried.total"], near.total[:, None]], 1)
+        known = np.isfinite(logged)
+        total = np.where(known, total, 0.0)
+        base = np.where(known, logged, 0.0) * total
+        both = np.where(known | (own > 0), np.maximum(total + own, 1e-12), np.inf)
+        missing = ~known & (own <= 0)
+        may = memory["tried.may"]
+        value = _best(logged[:, :-1], may)
+        for _ in range(LATEST):
+            y = memory["tried.reward"] + memory["tried.discount"] * value
+            q_all = (base + np.einsum("nec,nck->nek", weight * y[:, None], one_hot)) / both
+            q_all = np.where(missing, -np.inf, q_all)
+            value = _best(q_all[:, :-1], may)
+        corrected: Array = q_all[:, -1].astype(np.float32)
+        return corrected
+
+
+def _best(q: Array, may: Array) -> Array:
+    """Return the largest value among what may be chosen, (n, calls); 0 where nothing is known."""
+    best = np.where(may, q, -np.inf).max(-1)
+    return np.where(np.isfinite(best), best, 0.0)
+
+
+def _put(memory: Memory, values: Mapping[str, Any], rows: Array, slot: Array) -> Memory:
+    """Return copies of some of a memory's arrays, with values in one slot of each row."""
+    changed: Memory = {}
+    for name, value in values.items():
+        changed[name] = memory[name].copy()
+        changed[name][rows, slot] = value
+    return changed

@@ -1,0 +1,322 @@
+"""Logs of calls: recorded, against a loop by hand; saved, damaged, joined."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from ready_selectors.chain import (
+    DOOR,
+    KEY,
+    LAST,
+    NAMES,
+    PLACE,
+    SPEC,
+    Corridor,
+    GetKey,
+    Leave,
+    OpenDoor,
+    Wait,
+    hierarchy,
+)
+
+from skillweave import Automaton, EnvSpec, Lengths
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import DeclarationError, EnvError, RunError
+from skillweave.planning import CallLog, join, record_calls
+from skillweave.planning.calls import columns_of
+from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.skills import Skill
+from skillweave.skills.scripted import ScriptedPolicy
+
+SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
+
+
+def skill_set(**how: Any) -> SkillSet:
+    return SkillSet(SKILLS, tuple(s.policy for s in SKILLS), **how)
+
+
+@pytest.fixture(scope="module")
+def log() -> CallLog:
+    return record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=3, info=["door"])
+
+
+def by_hand(obs: Any, skill: int, age: int, most: int) -> list[Any]:
+    """The steps of one call in the corridor: observations; and why it ended."""
+    place, key, door = (int(x) for x in obs)
+    move = (-1, 1, 1, 0)[skill]
+    limit = min(most, (most, 12, 1, 2)[skill])
+    found: list[Any] = []
+    for t in range(1, limit + 1):
+        place = max(0, min(place + move, LAST + door))
+        key |= place == 0
+        door |= place == LAST and key
+        found.append((place, key, door))
+        over = place > LAST
+        if over or age + t == 40:
+            return [found, CallEnd.EPISODE, over, not over]
+        if (skill == 0 and key) or (skill == 1 and place == LAST):
+            return [found, CallEnd.OWN, False, False]
+    return [found, CallEnd.LIMIT, False, False]
+
+
+def test_every_call_is_that_of_a_loop_by_hand(log: CallLog) -> None:
+    ages: dict[int, int] = {}
+    ends: dict[int, Any] = {}
+    orders: dict[int, int] = {}
+    for c in range(len(log)):
+        episode, skill = int(log.episode[c]), int(log.skill[c])
+        assert log.order[c] == orders.setdefault(episode, 0)
+        orders[episode] += 1
+        if episode in ends:
+            assert (log.start[c] == ends[episode]).all()
+        else:
+            assert log.start[c, KEY] == 0
+        steps, why, terminated, truncated = by_hand(log.start[c], skill, ages.get(episode, 0), 5)
+        inside = log.next_obs[log.offset[c] : log.offset[c + 1]]
+        assert inside.tolist() == [list(map(float, s)) for s in steps]
+        assert log.end_reason[c] == why
+        assert (log.terminated[c], log.truncated[c]) == (terminated, truncated)
+        assert log.age[c] == ages.get(episode, 0)
+        ages[episode] = ages.get(episode, 0) + len(steps)
+        ends[episode] = log.end[c]
+        won = steps[-1][DOOR] == 1 if skill == 1 else why == CallEnd.OWN
+        assert log.succeeded[c] == won
+        assert log.may_follow[c].tolist() == [True, bool(log.end[c, KEY]), True, True]
+        action = log.action[log.offset[c] : log.offset[c + 1]]
+        assert set(action.tolist()) == {(0, 2, 2, 1)[skill]}
+    assert sum(log.terminated) == log.reward.sum() > 0
+    assert (log.info["door"] == log.next_obs[:, DOOR]).all()
+    assert set(log.skill) == {0, 1, 2, 3}
+    assert 600 <= log.steps < 600 + 4 * 5
+    assert np.unique(log.episode).tolist() == list(range(log.episode.max() + 1))
+
+
+def test_what_follows_from_the_columns(log: CallLog) -> None:
+    assert log.tau.sum() == log.steps == log.offset[-1]
+    following = log.followed_by
+    for c in range(len(log)):
+        later = np.flatnonzero((log.episode == log.episode[c]) & (log.order == log.order[c] + 1))
+        assert following[c] == (later[0] if len(later) else -1)
+    gamma = 0.9
+    wanted = [
+        sum(gamma**k * r for k, r in enumerate(log.reward[a:b]))
+        for a, b in zip(log.offset[:-1], log.offset[1:], strict=True)
+    ]
+    np.testing.assert_allclose(log.returns(gamma), wanted)
+    step = log.as_steps()
+    assert (step.obs[log.offset[:-1]] == log.start).all()
+    inner = np.setdiff1d(np.arange(log.steps), log.offset[:-1])
+    assert (step.obs[inner] == log.next_obs[inner - 1]).all()
+    assert step.terminated.sum() == log.terminated.sum()
+    assert (step.elapsed[log.offset[1:] - 1] == log.age + log.tau).all()
+    assert (log.elapsed[log.offset[1:] - 1] == log.tau).all()
+    some = log.take(np.array([5, 2]))
+    assert some.steps == log.tau[5] + log.tau[2]
+    assert (some.end == log.end[[5, 2]]).all()
+    assert (some.as_steps().obs[0] == log.start[5]).all()
+    assert (log.of("wait").skill == 3).all()
+    part = log.within(200)
+    assert part.steps <= 200 < part.steps + log.tau[len(part)]
+    assert log.latest(100).offset[-1] <= 100
+    assert log.latest(100).episode[-1] == log.episode[-1]
+    assert repr(log.take(np.array([0]))).startswith("<CallLog: 1 calls (")
+
+
+def test_the_same_seed_gives_the_same_log(log: CallLog) -> None:
+    again = record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=3, info=["door"])
+    other = record_calls(SPEC, skill_set(call_steps=5), 600, num_envs=4, seed=4, info=["door"])
+    for name, column in columns_of(log).items():
+        assert np.array_equal(column, columns_of(again)[name]), name
+    assert not np.array_equal(log.choice[:50], other.choice[:50])
+
+
+def test_calls_of_a_selector_and_of_chosen_lengths() -> None:
+    chain = Automaton(
+        {"search": "get_key", "unlock": "open_door", "free": "leave"},
+        {
+            ("search", "unlock"): lambda step: step.next_obs[:, KEY] == 1,
+            ("unlock", "free"): "success",
+        },
+    )
+    made = record_calls(SPEC, hierarchy(chain), 60, choose=chain, num_envs=2)
+    assert [NAMES[s] for s in made.skill[made.episode == 0]] == ["get_key", "open_door", "leave"]
+    lengths = skill_set(call_steps=Lengths(1, 3))
+    made = record_calls(SPEC, lengths, 300, num_envs=3)
+    assert made.lengths == (1, 3)
+    assert made.choices == 8
+    assert made.may_follow.shape == (len(made), 8)
+    limited = made.end_reason == CallEnd.LIMIT
+    assert (made.tau[limited & (made.skill == 0)] == np.array([1, 3])[
+        made.choice[limited & (made.skill == 0)] % 2]).all()  # fmt: skip
+    assert set(made.choice) == set(range(8))
+
+
+def test_a_call_that_the_time_limit_cut() -> None:
+    class Stay(Wait):
+        max_steps = 7
+
+    made = record_calls(SPEC, SkillSet((Stay(),), (Stay.policy,)), 80, num_envs=1)
+    assert made.tau.tolist() == [7, 7, 7, 7, 7, 5] * 2
+    assert made.was_cut.tolist() == ([False] * 5 + [True]) * 2
+    assert made.truncated.tolist() == made.was_cut.tolist()
+
+
+class Pair(gym.Env):
+    """Observations are a Dict, actions a Box."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "place": gym.spaces.Box(-9, 9, (2,), np.float32),
+            "picture": gym.spaces.Box(0, 255, (4, 4, 1), np.uint8),
+        }
+    )
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place, self.t = np.zeros(2, np.float32), 0
+        return self.seen(), {}
+
+    def seen(self) -> Any:
+        return {"place": self.place.copy(), "picture": np.full((4, 4, 1), self.t, np.uint8)}
+
+    def step(self, action: Any) -> Any:
+        self.place, self.t = self.place + action, self.t + 1
+        return self.seen(), 0.5, False, self.t == 7, {}
+
+
+def test_a_log_is_saved_and_read(log: CallLog, tmp_path: Any) -> None:
+    class Move(Skill):
+        max_steps = 3
+        policy = ScriptedPolicy(
+            lambda obs: np.full((len(obs), 2), 0.25, np.float32),
+            Pair.observation_space,
+            Pair.action_space,
+        )
+
+    spec, moves = EnvSpec(Pair, engine="sync"), SkillSet((Move(),), (Move.policy,))
+    pairs = record_calls(spec, moves, 40, num_envs=2)
+    assert pairs.next_obs["place"].max() == 1.75
+    for i, made in enumerate((log, pairs, record_calls(SPEC, skill_set(), 1))):
+        made.save(tmp_path / f"{i}.safetensors")
+        read = CallLog.load(str(tmp_path / f"{i}.safetensors"))
+        assert (read.skills, read.lengths, read.checksums) == (
+            made.skills, made.lengths, made.checksums,
+        )  # fmt: skip
+        assert read.observation_space == made.observation_space
+        for name, column in columns_of(made).items():
+            other = columns_of(read)[name]
+            assert column.dtype == other.dtype
+            assert np.array_equal(column, other), name
+
+
+DAMAGE = {
+    "offset": (lambda x: x[::-1].copy(), "'offset' is out of range"),
+    "choice": (lambda x: x + 4, "'choice' is out of range"),
+    "end_reason": (lambda x: x * 0, "'end_reason' is out of range"),
+    "order": (lambda x: x - 1, "'order' is out of range"),
+    "reward": (lambda x: x * np.nan, "'reward' is not finite"),
+    "start": (lambda x: x * np.inf, "'start' is not finite"),
+    "next_obs": (lambda x: x[:-1], "'next_obs' is float32"),
+    "succeeded": (lambda x: x.astype(np.int8), "'succeeded' is int8"),
+    "may_follow": (lambda x: x[:, :2].copy(), "'may_follow' is bool"),
+    "info.door": (lambda x: x[:3], "'info.door' is"),
+    "terminated": (lambda x: None, "it has the columns"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_file_is_refused(log: CallLog, tmp_path: Any, name: str) -> None:
+    import torch
+
+    damage, message = DAMAGE[name]
+    path = tmp_path / "log.safetensors"
+    log.save(path)
+    tensors, header = read_tensors(path)
+    changed = damage(tensors[name].numpy())
+    tensors = {k: v for k, v in tensors.items() if k != name}
+    if changed is not None:
+        tensors[name] = torch.from_numpy(changed)
+    write_tensors(path, tensors, header)
+    with pytest.raises(RunError, match=f"log.safetensors is damaged: {message}"):
+        CallLog.load(path)
+
+
+def test_other_files_are_refused(log: CallLog, tmp_path: Any) -> None:
+    path = tmp_path / "log.safetensors"
+    with pytest.raises(RunError, match="does not exist"):
+        CallLog.load(path)
+    path.write_bytes(b"PK")
+    with pytest.raises(RunError, match="damaged"):
+        CallLog.load(path)
+    write_tensors(path, {}, {"kind": "agent"})
+    with pytest.raises(RunError, match="no log of calls"):
+        CallLog.load(path)
+    log.save(path)
+    tensors, header = read_tensors(path)
+    for key, value in (("lengths", [0]), ("skills", ["a", "a", "b", "c"]), ("checksums", [])):
+        write_tensors(path, tensors, header | {key: value})
+        with pytest.raises(RunError, match=r"log\.safetensors"):
+            CallLog.load(path)
+
+
+def test_logs_are_joined(log: CallLog) -> None:
+    other = record_calls(SPEC, skill_set(call_steps=5), 100, num_envs=4, info=["door"])
+    both = join([log, other])
+    assert (len(both), both.steps) == (len(log) + len(other), log.steps + other.steps)
+    assert (both.end == np.concatenate([log.end, other.end])).all()
+    assert len(np.unique(both.episode)) == len(np.unique(log.episode)) + len(
+        np.unique(other.episode)
+    )
+    assert (both.followed_by[len(log) :] >= 0).sum() == (other.followed_by >= 0).sum()
+    with pytest.raises(RunError, match="record the same keys"):
+        join([log, record_calls(SPEC, skill_set(call_steps=5), 20)])
+    with pytest.raises(RunError, match="'get_key' differs between the logs"):
+        join([log, record_calls(SPEC, skill_set(call_steps=6), 20, info=["door"])])
+    few = SkillSet(SKILLS[2:], tuple(s.policy for s in SKILLS[2:]))
+    with pytest.raises(RunError, match="another of leave, wait"):
+        join([log, record_calls(SPEC, few, 20)])
+    with pytest.raises(DeclarationError, match="at least one"):
+        join([])
+
+
+def test_a_log_of_other_skills_says_so(log: CallLog) -> None:
+    log.check_skills(skill_set(call_steps=5))
+    for skills, message in (
+        (skill_set(call_steps=6), "'get_key' has changed since the log was recorded"),
+        (skill_set(call_steps=Lengths(1, 2)), "no chosen lengths, but these are with the lengths"),
+        (SkillSet(SKILLS[1:], tuple(s.policy for s in SKILLS[1:])), "record a log of these skills"),
+    ):
+        with pytest.raises(RunError, match=message):
+            log.check_skills(skills)
+    elsewhere = replace(log, observation_space=gym.spaces.Box(0, 1, (2,)))
+    with pytest.raises(RunError, match="record a log in this environment"):
+        elsewhere.check_skills(skill_set(call_steps=5))
+    with pytest.raises(DeclarationError, match=r"no skill 'get_kay'.*Close matches: get_key"):
+        log.of("get_kay")
+
+
+@pytest.mark.parametrize(
+    ("how", "kind", "message"),
+    [
+        ({"steps": 0}, DeclarationError, "steps is 0"),
+        ({"choose": "best"}, DeclarationError, "choose is 'best'; it must be 'random'"),
+        ({"info": ["window"]}, EnvError, r"info\['window'\] is to be recorded, but no env"),
+        ({"skills": 3}, DeclarationError, "3 has no skills"),
+        ({"steps": 10**12}, DeclarationError, "at most 4 GiB are recorded"),
+    ],
+)
+def test_wrong_arguments(how: Any, kind: Any, message: str) -> None:
+    given = {"env": SPEC, "skills": skill_set(), "steps": 10} | how
+    with pytest.raises(kind, match=message):
+        record_calls(**given)
+
+
+def test_the_corridor_is_what_the_loop_takes_it_for() -> None:
+    assert (PLACE, KEY, DOOR, Corridor.action_space.n) == (0, 1, 2, 3)

@@ -1,0 +1,249 @@
+"""Reward machines by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from planning.steps import column, step_to
+
+from skillweave.errors import DeclarationError, SkillError
+from skillweave.planning import (
+    Mission,
+    Predicate,
+    RewardMachine,
+    held,
+    in_any_order,
+    successes,
+)
+from skillweave.selectors import LastCall
+from skillweave.skills import Skill
+
+A, B, C = (column(i) for i in range(3))
+
+
+def states(task: RewardMachine, state: Any) -> list[str]:
+    return [task.state_names[i] for i in state[:, 0]]
+
+
+def test_transitions_rewards_and_ends_by_hand() -> None:
+    task = RewardMachine(
+        {
+            ("one", "two"): (A, 0.25),
+            ("one", "bad"): B,
+            ("two", "done"): (C, 0.75),
+            ("two", "one"): (B, -1.0),
+        },
+        accepting={"done"},
+        failing={"bad"},
+    )
+    state = task.start(4)
+    assert states(task, state) == ["one"] * 4
+    # The first declared counts where two hold; at most one transition is taken in a step.
+    state, reward, done = task.step(state, step_to([[1, 1, 1], [0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+    assert states(task, state) == ["two", "bad", "one", "two"]
+    assert reward.tolist() == [0.25, 0.0, 0.0, 0.25]
+    assert done.tolist() == [False, True, False, False]
+    state, reward, done = task.step(state, step_to([[0, 0, 1], [1, 1, 1], [0, 1, 0], [0, 1, 0]]))
+    assert states(task, state) == ["done", "bad", "bad", "one"]
+    assert reward.tolist() == [0.75, 0.0, 0.0, -1.0]
+    assert done.tolist() == [True, True, True, False]
+    assert task.has_succeeded(state).tolist() == [True, False, False, False]
+
+
+def test_a_counter_counts_steps_without_a_gap_and_only_in_its_state() -> None:
+    task = RewardMachine({("a", "b"): A, ("b", "c"): held(B, 3)}, accepting={"c"})
+    state = task.start(1)
+    seen = []
+    for row in ([0, 1], [1, 1], [0, 1], [0, 1], [0, 0], [0, 1], [0, 1], [0, 1]):
+        state, _, done = task.step(state, step_to([row]))
+        seen.append((states(task, state)[0], int(state[0, 1]), bool(done[0])))
+    # The steps in b before its state was entered do not count.
+    assert seen == [
+        ("a", 0, False), ("b", 0, False), ("b", 1, False), ("b", 2, False), ("b", 0, False),
+        ("b", 1, False), ("b", 2, False), ("c", 0, True),
+    ]  # fmt: skip
+
+
+def test_several_counters_in_one_state() -> None:
+    task = RewardMachine({("a", "x"): held(A, 2), ("a", "y"): held(B, 3)}, accepting={"x", "y"})
+    state = task.start(3)
+    for rows in ([[1, 1], [0, 1], [1, 0]], [[0, 1], [0, 1], [0, 1]], [[1, 1], [1, 1], [1, 1]]):
+        state, _, done = task.step(state, step_to(rows))
+    assert states(task, state) == ["y", "y", "a"]
+    assert state[2].tolist() == [0, 1, 2]
+    assert done.tolist() == [True, True, False]
+
+
+def test_rewards_may_be_functions_of_a_step() -> None:
+    def fast(step: Any) -> Any:
+        return step.next_obs[:, 0] - step.obs[:, 0]
+
+    task = RewardMachine(
+        {("go", "rest"): (B, fast), ("rest", "end"): C},
+        accepting={"end"},
+        each_step={"go": -1.0, "rest": fast},
+    )
+    state = task.start(2)
+    state, reward, _ = task.step(state, step_to([[3, 0, 0], [3, 1, 0]]))
+    assert reward.tolist() == [-1.0, 2.0]
+    state, reward, _ = task.step(state, step_to([[5, 1, 1], [5, 0, 1]], [[1, 0, 0]] * 2))
+    assert reward.tolist() == [3.0, 4.0]
+    assert states(task, state) == ["rest", "end"]
+    _, reward, _ = task.step(state, step_to([[5, 0, 0]] * 2))
+    assert reward.tolist() == [5.0, 0.0]  # a task that is over pays nothing
+
+
+def test_several_states_of_one_step_at_once() -> None:
+    task = RewardMachine({("a", "b"): (A, 1.0), ("b", "c"): held(B, 2)}, accepting={"c"})
+    every = np.array([[0, 0], [1, 0], [1, 1], [2, 0]])
+    readings = task.read(step_to([[1, 1], [0, 0]]))
+    after, reward = task.advance(np.stack([every, every]), readings)
+    assert after.tolist() == [
+        [[1, 0], [1, 1], [2, 0], [2, 0]],
+        [[0, 0], [1, 0], [1, 0], [2, 0]],
+    ]
+    assert reward.tolist() == [[1.0, 0.0, 0.0, 0.0], [0.0] * 4]
+
+
+def test_predicates_of_steps_and_of_observations() -> None:
+    def moved(step: Any) -> Any:
+        return step.next_obs[:, 0] != step.obs[:, 0]
+
+    class Stand(Skill):
+        def success(self, step: Any) -> Any:
+            return step.next_obs[:, 1] == 1
+
+    step = step_to([[1, 1], [0, 1]])
+    assert Predicate(moved).reads == "step"
+    assert Predicate(A).reads == "obs"
+    assert Predicate(lambda x: x.terminated, "end", "step").holds(step).tolist() == [False] * 2
+    stands = successes([Stand(), Skill()])
+    assert list(stands) == ["stand"]
+    assert (Predicate(A) & moved).holds(step).tolist() == [True, False]
+    assert (Predicate(A) | stands["stand"]).holds(step).tolist() == [True, True]
+    assert (~Predicate(A)).at(step.next_obs).tolist() == [False, True]
+    assert (Predicate(A) & ~Predicate(B)).name == "(a and not b)"
+    with pytest.raises(DeclarationError, match="reads a step, but only an observation is known"):
+        Predicate(moved).at(step.obs)
+
+
+def test_what_a_policy_sees_of_a_task() -> None:
+    task = RewardMachine({("a", "b"): held(A, 4), ("b", "c"): held(B, 2)}, accepting={"c"})
+    seen = task.observe(np.array([[0, 3], [1, 1], [2, 0]]))
+    assert seen.tolist() == [[1, 0, 0, 0.75], [0, 1, 0, 0.5], [0, 0, 1, 0]]
+    assert all(task.observation_space.contains(row) for row in seen)
+
+
+TASKS = {
+    "several transitions": RewardMachine(
+        {
+            ("a", "bad"): C,
+            ("a", "b"): A,
+            ("b", "a"): held(B, 3),
+            ("b", "done"): [column(3), column(4)],
+        },
+        accepting={"done"},
+        failing={"bad"},
+    ),
+    "a counter that goes on": Mission(in_any_order(A, held(B, 6)), column(3), avoid=C),
+}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_its_automaton_is_in_the_same_states(name: str) -> None:
+    task = TASKS[name]
+    skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
+    automaton = task.automaton(skills)
+    n = 200
+    rng = np.random.default_rng(0)
+    state, memory = task.start(n), automaton.start(n)
+    last = LastCall(np.zeros(n, int), np.zeros(n, np.int8), np.zeros(n, bool))
+    seen = set()
+    for _ in range(40):
+        step = step_to(rng.random((n, 5)) < [0.3, 0.8, 0.03, 0.05, 0.05])
+        state, _, _ = task.step(state, step)
+        memory = automaton.watch(memory, step, last)
+        names = [automaton.state_names[i] for i in memory["state"]]
+        wanted = [
+            name if not count else f"{name} ({count} steps held)"
+            for name, count in zip(states(task, state), state[:, 1], strict=True)
+        ]
+        assert names == wanted
+        seen.update(names)
+    assert len(seen) > 5
+
+
+def test_the_skills_of_its_automaton() -> None:
+    skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
+    automaton = TASKS["several transitions"].automaton(skills)
+    assert automaton.states["a"] == ("go_a",)
+    assert automaton.states["b"] == automaton.states["b (2 steps held)"] == ("go_b", "wait", "go_d")
+    assert automaton.states["done"] == ("go_a", "go_b", "wait", "no", "go_d")
+
+
+def wrong(make: Any, message: str) -> Any:
+    return pytest.param(make, message, id=message)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        wrong(lambda: RewardMachine([A]), "transitions are"),
+        wrong(lambda: RewardMachine({"a": A}), "transition is from 'a'; write"),
+        wrong(lambda: RewardMachine({("a", 3): A}), "state is named 3"),
+        wrong(lambda: RewardMachine({("a", "b"): "x"}), "'x' is no predicate"),
+        wrong(lambda: RewardMachine({("a", "b"): (A, "x")}), "reward is 'x'"),
+        wrong(lambda: RewardMachine({("a", "b"): (A, np.nan)}), "reward is nan"),
+        wrong(lambda: RewardMachine({("a", "b"): (A, 1, 2)}), r"write an event, or \(event"),
+        wrong(lambda: RewardMachine({("a", "b"): A}, start="c"), "start names the state 'c'"),
+        wrong(lambda: RewardMachine({("a", "b"): A}, accepting={"c"}), "states are: a, b"),
+        wrong(lambda: RewardMachine({("a", "b"): A}, accepting="b"), "give a set of states"),
+        wrong(
+            lambda: RewardMachine({("a", "b"): A}, accepting={"b"}, failing={"b"}),
+            "both accepting and failing",
+        ),
+        wrong(
+            lambda: RewardMachine({("a", "b"): A, ("b", "a"): A}, accepting={"b"}),
+            "ends the task, so it has no transition",
+        ),
+        wrong(lambda: RewardMachine({("a", "b"): A}, acepting={"b"}), "is 'accepting' meant"),
+        wrong(lambda: held(A, 0), "must be at least 1"),
+        wrong(lambda: held(A, 10**6), "an episode has at most"),
+        wrong(lambda: held(held(A, 3), 3), "event over several steps; give a predicate"),
+        wrong(lambda: held(A, 3) & A, r"combine predicates inside it: held\(a & b"),
+        wrong(lambda: Predicate(A) | held(A, 3), "is an event over several steps"),
+        wrong(lambda: Predicate(3), "a predicate is 3"),
+        wrong(lambda: Predicate(A, reads="steps"), "must be 'obs' or 'step'"),
+        wrong(
+            lambda: RewardMachine({("a", "b"): A}).automaton({"b": "x"}),
+            r"event 'a' has no skill; give one",
+        ),
+        wrong(
+            lambda: RewardMachine({("a", "b"): held(A, 3000)}).automaton({"a": "x"}),
+            "more than 2,000 states",
+        ),
+        wrong(
+            lambda: RewardMachine({("a", "b"): held(A, 3), ("a", "c"): held(B, 3)}).automaton(
+                {"a": "x", "b": "x"}
+            ),
+            "plan the task instead",
+        ),
+    ],
+)
+def test_a_wrong_machine_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(DeclarationError, match=message):
+        make()
+
+
+def test_a_predicate_that_answers_wrongly_is_named() -> None:
+    def bad(obs: Any) -> Any:
+        return obs
+
+    task = RewardMachine({("a", "b"): bad})
+    with pytest.raises(SkillError, match=r"task: bad\(\) returned shape \(2, 2\)"):
+        task.step(task.start(2), step_to([[1, 1], [0, 1]]))
+    task = RewardMachine({}, each_step=lambda step: step.next_obs[:, 9])
+    with pytest.raises(SkillError, match="IndexError"):
+        task.step(task.start(2), step_to([[1, 1], [0, 1]]))
