@@ -1,4 +1,7 @@
-"""Continue the run in a directory, perhaps for more steps: apart, as a new run needs none of it."""
+"""Continue the run in a directory, perhaps for more steps.
+
+Stands alone because a new run needs none of it.
+"""
 
 from __future__ import annotations
 

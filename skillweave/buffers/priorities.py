@@ -1,4 +1,7 @@
-"""Priorities of replayed transitions in sum trees (Schaul et al. 2016, appendix B.2.1)."""
+"""Priorities of replayed transitions in sum trees (Schaul et al. 2016, appendix B.2.1).
+
+Stands alone because sum trees know nothing of transitions.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Storage of replayed transitions in columns, one for each environment; no observation twice."""
+"""Storage of replayed transitions in columns, one for each environment; no observation twice.
+
+Stands alone because it only stores columns; ``replay`` samples from them.
+"""
 
 from __future__ import annotations
 

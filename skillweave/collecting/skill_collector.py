@@ -1,4 +1,7 @@
-"""The collector of a plain agent, or of a skill that learns by itself: a row is a step."""
+"""The collector of a plain agent, or of a skill that learns by itself: a row is a step.
+
+Stands alone because it is one of two collectors, beside ``hierarchy_collector``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Sources of experience: environments that are stepped, or batches that were recorded before."""
+"""Sources of experience: environments that are stepped, or batches that were recorded before.
+
+Stands alone because the loop reads environments and recorded batches in the same way.
+"""
 
 from __future__ import annotations
 

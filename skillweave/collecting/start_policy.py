@@ -1,4 +1,7 @@
-"""The policy that leads to where a skill may start: calls of other skills, or random actions."""
+"""The policy that leads to where a skill may start: calls of other skills, or random actions.
+
+Stands alone because it acts, and a collector records.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The main function of a worker process."""
+"""The main function of a worker process.
+
+Stands alone because it runs in the worker, not in the process of the run.
+"""
 
 from __future__ import annotations
 

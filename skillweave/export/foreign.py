@@ -1,4 +1,7 @@
-"""Graphs of foreign networks, like those of trained agents: apart, as they are no agents."""
+"""Graphs of foreign networks, like those of trained agents.
+
+Stands alone because they are no agents: their inputs and outputs are their own.
+"""
 
 from __future__ import annotations
 

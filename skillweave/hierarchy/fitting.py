@@ -1,4 +1,7 @@
-"""Fit a hierarchy to its environment: algorithms, reflexes, and all that is ready to act."""
+"""Fit a hierarchy to its environment: algorithms, reflexes, and all that is ready to act.
+
+Stands alone because it needs an environment, and a declaration does not.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The keys of ``info`` that a skill reads, so that only these are recorded with experience."""
+"""The keys of ``info`` that a skill reads, so that only these are recorded with experience.
+
+Stands alone because a skill is declared without it; only what records steps needs it.
+"""
 
 from __future__ import annotations
 

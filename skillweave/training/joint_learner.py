@@ -1,4 +1,7 @@
-"""A learner of several policies from one stream of steps, each with its own rows."""
+"""A learner of several policies from one stream of steps, each with its own rows.
+
+Stands alone because it learns; ``joint`` runs the stage.
+"""
 
 from __future__ import annotations
 

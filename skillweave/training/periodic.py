@@ -1,4 +1,7 @@
-"""Evaluation of an agent while it trains: whole episodes in separate environments."""
+"""Evaluation of an agent while it trains: whole episodes in separate environments.
+
+Stands alone because it plays episodes, and ``trainer`` trains.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Counts of the steps of an evaluation in which each reflex acted."""
+"""Counts of the steps of an evaluation in which each reflex acted.
+
+Stands alone because it only counts.
+"""
 
 from __future__ import annotations
 
