@@ -15,8 +15,13 @@ from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.neighbours import SOFT
 from skillweave.types import Array, Memory
 
-LATEST = 8
+LATEST = 16
 """The calls of an episode that are remembered."""
+TRUST = 20.0
+"""Logged calls for which one of the episode counts at the same distance: it says what happens here,
+while logged calls may have started behind a wall."""
+SLACK = 0.03
+"""A call of the episode counts where it is nearer than any logged one, but for so much."""
 
 
 class Tried:
@@ -49,6 +54,7 @@ class Tried:
             "tried.to": np.full(calls, -1),
             "tried.q": np.zeros((*calls, self._choices), np.float32),
             "tried.total": np.zeros((*calls, self._choices), np.float32),
+            "tried.far": np.zeros((*calls, self._choices), np.float32),
             "tried.may": np.zeros((*calls, self._choices), bool),
         }
 
@@ -101,6 +107,7 @@ class Tried:
             "tried.to": place[rows],
             "tried.q": q[rows],
             "tried.total": near.total[rows],
+            "tried.far": near.distance[rows],
             "tried.may": may[rows],
         }
         return _put(memory, new, rows, slot[rows])
@@ -121,12 +128,16 @@ class Tried:
         where = np.concatenate([memory["tried.end"], features[:, None]], 1)
         states = np.concatenate([memory["tried.to"], place[:, None]], 1)
         same = (states[:, :, None] == memory["tried.from"][:, None]) & (choice >= 0)[:, None]
-        if not same[:, -1].any():
-            return q
         skill = self._skill_of[np.maximum(choice, 0)]
         to = where[np.arange(n)[:, None], :, skill].swapaxes(1, 2)  # (n, ends, calls, F)
         far = np.sqrt(np.square(to - memory["tried.start"][:, None]).sum(3))
-        weight = np.where(same, 1.0 / (far + SOFT), 0.0)
+        # The distance of the nearest logged call of the same choice, (n, ends, calls).
+        nearest = np.concatenate([memory["tried.far"], near.distance[:, None]], 1)
+        logged_far = np.take_along_axis(nearest, np.maximum(choice, 0)[:, None], 2)
+        same &= far <= logged_far + SLACK
+        if not same[:, -1].any():
+            return q
+        weight = np.where(same, TRUST / (far + SOFT), 0.0)
         one_hot = choice[:, :, None] == np.arange(self._choices)
         own = np.einsum("nec,nck->nek", weight, one_hot)
         logged = np.concatenate([memory["tried.q"], q[:, None]], 1)
