@@ -32,10 +32,14 @@ from skillweave.cli import main
 from skillweave.collecting.acting import Acting
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
-from skillweave.runs import starts
+from skillweave.runs import initial_policies
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.runs.starts import begin_with, keep_starts, learnt_in
+from skillweave.runs.initial_policies import (
+    copy_initial_policies,
+    learners_of_run,
+    record_initial_policies,
+)
 from skillweave.training import stage_log
 from skillweave.training.joint_learner import JointLearner
 
@@ -79,7 +83,7 @@ def weights_of(path):
     """By name, the weights of all who have learnt in a run, without the scaling of observations."""
     return {
         name: {k: v for k, v in own.policy.weights.items() if not k.startswith("obs_")}
-        for name, own in learnt_in(path).items()
+        for name, own in learners_of_run(path).items()
     }
 
 
@@ -160,7 +164,9 @@ def test_who_has_not_learnt_there_begins_afresh_and_people_are_told(source, tmp_
 
 @pytest.mark.slow
 def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_path):
-    moments = {k: v for k, v in learnt_in(source)["left"].policy.weights.items() if "obs_" in k}
+    moments = {
+        k: v for k, v in learners_of_run(source)["left"].policy.weights.items() if "obs_" in k
+    }
     assert set(moments) == {"obs_mean", "obs_var"}
     run = declare().train(tmp_path / "run", seed=6, quiet=True, start_from=source)
     (told,) = [s["starts"] for s in run.info()["stages"] if s["name"] == "left"]
@@ -168,7 +174,7 @@ def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_
     config = PPO(num_envs=4, n_steps=16, network=SMALL, learning_rate=STILL)
     Agent("CartPole-v1", config, 6_400).train(tmp_path / "a", quiet=True)
     Agent("CartPole-v1", config, 64).train(tmp_path / "b", quiet=True, start_from=tmp_path / "a")
-    a, b = (learnt_in(tmp_path / k)["agent"].policy.weights["obs_var"] for k in "ab")
+    a, b = (learners_of_run(tmp_path / k)["agent"].policy.weights["obs_var"] for k in "ab")
     assert ((a - b).abs() <= 0.03 * a).all(), "64 steps move what 6,400 have found by a hundredth"
 
 
@@ -223,14 +229,14 @@ def test_who_starts_from_a_run_is_not_held_near_what_it_was(source, tmp_path, mo
 
 
 def test_where_nothing_can_be_copied_no_run_is_begun(source, tmp_path, monkeypatch):
-    write = starts.write_tensors
+    write = initial_policies.write_tensors
 
     def full(path, *about, **how):
         if "other" in path.name:
             raise RunError("No space left on device")
         return write(path, *about, **how)
 
-    monkeypatch.setattr(starts, "write_tensors", full)
+    monkeypatch.setattr(initial_policies, "write_tensors", full)
     with pytest.raises(SkillweaveError, match="No space left"):
         declare().train(tmp_path / "run", quiet=True, start_from=source)
     monkeypatch.undo()
@@ -253,7 +259,7 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
 def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, monkeypatch):
     """Killed between the end of a stage and the removal of what it began with."""
     run = begun(tmp_path / "run", source)
-    monkeypatch.setattr(stage_log, "drop_starts", lambda *_: 1 / 0)
+    monkeypatch.setattr(stage_log, "remove_initial_policies", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         training.train(declare(), run)
     run.close()
@@ -265,11 +271,11 @@ def test_what_is_left_of_a_start_goes_with_the_next_training(source, tmp_path, m
 
 def begun(path, source, **how):
     """A run that starts from another one, not trained yet."""
-    hierarchy, learnt = declare(**how), learnt_in(source)
+    hierarchy, learnt = declare(**how), learners_of_run(source)
     content = training.manifest(hierarchy, seed=3, flat=False)
-    begin_with(content["stages"], learnt, source)
+    record_initial_policies(content["stages"], learnt, source)
     return RunDirectory.create(
-        path, content | {"recipe": None}, partial(keep_starts, learnt=learnt)
+        path, content | {"recipe": None}, partial(copy_initial_policies, learnt=learnt)
     )
 
 
@@ -394,7 +400,7 @@ def test_a_run_that_is_not_finished_gives_what_it_has(source, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         training.train(declare(), run, (heard,))
     run.close()
-    assert set(learnt_in(path)) == {"left"}
+    assert set(learners_of_run(path)) == {"left"}
     declare(rate=STILL).train(tmp_path / "run", quiet=True, start_from=path)
     assert_near(weights_of(tmp_path / "run")["left"], weights_of(path)["left"])
 

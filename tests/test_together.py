@@ -42,8 +42,8 @@ from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.applying import differences
 from skillweave.hierarchy import select_best, training
+from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import SAMPLING
 from skillweave.training import joint
 from skillweave.training.stage_log import START, StageLog, success_rate
 

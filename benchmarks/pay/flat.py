@@ -14,7 +14,11 @@ from skillweave import Agent, Skill
 from skillweave.api import Run
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.starts import begin_with, keep_starts, learnt_in
+from skillweave.runs.initial_policies import (
+    copy_initial_policies,
+    learners_of_run,
+    record_initial_policies,
+)
 from skillweave.training.learning_task import skill_task
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.role import agent_role
@@ -44,10 +48,10 @@ class Flat(Agent):
         else:
             content = self.manifest(seed)
             content["stages"][0]["workers"] = 1  # runs go side by side
-            learnt = {} if self.starts_from is None else learnt_in(self.starts_from)
+            learnt = {} if self.starts_from is None else learners_of_run(self.starts_from)
             if self.starts_from is not None:
-                begin_with(content["stages"], learnt, str(self.starts_from))
-            keep = partial(keep_starts, learnt=learnt)
+                record_initial_policies(content["stages"], learnt, str(self.starts_from))
+            keep = partial(copy_initial_policies, learnt=learnt)
             run = RunDirectory.create(path, content | {"recipe": None, "track": ()}, keep)
         try:
             run.begin()

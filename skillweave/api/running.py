@@ -31,9 +31,9 @@ from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
+from skillweave.runs.initial_policies import copy_initial_policies
 from skillweave.runs.manifest import identity
 from skillweave.runs.numbered import make_numbered
-from skillweave.runs.starts import keep_starts
 from skillweave.runs.trackers import make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
@@ -114,7 +114,9 @@ def begin(
             run_dir = make_numbered(_run_name(content["recipe"], name, flat), place)
             note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
             stack.callback(_remove_if_empty, run_dir)
-        run = RunDirectory.create(run_dir, content, partial(keep_starts, learnt=learnt), hold=True)
+        run = RunDirectory.create(
+            run_dir, content, partial(copy_initial_policies, learnt=learnt), hold=True
+        )
         stack.callback(run.close)
         return go_on(declared, run, quiet, evolve, cluster, note, callback)
 

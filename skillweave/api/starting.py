@@ -12,7 +12,14 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.paths import AGENT
-from skillweave.runs.starts import Chooses, Learnt, begin_with, chosen_from, learnt_in, same_shapes
+from skillweave.runs.initial_policies import (
+    Chooses,
+    Learnt,
+    learners_of_run,
+    options_of,
+    record_initial_policies,
+    same_shapes,
+)
 from skillweave.spaces import same_space
 from skillweave.training.role import Role
 
@@ -40,11 +47,11 @@ def starts(
         learnt, places = _learnt_by_name(content, start_from)
     else:
         place = _place(start_from, "start_from")
-        learnt = learnt_in(place)
+        learnt = learners_of_run(place)
         places = dict.fromkeys(learnt, place)
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
-    started = begin_with(content["stages"], learnt, where)
+    started = record_initial_policies(content["stages"], learnt, where)
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
             config = stage.get("algorithms", {}).get(name, stage["algorithm"])
@@ -52,7 +59,7 @@ def starts(
             algorithm = make_algorithm(
                 config_from_json(config), role.observation_space, role.action_space
             )
-            chooses = chosen_from(content, name)
+            chooses = options_of(content, name)
             _check_start(name, algorithm, chooses, learnt[name], places[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
@@ -135,7 +142,7 @@ def _learnt_by_name(
             )
         place = _place(run, f"start_from[{name!r}]")
         if place not in known:
-            known[place] = learnt_in(place)
+            known[place] = learners_of_run(place)
         there = known[place]
         # A plain agent's run has one learner, whatever it is to be here.
         policy = there.get(name) or (there.get(AGENT) if set(there) == {AGENT} else None)

@@ -29,9 +29,9 @@ from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
+from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
-from skillweave.runs.kept import best_words, kept_words
 from skillweave.runs.several import open_runs
 from skillweave.terminal import one_line
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
@@ -266,7 +266,7 @@ def run_lines(
                 f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
             )
         if kept := stage.get("kept"):
-            lines.append(f"    {kept_words(kept)}")
+            lines.append(f"    {comparison_words(kept)}")
     lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest["versions"].items())]
     for score in saved:
         if score is not None:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from skillweave.envs.infos import info_rows, random_actions, told_success
+from skillweave.envs.infos import info_rows, random_actions, reported_success
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
@@ -59,7 +59,7 @@ class Outcome:
     def success(self) -> Array | None:
         """(n,) bool; of the task float64, NaN where unknown; None: the skill defines none."""
         if self._skill is None:
-            return told_success(self._step.info, len(self._step.reward))
+            return reported_success(self._step.info, len(self._step.reward))
         return self._asked(self._skill, "success") if self._skill.defines("success") else None
 
     def _asked(self, skill: Skill, method: str) -> Array:

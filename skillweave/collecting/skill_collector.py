@@ -16,7 +16,7 @@ from skillweave.collecting.start_policy import StartPolicy
 from skillweave.collecting.views import rows_of, steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import told_success
+from skillweave.envs.infos import reported_success
 from skillweave.errors import TrainingError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
@@ -145,7 +145,7 @@ class SkillCollector(Collector):
                 memory[~playing] = 0
         self.obs = raw.next_obs
         if len(called := np.flatnonzero(end)):
-            success = None if self.skill is not None else told_success(raw.info, self.num_envs)
+            success = None if self.skill is not None else reported_success(raw.info, self.num_envs)
             success = None if success is None else success[called]
             self._tell(out.row, called, raw.info, success, task=self.skill is not None)
             more = self._call_again(called[end[called] == LIMIT])

@@ -78,7 +78,7 @@ def judged(
     A reward that changes (``Skill.reward_changes``) gets each step by itself, once, by time.
 
     Raises:
-        SkillweaveError: the skill's method failed, or returned a wrong result; the message is that
+        SkillError: the skill's method failed, or returned a wrong result; the message is that
             of the first step in which it does.
     """
     alone = what == "reward" and skill.reward_changes

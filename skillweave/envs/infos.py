@@ -268,7 +268,7 @@ class ActionMasks:
         return allowed
 
 
-def told_success(info: Mapping[str, Any], n: int) -> Array | None:
+def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
     """Return the success of n environments' episodes by ``info["success"]``.
 
     Returns:

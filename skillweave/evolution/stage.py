@@ -128,8 +128,8 @@ class EvolvingPopulation:
             self.generation()
             if interrupts.requested() and not self.over:
                 interrupts.stop()
-        log.tell_absent(self.population.part.tally, over=True)
-        log.tell_endless(self.population.part.tally)
+        log.report_absent(self.population.part.tally, over=True)
+        log.report_endless(self.population.part.tally)
         return {self.stage.name: self._finish()}
 
     def states(self) -> dict[str, Any]:
@@ -176,8 +176,8 @@ class EvolvingPopulation:
         self.log.at["steps"] += self.fitness_steps
         self._note(fitness)
         self.done += 1
-        self.log.tell_absent(self.population.part.tally, over=False)
-        self.log.tell_endless(self.population.part.tally)
+        self.log.report_absent(self.population.part.tally, over=False)
+        self.log.report_endless(self.population.part.tally)
         if self.log.stop_requested:
             return  # no checkpoint: a run resumed from the previous one arrives here again
         if not self.over:
@@ -198,7 +198,7 @@ class EvolvingPopulation:
         elif self.log.stop_requested:
             self.log.stopped()
         elif self.done < generations:
-            self.log.tell(
+            self.log.message(
                 f"its budget of {self.budget:,} steps is spent after {self.done} of {generations} "
                 "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
             )
@@ -242,13 +242,13 @@ class EvolvingPopulation:
         )
         lost = [str(m.number) for m, f in zip(members, fitness, strict=True) if f == -np.inf]
         if lost:
-            self.log.tell(
+            self.log.message(
                 f"generation {self.done + 1}: member {', '.join(lost)} diverged; it is replaced"
             )
         winner = members[int(fitness.argmax())]
         settings = settings_of(winner.config, self.evolution)
         shown = ", ".join(f"{k} {_short(v)}" for k, v in settings.items())
-        self.log.tell(
+        self.log.message(
             f"generation {self.done + 1} of {self.evolution.generations}: best is member "
             f"{winner.number} with {fitness.max():.1f} ({shown})"
         )
@@ -281,7 +281,7 @@ class EvolvingPopulation:
         saved = unprefixed("collector", tensors)
         store = unprefixed("store", tensors)
         ids = resumed(self.log, lambda: population.resume(saved, store))
-        self.log.tell_begun_anew(len(ids), population.part.num_envs)
+        self.log.report_reset(len(ids), population.part.num_envs)
 
     def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""

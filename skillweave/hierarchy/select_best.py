@@ -18,8 +18,8 @@ from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
 from skillweave.paths import join, levels_to
+from skillweave.runs.comparison import SAMPLING, comparison_words, needs_comparison
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import SAMPLING, kept_words, to_be_judged
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.skill_text import useless_skills
 from skillweave.training.stage import TOGETHER, Policies
@@ -51,7 +51,7 @@ def select_best(
     The run records the choice.
     """
     entry = run.stage(join(level.path, TOGETHER))
-    if "kept" not in entry and to_be_judged(entry):
+    if "kept" not in entry and needs_comparison(entry):
         episodes = _episodes(entry)
         for listener in listeners:
             listener.message(
@@ -64,7 +64,7 @@ def select_best(
         entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
         run.save()
         for listener in listeners:
-            listener.message(f"{entry['name']}: {kept_words(entry['kept'])}")
+            listener.message(f"{entry['name']}: {comparison_words(entry['kept'])}")
             for hint in useless_skills(scores[entry["kept"]["kept"]].skills, episodes):
                 listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
@@ -166,7 +166,7 @@ def _sampling(run: RunDirectory, path: str) -> tuple[bool, bool]:
         if entry is None or entry["status"] != "done":
             continue
         if "kept" not in entry:
-            if to_be_judged(entry):
+            if needs_comparison(entry):
                 continue
             return True, False  # not evaluated: skills act as they did while the selector learnt
         if (choice := entry["kept"]["kept"]) != "before":

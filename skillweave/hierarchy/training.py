@@ -18,7 +18,7 @@ from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.paths import SELECTOR, level_of
 from skillweave.runs.command_words import resume_words
-from skillweave.runs.copies import keep_policy, recorded_policy
+from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
@@ -87,7 +87,7 @@ def train(
     roles = roles_of(declaration)
     policies: Policies = _ready(roles, run)
     for path, policy in policies.items():
-        keep_policy(run, path, policy)
+        copy_ready_policy(run, path, policy)
     budgets = budgets_of(roles)
     for level in roles.trained:
         # What has learnt together so far may have decided whether skills sample.
@@ -104,7 +104,7 @@ def train(
 def load(roles: Roles, run: RunDirectory) -> Policy:
     """Return the policy of a finished run of a hierarchy."""
     policies = _ready(roles, run) | _learnt(run)
-    if run.unjudged:
+    if run.lacks_comparison:
         raise RunError(
             f"{run.path}: all is trained, but the best of the hierarchies that it could end with "
             f"was not judged yet; {resume_words(run)}"
@@ -133,7 +133,7 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
 def _ready(roles: Roles, run: RunDirectory) -> dict[str, Policy]:
     """Return the ready policies and selectors as they were when the run started, by path."""
     policies = {
-        path: recorded_policy(run, path, policy) for path, policy in ready_policies(roles).items()
+        path: policy_at_start(run, path, policy) for path, policy in ready_policies(roles).items()
     }
     for path, policy in ready_selectors(roles).items():
         entry = _entry_of(run, level_of(path))

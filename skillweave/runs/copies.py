@@ -15,7 +15,7 @@ from skillweave.skills.foreign_policy import Foreign, as_recorded
 from skillweave.types import Policy
 
 
-def keep_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
+def copy_ready_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
     """Copy the content of a skill's ready policy into the run, if it has content to copy."""
     if isinstance(policy, Foreign) and (content := policy.content()) is not None:
         path = _copy_path(run, skill, policy)
@@ -25,7 +25,7 @@ def keep_policy(run: RunDirectory, skill: str, policy: Policy) -> None:
             write_bytes(path, content, make_directories=False)
 
 
-def recorded_policy(run: RunDirectory, skill: str, policy: Policy) -> Policy:
+def policy_at_start(run: RunDirectory, skill: str, policy: Policy) -> Policy:
     """Return a skill's ready policy as it was when the run began.
 
     Raises:

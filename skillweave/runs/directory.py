@@ -37,6 +37,7 @@ from skillweave.messages import absolute, shown_path
 from skillweave.reading import fit, shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
+from skillweave.runs.comparison import needs_comparison
 from skillweave.runs.files import (
     TEMPORARY,
     check_unchanged,
@@ -48,7 +49,6 @@ from skillweave.runs.files import (
     write_tensors,
 )
 from skillweave.runs.jsonl import JsonLines
-from skillweave.runs.kept import to_be_judged
 from skillweave.runs.links import check_no_links
 from skillweave.runs.lock import NAME as LOCK
 from skillweave.runs.lock import Lock
@@ -253,7 +253,7 @@ class RunDirectory:
     def finished(self) -> bool:
         """Return whether every stage is done, and compared at its end where it must be."""
         done = all(p["status"] == "done" for p in self.manifest["stages"])
-        return done and not self.unjudged
+        return done and not self.lacks_comparison
 
     @property
     def has_learnt(self) -> bool:
@@ -263,10 +263,10 @@ class RunDirectory:
         return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
 
     @property
-    def unjudged(self) -> bool:
+    def lacks_comparison(self) -> bool:
         """Return whether the comparison that chooses the best hierarchy is still missing."""
         stages = self.manifest["stages"]
-        return any("kept" not in s and to_be_judged(s) for s in stages)
+        return any("kept" not in s and needs_comparison(s) for s in stages)
 
     def save_checkpoint(
         self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None

@@ -17,8 +17,8 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.errors import RunError
 from skillweave.paths import names_in
 from skillweave.reading import fit, shown
+from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json
-from skillweave.runs.kept import Kept
 from skillweave.settings import AtLeastOne, Check, Count, NonNegative, Positive
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
@@ -174,7 +174,7 @@ class StageEntry(TypedDict):
     """Keep the jointly learnt weights only if they are better than the earlier ones."""
     greedy_judged: NotRequired[bool]
     """At its end, evaluate whether skills and selector should act greedily or sample."""
-    kept: NotRequired[Kept]
+    kept: NotRequired[Comparison]
     """The result of the comparison at its end."""
     continued: NotRequired[list[Count]]
     """Steps after which the stage had ended, before its budget was raised."""

@@ -16,7 +16,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
-from skillweave.envs.infos import told_success
+from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
 from skillweave.messages import short, whole_number
@@ -323,7 +323,7 @@ def _scored(
         cut += int(played.cut.sum())
         tally.add(played)
         reflexes.add(played)
-        succeeded = told_success(played.step.info, len(played.rows))
+        succeeded = reported_success(played.step.info, len(played.rows))
         if succeeded is not None:
             success[played.episode[played.over]] = succeeded[played.over]
         if watch is not None:

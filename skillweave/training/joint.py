@@ -27,7 +27,7 @@ from skillweave.experience import Reference
 from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.paths import CRITIC, SELECTOR, decides, level_of, relative
-from skillweave.runs.starts import start_of
+from skillweave.runs.initial_policies import initial_policy
 from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds, global_generators
 from skillweave.training.joint_learner import JointLearner
@@ -170,7 +170,7 @@ class JointAgents(OneAgent):
             return policy, self._steps_of(name)
         if self.stage.continues:
             return None  # its final state holds everything
-        return start_of(self.stage.run, self.stage.name, name, self.algorithms[name])
+        return initial_policy(self.stage.run, self.stage.name, name, self.algorithms[name])
 
     def _report_lost_state(self, name: str, log: StageLog) -> None:
         """Report a deleted file of a state."""
@@ -178,7 +178,7 @@ class JointAgents(OneAgent):
         path = state_path(self.stage.run, name)
         choice = latest.get("kept", {}).get("kept")
         if latest and latest.get("evolution") is None and choice != "before" and not path.exists():
-            log.tell(
+            log.message(
                 f"{path} is not there any more, so {name!r} continues with its weights alone, and "
                 "learns otherwise than without the interruption"
             )
@@ -204,7 +204,7 @@ class JointAgents(OneAgent):
             return None  # it starts from another run, to learn the task of this one
         rate = success_rate(self._latest_stage(name))
         if rate == 0.0:
-            log.tell(
+            log.message(
                 f"skill {name!r} did not succeed any more when its own stage ended, so it moves "
                 "freely here (together.reference_kl is not used for it)"
             )
@@ -257,13 +257,13 @@ class JointAgents(OneAgent):
             if decides(name):
                 continue
             if rows and not updates:
-                log.tell(
+                log.message(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
                     "to learn from once: lower together.quota, raise together.epsilon, or give "
                     "more steps"
                 )
             elif not rows:
-                log.tell(
+                log.message(
                     f"skill {name!r} was never called in {log.at['steps']:,} steps, so it learnt "
                     "nothing: perhaps its initiation() is never True where the other skills "
                     "lead, or the selector never chooses it"
@@ -275,7 +275,7 @@ class JointAgents(OneAgent):
         assert isinstance(self.learner, JointLearner)
         for name, (rows, _) in self.learner.counts.items():
             if not rows and not decides(name):
-                log.tell(
+                log.message(
                     f"skill {name!r} was not called in the first {steps:,} steps; it starts to "
                     "learn once its initiation() is True where other skills end"
                 )

@@ -14,9 +14,9 @@ from skillweave.messages import close_matches
 from skillweave.notices import notice
 from skillweave.reading import shown
 from skillweave.runs.command_words import resume_words
+from skillweave.runs.comparison import best_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import best_words
-from skillweave.runs.starts import drop_starts
+from skillweave.runs.initial_policies import remove_initial_policies
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
@@ -96,7 +96,7 @@ class StageLog:
         for listener in listeners:
             listener.stage(name, int(self.entry["budget"]))
         for file in incomplete:
-            self.tell(f"{run.path / file} was removed or shortened: curves lack its lines")
+            self.message(f"{run.path / file} was removed or shortened: curves lack its lines")
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write the report of an update, and pass it to listeners."""
@@ -116,23 +116,23 @@ class StageLog:
         """Set the counts of the next checkpoint."""
         self.at.update(update=update, steps=steps, seconds=seconds)
 
-    def tell(self, text: str) -> None:
+    def message(self, text: str) -> None:
         """Send a message about the stage to listeners."""
         for listener in self.listeners:
             listener.message(f"{self.entry['name']}: {text}")
 
-    def tell_begun_anew(self, count: int, of: int) -> None:
+    def report_reset(self, count: int, of: int) -> None:
         """Report that ``count`` of ``of`` environments could not repeat their open episodes."""
         if count:
-            self.tell(
+            self.message(
                 f"{count} of {of} open episodes start again, so the result may differ from that of "
                 "an undisturbed run: given the same seed and the same actions, the environment "
                 "does not repeat itself"
             )
 
-    def tell_learnt_nothing(self) -> None:
+    def report_learnt_nothing(self) -> None:
         """Report that the weights are still the initial ones."""
-        self.tell(
+        self.message(
             f"it learnt nothing in {self.at['steps']:,} steps, as too few of them were its own: "
             "perhaps its initiation() is seldom True where the others lead. Widen it, or give more "
             "steps"
@@ -155,7 +155,7 @@ class StageLog:
         for callback in self._callbacks:
             callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
 
-    def tell_absent(self, tally: EpisodeTally, *, over: bool) -> None:
+    def report_absent(self, tally: EpisodeTally, *, over: bool) -> None:
         """Report once in a run the logged keys of ``info`` that never occurred.
 
         Args:
@@ -168,12 +168,12 @@ class StageLog:
         others = sorted(tally.others - set(absent))
         content = f"its keys there were {', '.join(others)}" if others else "it was empty there"
         for key in absent:
-            self.tell(
+            self.message(
                 f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info); "
                 f"{content}.{close_matches(key, others)}"
             )
 
-    def tell_endless(self, tally: EpisodeTally) -> None:
+    def report_endless(self, tally: EpisodeTally) -> None:
         """Report once in a run that an episode has gone on for ``LONG_EPISODE`` steps."""
         if tally.longest < LONG_EPISODE:
             return
@@ -195,7 +195,7 @@ class StageLog:
         if took < max(SLOW_SECONDS, after) or self.run.reported_slow:
             return
         self.run.reported_slow = True
-        self.tell(
+        self.message(
             f"evaluating took {took:.0f} s, and the training before it {after:.0f} s: a larger "
             "eval_every, or a smaller eval_episodes, would make the run faster"
         )
@@ -203,7 +203,7 @@ class StageLog:
     def stopped(self) -> None:
         """Record that a callback has ended the stage."""
         self.entry["stopped"] = {"steps": self.at["steps"]}
-        self.tell(
+        self.message(
             f"the callback returned False after {self.at['steps']:,} steps: the stage ends here"
         )
 
@@ -211,7 +211,7 @@ class StageLog:
         """Record that the stage ends with the weights of its best evaluation."""
         self.entry["best"] = {"steps": best.steps, "of": best.of, "value": best.value}
         self.at["metrics"] = self.at["metrics"] | best.metrics
-        self.tell(best_words(self.entry["best"]))
+        self.message(best_words(self.entry["best"]))
 
     def save_final(
         self,
@@ -247,7 +247,7 @@ class StageLog:
                 break
         else:
             self.run.check()
-            self.tell(
+            self.message(
                 f"it cannot be given more steps later, as its final state is not kept: {problem}"
             )
             return
@@ -258,7 +258,7 @@ class StageLog:
         """Record that the stage has reached its target."""
         self.entry["reached"] = {"steps": self.at["steps"], "value": value}
         target = self.entry["target"]
-        self.tell(
+        self.message(
             f"target reached after {self.at['steps']:,} steps: {target['of']} {value:g}, "
             f"the target is {target['at_least']:g}"
         )
@@ -286,14 +286,14 @@ class StageLog:
             entry["succeeded"] = succeeded
         self.run.save()
         if never_succeeded(entry):
-            self.tell(
+            self.message(
                 "no call ended with success() true, so stages after this one build on a skill that "
                 "does not work. It may need more steps, a reward that leads there "
                 "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
             )
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])
-        drop_starts(self.run, entry["name"])
+        remove_initial_policies(self.run, entry["name"])
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 
@@ -306,7 +306,7 @@ class StageLog:
             if not self.run.make_room():
                 raise
             self.run.save_policies(name, policies)
-            self.tell(
+            self.message(
                 "the disk is full, so final states of earlier stages were deleted to make room: "
                 "those stages cannot be given more steps later"
             )

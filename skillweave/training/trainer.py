@@ -20,8 +20,8 @@ from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
 from skillweave.runs.manifest import Checkpoint
-from skillweave.runs.starts import drop_starts, start_of
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
@@ -85,7 +85,7 @@ class OneAgent:
         self.algorithm = make_algorithm(stage.config, *spaces)
         self.start = None
         if not stage.continues:
-            self.start = start_of(stage.run, stage.name, stage.name, self.algorithm)
+            self.start = initial_policy(stage.run, stage.name, stage.name, self.algorithm)
         return self._initial_state()
 
     def _initial_state(self) -> Any:
@@ -171,7 +171,7 @@ class OneAgent:
         learner, collectors, episodes = self.learner, self.collectors, self.episodes
         if unprefixed("collector", extra):
             ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
-            log.tell_begun_anew(len(ids), self.collectors.num_envs)
+            log.report_reset(len(ids), self.collectors.num_envs)
         elif at.steps:
             resumed(log, lambda: begin_episodes(learner, collectors, extra, at, self.stage.seeds))
 
@@ -181,10 +181,10 @@ class OneAgent:
         made = self.collectors.steps_made
 
         def on_tick(tick: Tick) -> None:
-            log.tell_begun_anew(self.collectors.begun_anew, self.collectors.num_envs)
+            log.report_reset(self.collectors.begun_anew, self.collectors.num_envs)
             self.collectors.begun_anew = 0
-            log.tell_absent(self.episodes.tally, over=False)
-            log.tell_endless(self.episodes.tally)
+            log.report_absent(self.episodes.tally, over=False)
+            log.report_endless(self.episodes.tally)
             if tick.since < EARLY * self.stage.budget <= tick.steps:
                 self.tell_early(tick.steps, log)
             # If the best weights count, the last ones must be evaluated, too.
@@ -232,9 +232,9 @@ class OneAgent:
         else:
             self._save_final(log, spent=True)
             if self.stage.entry["kind"] == "skill" and self._is_unchanged():
-                log.tell_learnt_nothing()
-        log.tell_absent(self.episodes.tally, over=True)
-        log.tell_endless(self.episodes.tally)
+                log.report_learnt_nothing()
+        log.report_absent(self.episodes.tally, over=True)
+        log.report_endless(self.episodes.tally)
         if self.best is not None and self.best.metrics:
             self._load_best(self.best)
             log.kept_best(self.best)
@@ -301,7 +301,7 @@ def train_stage(
     """
     entry = run.stage(stage.name)
     if entry["status"] == "done":
-        drop_starts(run, stage.name)  # the run may have been killed just before
+        remove_initial_policies(run, stage.name)  # the run may have been killed just before
         return run.load_policies(stage.name)
     earlier = policies or {}
     learning_task = stage.learning_task(earlier)

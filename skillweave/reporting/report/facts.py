@@ -7,8 +7,8 @@ from typing import Any
 
 from skillweave.reporting.report.numbers import number
 from skillweave.runs.command_words import command_words
+from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.kept import best_words, kept_words
 from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -80,7 +80,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
         if best := entry.get("best"):
             notes.append(best_words(best))
         if kept := entry.get("kept"):
-            notes.append(kept_words(kept))
+            notes.append(comparison_words(kept))
         if winner := entry.get("winner"):
             notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
         done = entry["status"] == "done"

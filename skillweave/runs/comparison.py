@@ -26,7 +26,7 @@ _WORDS = {
 }
 
 
-class Kept(TypedDict):
+class Comparison(TypedDict):
     """The hierarchy that a stage ended with, and the mean returns of the compared ones."""
 
     before: NotRequired[float]
@@ -39,7 +39,7 @@ class Kept(TypedDict):
     kept: Candidate
 
 
-def kept_words(kept: Mapping[str, Any]) -> str:
+def comparison_words(kept: Mapping[str, Any]) -> str:
     """Return a sentence on the compared hierarchies and the kept one."""
     returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
     return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
@@ -54,6 +54,6 @@ def best_words(best: Mapping[str, Any]) -> str:
     )
 
 
-def to_be_judged(entry: Mapping[str, Any]) -> bool:
+def needs_comparison(entry: Mapping[str, Any]) -> bool:
     """Return whether a stage of a run must end with the best of several hierarchies."""
     return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

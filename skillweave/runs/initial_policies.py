@@ -46,7 +46,7 @@ Chooses = tuple[tuple[str, ...], tuple[int, ...]]
 """Names of skills in order, and selectable lengths of calls."""
 
 
-def learnt_in(path: Path) -> dict[str, Learnt]:
+def learners_of_run(path: Path) -> dict[str, Learnt]:
     """Return the learners of a run by name, at the end of their latest finished stage.
 
     Raises:
@@ -55,7 +55,7 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
     """
     run = RunDirectory.open(path)
     learnt = dict[str, Learnt]()
-    if run.unjudged and all(entry["status"] == "done" for entry in run.manifest["stages"]):
+    if run.lacks_comparison and all(entry["status"] == "done" for entry in run.manifest["stages"]):
         raise RunError(
             f"start_from: {path} was stopped during the comparison at its end; finish it first: "
             f"{resume_words(run)}"
@@ -67,12 +67,12 @@ def learnt_in(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry["name"]).items():
             sha256 = sums[name]
             steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
-            chooses = chosen_from(run.manifest, name)
+            chooses = options_of(run.manifest, name)
             learnt[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses)
     return learnt
 
 
-def chosen_from(manifest: Mapping[str, Any], name: str) -> Chooses:
+def options_of(manifest: Mapping[str, Any], name: str) -> Chooses:
     """Return the options that a selector or a critic of skills chooses among; else empty."""
     if not decides(name):
         return (), ()
@@ -86,7 +86,9 @@ def chosen_from(manifest: Mapping[str, Any], name: str) -> Chooses:
     return skills, tuple(lengths)
 
 
-def begin_with(stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: str) -> set[str]:
+def record_initial_policies(
+    stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: str
+) -> set[str]:
     """Record the initial policies in a new run's stages; return the names of their learners.
 
     Args:
@@ -125,7 +127,7 @@ def same_shapes(one: Algorithm, other: Algorithm) -> bool:
     return one.weight_shapes() == other.weight_shapes()
 
 
-def keep_starts(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
+def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
     """Copy the initial policies of a new run's stages into it: all, or nothing.
 
     The stages record the checksums of the copies.
@@ -143,7 +145,7 @@ def keep_starts(run: RunDirectory, learnt: Mapping[str, Learnt]) -> None:
         raise
 
 
-def start_of(
+def initial_policy(
     run: RunDirectory, stage: str, name: str, algorithm: Algorithm
 ) -> tuple[AgentPolicy, int] | None:
     """Return the initial policy of ``name`` in a stage, and the steps of its training.
@@ -172,7 +174,7 @@ def start_of(
     return policy, start["steps"]
 
 
-def drop_starts(run: RunDirectory, stage: str) -> None:
+def remove_initial_policies(run: RunDirectory, stage: str) -> None:
     """Remove the initial policies of the learners of a finished stage."""
     for name in run.stage(stage).get("starts", {}):
         remove(_path(run, name))
