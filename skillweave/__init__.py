@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
+    from skillweave.skills.mapping import Acts, Goal, LastAction, Part
     from skillweave.training.callback import TrainEvent
     from skillweave.training.defaults import TrainDefaults
     from skillweave.training.evaluation import Evaluation, evaluate
@@ -61,6 +62,7 @@ __version__ = "0.1.0"
 _HOME = {
     "ActingParams": "algorithms.base",
     "ActionHead": "networks.heads",
+    "Acts": "skills.mapping",
     "Agent": "api",
     "AgentState": "algorithms.base",
     "Algorithm": "algorithms.base",
@@ -76,11 +78,13 @@ _HOME = {
     "Evaluation": "training.evaluation",
     "Evolution": "evolution.config",
     "Export": "export.write",
+    "Goal": "skills.mapping",
     "Guide": "hierarchy.settings",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
     "HierarchyPolicy": "hierarchy.policy",
     "Interrupted": "errors",
+    "LastAction": "skills.mapping",
     "LastCall": "selectors",
     "Layout": "networks.stacked",
     "Lengths": "collecting.lengths",
@@ -94,6 +98,7 @@ _HOME = {
     "PPO": "algorithms.config",
     "ParameterGroup": "algorithms.parameters",
     "ParentSelection": "evolution.selection",
+    "Part": "skills.mapping",
     "Player": "api.player",
     "Policy": "types",
     "PolicyError": "errors",
@@ -153,6 +158,7 @@ __all__ = [
     "TD3",
     "ActingParams",
     "ActionHead",
+    "Acts",
     "Agent",
     "AgentState",
     "Algorithm",
@@ -166,11 +172,13 @@ __all__ = [
     "Evaluation",
     "Evolution",
     "Export",
+    "Goal",
     "Guide",
     "Heir",
     "Hierarchy",
     "HierarchyPolicy",
     "Interrupted",
+    "LastAction",
     "LastCall",
     "Layout",
     "Lengths",
@@ -183,6 +191,7 @@ __all__ = [
     "OptionsEnv",
     "ParameterGroup",
     "ParentSelection",
+    "Part",
     "Player",
     "Policy",
     "PolicyError",

@@ -1,0 +1,81 @@
+"""Policies from elsewhere act behind their mappings as their sources do, called by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from skills.mapped_models import ACTION, CASES, SPACE, Case, observations
+
+from skillweave.skills.foreign_policy import fitted
+from skillweave.types import Array
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("stable_baselines3")
+    folder = tmp_path_factory.mktemp("mapped")
+    return {name: make(folder) for name, make in CASES.items()}
+
+
+def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
+    return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
+
+
+def one(obs: Array, i: int) -> dict[str, Any]:
+    """An observation as an environment returns it."""
+    return {
+        "gyro": obs["gyro"][i],
+        "state": obs["state"][i],
+        "arm": {"joints": obs["arm"]["joints"][i], "grip": obs["arm"]["grip"][i]},
+    }
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_mapped_policy_acts_as_its_source(cases: dict[str, Case], name: str) -> None:
+    case, n = cases[name], 3
+    policy, sources = fit(case.policy), [case.source() for _ in range(n)]
+    memory = policy.start(n)
+    for obs in observations(n, 20):
+        action, memory = policy.act(memory, obs)
+        assert action.dtype == np.float32
+        wanted = [s.act(one(obs, i)) for i, s in enumerate(sources)]
+        np.testing.assert_allclose(action, wanted, atol=1e-5)
+    assert len(np.unique(np.round(wanted, 3))) > 3  # it does something
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_environments_start_again_and_act_at_different_times(
+    cases: dict[str, Case], name: str
+) -> None:
+    case, n = cases[name], 5
+    policy, sources = fit(case.policy), [case.source() for _ in range(n)]
+    memory, rng = policy.start(n), np.random.default_rng(1)
+    for obs in observations(n, 30, seed=1):
+        fresh = np.flatnonzero(rng.random(n) < 0.2)
+        for k, v in policy.start(len(fresh)).items():
+            memory[k][fresh] = v
+        for i in fresh:
+            sources[i] = case.source()
+        rows = np.flatnonzero(rng.random(n) < 0.7)
+        if not len(rows):
+            continue
+        before = {k: v.copy() for k, v in memory.items()}
+        action, after = policy.act({k: v[rows] for k, v in memory.items()}, obs[rows])
+        for k, v in memory.items():
+            np.testing.assert_array_equal(v, before[k])  # a memory is not changed in place
+            v[rows] = after[k]
+        wanted = [sources[i].act(one(obs, i)) for i in rows]
+        np.testing.assert_allclose(action, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_alone_it_acts_as_among_others(cases: dict[str, Case], name: str) -> None:
+    policy = fit(cases[name].policy)
+    together, alone = policy.start(4), policy.start(1)
+    for obs in observations(4, 12, seed=2):
+        actions, together = policy.act(together, obs)
+        action, alone = policy.act(alone, obs[2:3])
+        np.testing.assert_allclose(action[0], actions[2], atol=1e-6)
