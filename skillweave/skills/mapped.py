@@ -538,6 +538,7 @@ class Outputs:
             raise PolicyError(f"{who}: acts has rest, but its outputs are all numbers of an action")
         self.scale = _wide(acts.scale, self.count, f"{who}: acts.scale")
         self.offset = _wide(acts.offset, self.count, f"{who}: acts.offset")
+        self.same = acts.scale == 1.0 and acts.offset == 0.0
         self.template = np.zeros((1, size))
         if self.to is not None and left:
             others = np.setdiff1d(np.arange(size), self.to)
@@ -560,18 +561,11 @@ class Outputs:
         """
         acts, space = self.acts, self.space
         if isinstance(space, Box):
-            numbers = self._numbers(output, n) if acts is not None else output
             if acts is None:
                 action = self._checked(output, n, space, logits, mask, deterministic, rng)
                 return action, output.reshape(n, -1)
-            if acts.clip is not None:
-                numbers = np.minimum(np.maximum(numbers, acts.clip[0]), acts.clip[1])
-            full = numbers * self.scale + self.offset
-            if self.to is not None:
-                values, full = full, self.template.repeat(n, axis=0)
-                full[:, self.to] = values
-            shape = (n, *space.shape)
-            return checked_actions(full.reshape(shape), n, space, self.who), numbers
+            numbers = self._numbers(output, n)
+            return self._scaled(acts, numbers, space), numbers
         if self.to is None:
             return self._checked(output, n, space, logits, mask, deterministic, rng), None
         assert isinstance(space, Discrete)
@@ -596,12 +590,34 @@ class Outputs:
         return decoded(output, n, space, self.who, **how)
 
     def _numbers(self, output: Array, n: int) -> Array:
+        """Return outputs (n, count), clipped.
+
+        Raises:
+            PolicyError: they have another shape, or one is not finite.
+        """
+        acts = self.acts
         if output.size != n * self.count or output.dtype.kind not in "iuf":
             raise PolicyError(
                 f"{self.who} returned {output.dtype} of shape {output.shape}, but numbers of shape "
                 f"{(n, self.count)} were expected: acts writes {self.count} numbers of an action"
             )
-        return output.reshape(n, self.count)
+        if not np.isfinite(output).all():
+            raise PolicyError(f"{self.who} returned a NaN or an infinity as an action")
+        numbers = output.reshape(n, self.count)
+        if acts is not None and acts.clip is not None:
+            numbers = np.minimum(np.maximum(numbers, acts.clip[0]), acts.clip[1])
+        return numbers
+
+    def _scaled(self, acts: Acts, numbers: Array, space: Box) -> Array:
+        """Return actions (n, *shape) for clipped outputs (n, count), within the space's bounds."""
+        if not self.same:
+            numbers = numbers * self.scale + self.offset
+        full = numbers
+        if self.to is not None:
+            full = self.template.repeat(len(numbers), axis=0)
+            full[:, self.to] = numbers
+        full = full.reshape(len(numbers), *space.shape)
+        return np.minimum(np.maximum(full, space.low), space.high).astype(space.dtype)
 
     def _places(self, acts: Acts, size: int) -> Array:
         where = f"{self.who}: acts.to"
