@@ -105,13 +105,17 @@ class _Read:
         return obs if self.places is None else obs[:, self.places]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Goal:
-    """The goal."""
+    """The goal, within its range."""
+
+    place: Goal
 
     def __call__(self, obs: Array, goal: Array | None, last: Array | None) -> Array:
         assert goal is not None
-        return goal
+        if self.place.low is not None:
+            goal = np.maximum(goal, self.place.low)
+        return goal if self.place.high is None else np.minimum(goal, self.place.high)
 
 
 @dataclass(frozen=True)
@@ -276,7 +280,7 @@ class Plan:
         self.state_keys = tuple(f"state.{i}" for i in range(len(self.states)))
         self._leaves = [] if mapping.sees is None else leaves_of(observation_space)
         self._goal = self._fitted_goal()
-        self._range = [s for s in mapping.sources() if isinstance(s, Goal)]
+        self._has_goal = any(isinstance(s, Goal) for s in mapping.sources())
         self.inputs: dict[str, Input] | None = None
         if mapping.remembers_output and not isinstance(action_space, Box):
             raise PolicyError(
@@ -302,20 +306,16 @@ class Plan:
     def read(self, obs: Array, last: Array | None, goal: Array | None) -> dict[str, Array]:
         """Return the inputs of n observations, by name."""
         assert self.inputs is not None
-        if self._range:
+        if self._has_goal:
             goal = self.goal(obs) if goal is None else goal
         return {name: part(obs, goal, last) for name, part in self.inputs.items()}
 
     def goal(self, obs: Array) -> Array:
-        """Return the goals (n, G): the fixed one, or those of the user's function, in range."""
+        """Return the goals (n, G): the fixed one, or those of the user's function."""
         if isinstance(self._goal, np.ndarray):
             return self._goal if len(obs) == 1 else self._goal.repeat(len(obs), axis=0)
         assert self._goal is not None
-        goal = numbers_of(self._goal, obs, f"{self.who}: goal()")
-        for place in self._range:
-            goal = goal if place.low is None else np.maximum(goal, place.low)
-            goal = goal if place.high is None else np.minimum(goal, place.high)
-        return goal
+        return numbers_of(self._goal, obs, f"{self.who}: goal()")
 
     def _fitted_goal(self) -> Array | Callable[[Any], Any] | None:
         goal = self.mapping.goal
@@ -340,7 +340,7 @@ class Plan:
                 if alone and len(found) == 1 and found[0][0].whole:
                     shape = found[0][0].leaf.shape
             elif isinstance(source, Goal):
-                found = [(_Goal(), source, self._goal_width(where))]
+                found = [(_Goal(source), source, self._goal_width(where))]
             elif isinstance(source, LastAction):
                 found = [(_Last(), source, self.outputs.count)]
             else:

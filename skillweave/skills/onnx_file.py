@@ -71,8 +71,8 @@ class OnnxPolicy(MappedPolicy):
             )
         self.output = output or next((n for n in names if n not in states.values()), names[0])
         self._inputs = {i.name: i for i in inputs}
-        self._free = [i.name for i in free]
-        batches = [self._inputs[name].shape[0] for name in self._free]
+        self.free = [i.name for i in free]
+        batches = [self._inputs[name].shape[0] for name in self.free]
         odd_batch = next((n for n in batches if isinstance(n, int) and n != 1), None)
         if odd_batch is not None:
             raise PolicyError(
@@ -102,7 +102,7 @@ class OnnxPolicy(MappedPolicy):
         bound = super().bind(observation_space, action_space, who)
         if self.mapping.sees is not None:
             return bound
-        mine, theirs = self._inputs[self._free[0]].shape[1:], bound.observation_space.shape or ()
+        mine, theirs = self._inputs[self.free[0]].shape[1:], bound.observation_space.shape or ()
         fits = len(mine) == len(theirs) and all(
             a == b for a, b in zip(mine, theirs, strict=True) if isinstance(a, int)
         )
@@ -116,7 +116,7 @@ class OnnxPolicy(MappedPolicy):
 
     def expected(self) -> Shapes:
         """Return the shapes of its inputs, without those of its state."""
-        shapes = {name: self._inputs[name].shape[1:] for name in self._free}
+        shapes = {name: self._inputs[name].shape[1:] for name in self.free}
         return {
             name: tuple(n if isinstance(n, int) else None for n in shape)
             for name, shape in shapes.items()
@@ -135,6 +135,12 @@ class OnnxPolicy(MappedPolicy):
             found.append((tuple(sizes), NUMBERS[given.type]))
         return found
 
+    def single_states(self) -> tuple[tuple[str, str, tuple[int, ...]], ...]:
+        """Return the inputs, outputs and shapes of its recurrent state, as of one environment."""
+        shapes = (self._inputs[name].shape for name, _ in self.mapping.state)
+        single = [tuple(n if isinstance(n, int) else 1 for n in shape) for shape in shapes]
+        return tuple((*pair, shape) for pair, shape in zip(self.mapping.state, single, strict=True))
+
     def call(
         self,
         inputs: Any,
@@ -143,7 +149,7 @@ class OnnxPolicy(MappedPolicy):
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:
         """Run the model."""
-        free = self._free
+        free = self.free
         given = (
             inputs
             if isinstance(inputs, dict) and "" not in inputs
