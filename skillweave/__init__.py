@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skillweave.api.loading import from_hub, load
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
+    from skillweave.api.policies import load_policy, save_policy
     from skillweave.collecting.cluster import Ray
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
@@ -138,6 +139,7 @@ _HOME = {
     "from_torch": "skills",
     "gae": "ops.returns",
     "load": "api.loading",
+    "load_policy": "api.policies",
     "make_options_env": "api.options",
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
@@ -145,6 +147,7 @@ _HOME = {
     "plot_curves": "reporting.curves_figure",
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
+    "save_policy": "api.policies",
     "train_agent": "api",
     "tree": "selectors",
 }
@@ -228,6 +231,7 @@ __all__ = [
     "from_torch",
     "gae",
     "load",
+    "load_policy",
     "make_options_env",
     "mask_logits",
     "masked_mean",
@@ -235,6 +239,7 @@ __all__ = [
     "plot_curves",
     "register_algorithm",
     "register_encoder",
+    "save_policy",
     "train_agent",
     "tree",
 ]

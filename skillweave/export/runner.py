@@ -24,6 +24,9 @@ DTYPES = {  # of inputs, by ONNX's names
     "float16": "f2",
     "int64": "i8",
     "int32": "i4",
+    "int16": "i2",
+    "int8": "i1",
+    "uint16": "u2",
     "uint8": "u1",
 }
 

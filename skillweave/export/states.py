@@ -12,6 +12,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import mapping_entry, model_of
 from skillweave.export.graphs import Graph, agent_graph, worth_graph
+from skillweave.export.network import ExportedNetwork
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.selectors import Automaton
 from skillweave.selectors.base import function_name
@@ -56,6 +57,8 @@ class States:
                 return self._hierarchy(policy, f"{name}/" if name else "", sampled)
             case AgentPolicy():
                 return self._network(agent_graph(policy, sampled, where), name)
+            case ExportedNetwork():
+                return self._exported(policy, name)
             case ScriptedPolicy() if policy.mapping.is_identity:
                 acts: Any = policy.function
             case MappedPolicy():
@@ -88,10 +91,15 @@ class States:
             "margin": None,
         }
         if cuts is not None:
-            if not isinstance(cuts.critic, AgentPolicy):
-                raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
-            graph = worth_graph(cuts.critic, "the skill critic")
-            entry |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
+            name = f"{prefix}critic"
+            match cuts.critic:
+                case AgentPolicy():
+                    critic = self._network(worth_graph(cuts.critic, "the skill critic"), name)
+                case ExportedNetwork():
+                    critic = self._exported(cuts.critic, name)
+                case _:
+                    raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
+            entry |= {"critic": critic, "margin": cuts.margin}
         return entry
 
     def _skill(self, skills: SkillSet, i: int, prefix: str, judged: bool) -> dict[str, Any]:
@@ -133,6 +141,10 @@ class States:
             "memory": {"memory": graph.memory} if graph.memory else {},
             "noise": [list(n) for n in graph.noise],
         }
+
+    def _exported(self, policy: ExportedNetwork, name: str) -> dict[str, Any]:
+        """Return the entry of a network that was loaded from an export, with its new file."""
+        return {"kind": "Network", **policy.entry, "file": self._file(name, policy.data)}
 
     def _model(self, policy: MappedPolicy, name: str, where: str, sampled: bool) -> dict[str, Any]:
         if sampled and isinstance(policy, SB3Policy):
@@ -215,6 +227,8 @@ class States:
                 }
             case AgentPolicy():
                 return self._network(agent_graph(selector, sampled, name), name)
+            case ExportedNetwork():
+                return self._exported(selector, name)
         raise PolicyError(
             f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
             "cannot run: select by an Automaton, by a function, or train the selector"

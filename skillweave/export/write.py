@@ -23,6 +23,8 @@ from skillweave.types import Policy
 
 FORMAT = 2
 """Version of ``policy.json``."""
+MANIFEST = "policy.json"
+"""The name of the file that describes a policy."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ def write_export(
     }
     text = json.dumps(content, indent=1, allow_nan=False)
     runner = Path(__file__).with_name("runner.py").read_bytes()
-    files = states.files | {"policy.json": text.encode(), "runner.py": runner}
+    files = states.files | {MANIFEST: text.encode(), "runner.py": runner}
     for name, data in files.items():
         write_bytes(path / name, data)
     return Export(path, tuple(files), states.code, states.functions)

@@ -658,6 +658,7 @@ class MappedPolicy(Foreign):
         self,
         inputs: Any,
         state: tuple[Array, ...],
+        mask: Array | None,
         deterministic: bool,
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:
@@ -667,6 +668,8 @@ class MappedPolicy(Foreign):
             inputs: arrays by the names of inputs; observations (n, *obs_shape) where no ``sees`` is
                 declared.
             state: the recurrent state, each array with the environments first.
+            mask: (n, A) bool, allowed actions; None: all. Logits are masked afterwards.
+            deterministic: act greedily; else sample with ``rng``.
 
         Returns:
             The outputs (n, ...), and the next state.
@@ -773,11 +776,11 @@ class MappedPolicy(Foreign):
         plan, chunk, n = self.plan, self.plan.mapping.chunk, len(obs)
         inputs = obs if plan.inputs is None else plan.read(obs, memory.get("last"), goal)
         output, state = self.call(
-            inputs, tuple(memory[k] for k in plan.state_keys), deterministic, rng
+            inputs, tuple(memory[k] for k in plan.state_keys), mask, deterministic, rng
         )
         outputs = [output]
         if chunk is not None:
-            if output.ndim < 2 or output.shape[1] < chunk:
+            if output.ndim < (2 if plan.outputs.count <= 1 else 3) or output.shape[1] < chunk:
                 raise PolicyError(
                     f"{self._who} returned shape {output.shape}, but chunk={chunk} needs "
                     f"(n, {chunk}, ...): {chunk} actions for each environment"

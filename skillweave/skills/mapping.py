@@ -228,6 +228,16 @@ class PolicyMapping:
         """Return the parts of all inputs."""
         return [source for parts in (self.sees or {}).values() for source in parts]
 
+    def check_goal(self) -> None:
+        """Raise a DeclarationError where the goal has no place, or is out of its range."""
+        places = [s for s in self.sources() if isinstance(s, Goal)]
+        if self.goal is not None and not places:
+            raise DeclarationError(
+                "goal is given, but the policy does not take it: write Goal() at its place in sees"
+            )
+        if isinstance(self.goal, tuple):
+            _check_in_range(self.goal, places)
+
     def functions(self) -> dict[str, Callable[[Any], Any]]:
         """Return the user's functions in it, by the names under which ``to_json`` has them."""
         found = [s.function for s in self.sources() if isinstance(s, Computed)]
@@ -274,7 +284,7 @@ class PolicyMapping:
         if isinstance(goal, Mapping):
             goal = _function(goal.get("function"), code, "goal")
         acts, scaling = data.get("acts"), data.get("scaling") or {}
-        return cls(
+        mapping = cls(
             sees=None
             if sees is None
             else {
@@ -294,6 +304,8 @@ class PolicyMapping:
             single_state=data.get("single_state") is True,
             scaling={k: _from_json(Scaling, v, f"scaling[{k!r}]") for k, v in scaling.items()},
         )
+        mapping.check_goal()
+        return mapping
 
 
 def mapping_of(
@@ -327,13 +339,7 @@ def mapping_of(
             single_state=single,
             scaling=dict(scaling or {}),
         )
-        places = [s for s in mapping.sources() if isinstance(s, Goal)]
-        if mapping.goal is not None and not places:
-            raise DeclarationError(
-                "goal is given, but the policy does not take it: write Goal() at its place in sees"
-            )
-        if isinstance(mapping.goal, tuple):
-            _check_in_range(mapping.goal, places)
+        mapping.check_goal()
     except DeclarationError as error:
         raise DeclarationError(f"{who}: {error}") from None
     return mapping

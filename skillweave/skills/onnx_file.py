@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -11,7 +12,7 @@ from gymnasium import Space
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError
-from skillweave.messages import shortened
+from skillweave.messages import short, shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import checksum
 from skillweave.skills.mapped import MappedPolicy, Shapes
@@ -24,6 +25,9 @@ NUMBERS = {
     "tensor(float16)": np.float16,
     "tensor(int64)": np.int64,
     "tensor(int32)": np.int32,
+    "tensor(int16)": np.int16,
+    "tensor(int8)": np.int8,
+    "tensor(uint16)": np.uint16,
     "tensor(uint8)": np.uint8,
 }
 """Supported types of an input, by ONNX's names."""
@@ -34,6 +38,8 @@ class OnnxPolicy(MappedPolicy):
 
     kind = "onnx"
     suffix = ".onnx"
+    extra: tuple[str, ...] = ()
+    """Inputs that are neither observations nor state; see ``more_inputs``."""
 
     def __init__(
         self,
@@ -55,9 +61,9 @@ class OnnxPolicy(MappedPolicy):
         states = dict(self.mapping.state)
         for name, after in states.items():
             _check_state(name, after, [i.name for i in inputs], names, file)
-        free = [i for i in inputs if i.name not in states]
+        free = [i for i in inputs if i.name not in states and i.name not in self.extra]
         several = self.mapping.sees is not None and "" not in self.mapping.sees
-        odd = next((i for i in inputs if not i.shape or i.type not in NUMBERS), None)
+        odd = next((i for i in free if not i.shape or i.type not in NUMBERS), None)
         if odd is not None or not free or (len(free) > 1 and not several):
             found = shortened(", ".join(f"{i.name} {i.type}{i.shape}" for i in inputs))
             more = ""
@@ -145,6 +151,7 @@ class OnnxPolicy(MappedPolicy):
         self,
         inputs: Any,
         state: tuple[Array, ...],
+        mask: Array | None,
         deterministic: bool,
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:
@@ -159,6 +166,8 @@ class OnnxPolicy(MappedPolicy):
             name: np.ascontiguousarray(given[name], NUMBERS[self._inputs[name].type])
             for name in free
         }
+        if self.extra:
+            rows |= self.more_inputs(len(rows[free[0]]), mask, rng)
         if self._axes is None and len(rows[free[0]]) != 1:
             found = [
                 self._run({k: v[i : i + 1] for k, v in rows.items()}, [x[i] for x in state])
@@ -174,6 +183,12 @@ class OnnxPolicy(MappedPolicy):
             rows, [np.moveaxis(x, 0, axis) for x, axis in zip(state, axes, strict=True)]
         )
         return output, tuple(np.moveaxis(x, axis, 0) for x, axis in zip(after, axes, strict=True))
+
+    def more_inputs(
+        self, n: int, mask: Array | None, rng: np.random.Generator | None
+    ) -> dict[str, Array]:
+        """Return the inputs named in ``extra``, for n environments."""
+        return {}
 
     def _run(self, rows: dict[str, Array], state: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Run the model on arrays of its own shapes."""
@@ -195,9 +210,11 @@ class OnnxPolicy(MappedPolicy):
 
     def restored(self, content: bytes) -> Self:
         """Return a policy with the same spaces and mapping, and this model."""
-        spaces = self.observation_space, self.action_space
-        policy = type(self)(content, self.file, self.output, *spaces, self.mapping)
-        policy._who = self._who
+        policy = copy.copy(self)
+        policy.data, policy._session = content, _session(content, self.file)
+        given = {i.name: i.shape for i in policy._session.get_inputs()}
+        if given != {name: i.shape for name, i in self._inputs.items()}:
+            raise RunError(f"{self._who}: the copy in the run has other inputs: {short(given)}")
         return policy
 
 

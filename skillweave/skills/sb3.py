@@ -89,6 +89,7 @@ class SB3Policy(MappedPolicy):
         self,
         inputs: Any,
         state: tuple[Array, ...],
+        mask: Array | None,
         deterministic: bool,
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:

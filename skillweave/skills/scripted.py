@@ -54,7 +54,7 @@ class ScriptedPolicy(MappedPolicy):
     ) -> tuple[Array, Memory]:
         """Return the function's actions, checked if the action space is known."""
         if self.action_space is None and self.mapping.is_identity:
-            return self.call(obs, (), deterministic, rng)[0], memory
+            return self.call(obs, (), mask, deterministic, rng)[0], memory
         how: Any = {"deterministic": deterministic, "rng": rng, "goal": goal}
         return super().act(memory, obs, mask, **how)
 
@@ -62,6 +62,7 @@ class ScriptedPolicy(MappedPolicy):
         self,
         inputs: Any,
         state: tuple[Array, ...],
+        mask: Array | None,
         deterministic: bool,
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:

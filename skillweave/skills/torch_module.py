@@ -68,6 +68,7 @@ class TorchPolicy(MappedPolicy):
         self,
         inputs: Any,
         state: tuple[Array, ...],
+        mask: Array | None,
         deterministic: bool,
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:

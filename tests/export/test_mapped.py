@@ -41,6 +41,7 @@ def compare(policy: Any, folder: Path, code: Any) -> None:
     assert len(np.unique(told)) > 3
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", CASES)
 def test_the_runner_applies_the_mapping(name: str, tmp_path: Path) -> None:
     policy = CASES[name](tmp_path).policy.bind(SPACE, ACTION, "it")

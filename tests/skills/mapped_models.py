@@ -315,9 +315,9 @@ def chunked_case(folder: Path) -> Case:
 
 CASES = {
     "onnx": onnx_case,
-    "TorchScript": script_case,
-    "sb3": sb3_case,
-    "recurrent": recurrent_case,
     "function": function_case,
     "chunked": chunked_case,
+    "recurrent": recurrent_case,
+    "TorchScript": script_case,
+    "sb3": sb3_case,
 }
