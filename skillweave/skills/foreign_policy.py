@@ -79,7 +79,7 @@ class Foreign(Memoryless):
         raise NotImplementedError
 
     def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
-        """Return this policy with a recorded mapping.
+        """Return this policy with the recorded mapping ``data``.
 
         Raises:
             RunError: it has none; the message begins with ``where``.

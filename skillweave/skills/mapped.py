@@ -812,7 +812,7 @@ class MappedPolicy(Foreign):
         return found if self.mapping.is_identity else found | {"mapping": self.mapping.to_json()}
 
     def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
-        """Return a copy with a recorded mapping.
+        """Return a copy with the recorded mapping ``data``.
 
         Raises:
             RunError: it cannot be read, or needs a function that this policy does not have.
