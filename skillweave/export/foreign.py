@@ -1,4 +1,7 @@
-"""Models from elsewhere as ONNX files, beside the mapping that the runner applies around them."""
+"""Models from elsewhere as ONNX files, beside the mapping that the runner applies around them.
+
+Stands alone because each kind of model is converted in its own way.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,10 @@ from torch.distributions import Distribution
 from skillweave.errors import PolicyError
 from skillweave.export.graphs import leaves_of, traced
 from skillweave.ops.device import FLOAT
-from skillweave.skills.mapped import MappedPolicy, Plan, invoke, parted
+from skillweave.skills.mapped import MappedPolicy, invoke, parted
 from skillweave.skills.mapping import Computed
 from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.plan import Plan
 from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.torch_module import TorchPolicy
 from skillweave.spaces.packing import parts
@@ -62,7 +66,8 @@ def mapping_entry(
         only: the name of the input that the mapping calls "".
         name_of: returns the runner's name of a user's function; its second argument describes it.
     """
-    mapping, acts = plan.mapping, plan.mapping.acts
+    mapping = plan.mapping
+    acts = plan.mapping.acts
     entry = {"goal": None, "acts": None, "scaling": {}, "chunk": None} | mapping.to_json()
     entry |= {"every": mapping.every, "outputs": plan.outputs.count, "sees": None, "shapes": {}}
     if callable(mapping.goal):
@@ -89,8 +94,11 @@ class _Called(nn.Module):
 
     def __init__(self, policy: TorchPolicy, names: list[str]) -> None:
         super().__init__()
-        self.module, self.mapping, self.who = policy.module, policy.mapping, policy.name
-        self.space, self.names = policy.observation_space, names
+        self.module = policy.module
+        self.mapping = policy.mapping
+        self.who = policy.name
+        self.space = policy.observation_space
+        self.names = names
         weights = [*self.module.parameters(), *self.module.buffers()]
         self.dtype = next((x.dtype for x in weights if x.is_floating_point()), torch.float32)
 
@@ -132,7 +140,8 @@ def _module_model(policy: TorchPolicy, where: str) -> Model:
     states = [(f"state.{i}", f"state.{i}.after", shape) for i, shape in enumerate(shapes)]
     given |= {name: torch.zeros(shape, **FLOAT) for name, _, shape in states}
     outputs = ["output", *(after for _, after, _ in states)]
-    module = _Called(policy, list(inputs or ())).eval()
+    module = _Called(policy, list(inputs or ()))
+    module.training = False  # the policy's module is in evaluation mode already
     return Model(traced(module, given, outputs, where), OBS, "output", tuple(states))
 
 
@@ -141,7 +150,9 @@ class _Predicting(nn.Module):
 
     def __init__(self, policy: SB3Policy, names: list[str]) -> None:
         super().__init__()
-        self.policy, self.names, self.space = policy.policy, names, policy.model_space
+        self.policy = policy.policy
+        self.names = names
+        self.space = policy.model_space
 
     def forward(self, *given: Tensor) -> Tensor:
         """Return the actions in the model's own units."""

@@ -12,9 +12,9 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.settings import Check
-from skillweave.skills.mapped import leaves_of
-from skillweave.skills.mapping import Part, PolicyMapping
+from skillweave.skills.mapping import Part, PolicyMapping, Source
 from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.plan import leaves_of
 from skillweave.types import Array
 
 FileName = Annotated[
@@ -39,6 +39,14 @@ class NetworkEntry(TypedDict):
     """The distribution and width of each of its inputs ``noise.0``, ``noise.1``, …"""
 
 
+def leaf_inputs(space: gym.Space[Any]) -> dict[str, tuple[Source, ...]]:
+    """Return the inputs of a file that takes each leaf of an observation by itself."""
+    leaves = leaves_of(space)
+    names = [f"obs.{leaf.name}" if leaf.fields else "obs" for leaf in leaves]
+    parts = [(Part(leaf.name, one_hot=False),) for leaf in leaves]
+    return dict(zip(names, parts, strict=True))
+
+
 class ExportedNetwork(OnnxPolicy):
     """A network of an export: it returns actions, and takes a mask and noise."""
 
@@ -52,13 +60,12 @@ class ExportedNetwork(OnnxPolicy):
         observation_space: gym.Space[Any],
         action_space: gym.Space[Any],
     ) -> None:
-        self.entry, leaves = entry, leaves_of(observation_space)
-        names = {f"obs.{leaf.name}" if leaf.fields else "obs": leaf.name for leaf in leaves}
+        self.entry = entry
         self.extra = tuple(
             [f"noise.{i}" for i in range(len(entry["noise"]))] + ["mask"] * bool(entry["choices"])
         )
         mapping = PolicyMapping(
-            sees={name: (Part(key, one_hot=False),) for name, key in names.items()},
+            sees=leaf_inputs(observation_space),
             state=tuple((name, f"{name}.after") for name in entry["memory"]),
         )
         super().__init__(content, file, None, observation_space, action_space, mapping)

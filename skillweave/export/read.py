@@ -1,11 +1,13 @@
 """Policies from folders with a ``policy.json``: the counterpart of ``write``, and its schema.
 
-Only data is read: ONNX files and JSON. Python code is given by name.
+Only data is read: ONNX files and JSON. Python code is given by name. Stands alone because no part
+of an export needs it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -17,7 +19,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError, SkillweaveError
-from skillweave.export.network import ExportedNetwork, FileName, NetworkEntry
+from skillweave.export.network import ExportedNetwork, FileName, NetworkEntry, leaf_inputs
 from skillweave.export.write import FORMAT, MANIFEST
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
@@ -154,7 +156,9 @@ class _Reading:
     """The content of a folder while its policy is made."""
 
     def __init__(self, folder: Path, code: Mapping[str, Callable[..., Any]]) -> None:
-        self.folder, self.file, self.code = folder, folder / MANIFEST, code
+        self.folder = folder
+        self.file = folder / MANIFEST
+        self.code = code
         data = parse_json(read_file(self.file, LARGEST), self.file)
         version = data.get("format") if isinstance(data, dict) else None
         if version != FORMAT:
@@ -246,6 +250,8 @@ class _Reading:
             function = self._function(fitted["code"], path)
             scripted = ScriptedPolicy(function, *self.spaces, mapping)
             return self._bound(scripted, path)  # type: ignore[no-any-return]
+        if mapping.sees is None:
+            mapping = replace(mapping, sees=leaf_inputs(self.spaces[0]))
         file, content = self._content(fitted["file"], path)
         try:
             policy = OnnxPolicy(content, file, fitted["output"], *self.spaces, mapping)
@@ -289,7 +295,8 @@ class _Reading:
 
     def _hierarchy(self, entry: dict[str, Any], path: str) -> HierarchyPolicy:
         fitted: HierarchyEntry = self._fit(HierarchyEntry, entry, path)
-        skills, policies = [], []
+        skills = []
+        policies = []
         for i, one in enumerate(fitted["skills"]):
             policies.append(self._policy(one["policy"], f"{path}.skills[{i}].policy"))
             skills.append(self._skill(one, f"{path}.skills[{i}]"))
@@ -324,7 +331,8 @@ class _Reading:
                 methods[name] = _method(function)
         kind = type("Exported", (RecordedSkill,), methods | {"name": entry["name"]})
         skill: RecordedSkill = kind()
-        skill.max_steps, skill.call_steps = entry["max_steps"], entry["limit"]
+        skill.max_steps = entry["max_steps"]
+        skill.call_steps = entry["limit"]
         try:
             skill.validate()
         except DeclarationError as error:

@@ -87,10 +87,12 @@ class Runner:
 
     def action(self, value: Any) -> Any:
         """Return an action that code gave, within its space."""
-        space, dtype = self.space, self.space.get("dtype", "int64")
+        space = self.space
+        dtype = self.space.get("dtype", "int64")
         shape = space.get("shape", np.shape(space.get("nvec", 0)))
         if space["type"] == "MultiBinary":
-            shape, dtype = space["n"], "int8"
+            shape = space["n"]
+            dtype = "int8"
         if space["type"] == "Box":
             low, high = (np.array(wide(space[k]), dtype) for k in ("low", "high"))
             value = np.reshape(value, shape)
@@ -158,7 +160,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
         self.reset()
 
     def reset(self) -> None:
-        self.phase, self.last = 0, np.zeros((1, self.entry["outputs"]))
+        self.phase = 0
+        self.last = np.zeros((1, self.entry["outputs"]))
         states = ((s, self.dtypes.get(s["input"], "f8")) for s in self.entry["state"])
         self.state = [np.zeros(s["shape"], dtype) for s, dtype in states]
 
@@ -171,7 +174,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
 
     def inferred(self, mask: Any) -> list[Any]:
         """Return the actions of one inference, in their order."""
-        sees, chunk = self.entry["sees"], self.entry["chunk"]
+        sees = self.entry["sees"]
+        chunk = self.entry["chunk"]
         given = self.runner.feeds if self.session else {"": self.runner.obs}
         if sees is not None:
             given = {name: self.seen(name, parts) for name, parts in sees.items()}
@@ -209,7 +213,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
 
     def part(self, part: Any) -> Any:
         """Return the numbers of a part of an input, (1, K)."""
-        obs, goal = self.runner.obs, self.entry["goal"]
+        obs = self.runner.obs
+        goal = self.entry["goal"]
         if part["source"] == "last_action":
             return self.last
         if part["source"] == "function":
@@ -231,7 +236,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
 
     def action(self, x: Any, mask: Any) -> Any:
         """Return the action that an output (1, ...) means."""
-        space, acts = self.runner.space, self.entry["acts"] or {}
+        space = self.runner.space
+        acts = self.entry["acts"] or {}
         to = acts.get("to")
         if space["type"] == "Box":
             x = np.reshape(x, (1, -1))
@@ -243,7 +249,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
                 full = np.zeros((1, size))
                 others = np.setdiff1d(np.arange(size), to)
                 full[:, others] = acts.get("rest", 0.0) if len(others) else 0.0
-                full[:, to], x = x, full
+                full[:, to] = x
+                x = full
             return self.runner.action(x)
         if x.dtype.kind == "f" and self.entry["logits"]:
             return self.runner.action(self.chosen(x, space, to, mask))
@@ -251,7 +258,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
 
     def chosen(self, x: Any, space: Any, to: Any, mask: Any) -> Any:
         """Return the best choices by logits (1, ...), or those that are drawn."""
-        binary, rng = space["type"] == "MultiBinary", self.runner.rng
+        binary = space["type"] == "MultiBinary"
+        rng = self.runner.rng
         if self.entry["sampled"]:
             x = x + (rng.logistic if binary else rng.gumbel)(size=x.shape)
         if binary:

@@ -278,12 +278,15 @@ class PolicyMapping:
         """
         if not isinstance(data, Mapping):
             raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
-        code, sees, goal = code or {}, data.get("sees"), data.get("goal")
+        code = code or {}
+        sees = data.get("sees")
+        goal = data.get("goal")
         if sees is not None and not isinstance(sees, Mapping):
             raise DeclarationError(f"sees is {short(sees)}; it must be an object with each input")
         if isinstance(goal, Mapping):
             goal = _function(goal.get("function"), code, "goal")
-        acts, scaling = data.get("acts"), data.get("scaling") or {}
+        acts = data.get("acts")
+        scaling = data.get("scaling") or {}
         mapping = cls(
             sees=None
             if sees is None

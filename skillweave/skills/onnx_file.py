@@ -15,8 +15,9 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunEr
 from skillweave.messages import short, shortened
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import checksum
-from skillweave.skills.mapped import MappedPolicy, Shapes
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.skills.plan import Shapes
 from skillweave.types import Array
 
 NUMBERS = {
@@ -51,9 +52,11 @@ class OnnxPolicy(MappedPolicy):
         mapping: PolicyMapping | None = None,
     ) -> None:
         super().__init__(str(file), observation_space, action_space, mapping)
-        self.data, self.file = data, file
+        self.data = data
+        self.file = file
         self._session = _session(data, file)
-        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        inputs = self._session.get_inputs()
+        outputs = self._session.get_outputs()
         names = [o.name for o in outputs]
         if output is not None and output not in names:
             has = shortened(", ".join(names))
@@ -108,7 +111,8 @@ class OnnxPolicy(MappedPolicy):
         bound = super().bind(observation_space, action_space, who)
         if self.mapping.sees is not None:
             return bound
-        mine, theirs = self._inputs[self.free[0]].shape[1:], bound.observation_space.shape or ()
+        mine = self._inputs[self.free[0]].shape[1:]
+        theirs = bound.observation_space.shape or ()
         fits = len(mine) == len(theirs) and all(
             a == b for a, b in zip(mine, theirs, strict=True) if isinstance(a, int)
         )
@@ -211,7 +215,8 @@ class OnnxPolicy(MappedPolicy):
     def restored(self, content: bytes) -> Self:
         """Return a policy with the same spaces and mapping, and this model."""
         policy = copy.copy(self)
-        policy.data, policy._session = content, _session(content, self.file)
+        policy.data = content
+        policy._session = _session(content, self.file)
         given = {i.name: i.shape for i in policy._session.get_inputs()}
         if given != {name: i.shape for name, i in self._inputs.items()}:
             raise RunError(f"{self._who}: the copy in the run has other inputs: {short(given)}")

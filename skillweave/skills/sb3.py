@@ -20,8 +20,9 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import checksum
-from skillweave.skills.mapped import MappedPolicy, Shapes
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
+from skillweave.skills.plan import Shapes
 from skillweave.skills.torch_module import weights_of, with_weights
 from skillweave.types import Array
 
@@ -52,7 +53,9 @@ class SB3Policy(MappedPolicy):
         seen = None if mapping.sees is not None else model.observation_space
         taken = None if mapping.acts is not None else model.action_space
         super().__init__(name, seen, taken, mapping)
-        self.policy, self.file, self.sha256 = model.policy, file, sha256
+        self.policy = model.policy
+        self.file = file
+        self.sha256 = sha256
         if hasattr(self.policy, "lstm_actor"):
             raise PolicyError(
                 f"{name} has a recurrent policy, whose state predict() would forget here: give its "
@@ -63,7 +66,8 @@ class SB3Policy(MappedPolicy):
         """Return a copy; images may have their channels last if the model transposes them."""
         bound = super().bind(observation_space, action_space, who)
         bound.policy = copy.deepcopy(self.policy)
-        mine, theirs = self.model_space, observation_space
+        mine = self.model_space
+        theirs = observation_space
         if (
             self.mapping.sees is None
             and isinstance(mine, Box)

@@ -67,7 +67,8 @@ class ScriptedPolicy(MappedPolicy):
         rng: np.random.Generator | None,
     ) -> tuple[Array, tuple[Array, ...]]:
         """Call the function."""
-        who, mapping = self._who, self.mapping
+        who = self._who
+        mapping = self.mapping
         if isinstance(inputs, dict):
             arguments = {k: read_only(v) for k, v in inputs.items()}
         else:

@@ -38,7 +38,7 @@ class TorchPolicy(MappedPolicy):
     Args:
         module: the module.
         file: the file that it was loaded from, if any.
-        sha256: the checksum of that file.
+        content: the content of that file.
     """
 
     kind = "torch"
@@ -51,11 +51,24 @@ class TorchPolicy(MappedPolicy):
         action_space: Any = None,
         mapping: PolicyMapping | None = None,
         file: Path | None = None,
-        sha256: str | None = None,
+        content: bytes = b"",
     ) -> None:
         name = str(file) if file else f"module {type(module).__name__}"
         super().__init__(name, observation_space, action_space, mapping)
-        self.module, self.file, self.sha256 = module, file, sha256
+        self.module = module
+        self.file = file
+        self.data = content
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        if self.file is not None:  # such modules cannot be pickled
+            del state["module"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.file is not None:
+            self.module = _module_in(self.data, self.file)
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy in evaluation mode, independent of later changes of the module."""
@@ -106,7 +119,9 @@ class TorchPolicy(MappedPolicy):
         """Return the module's class, the checksum of its weights or its file, and the mapping."""
         found = super().source() | {"name": qualified(type(self.module))}
         return (
-            found if self.file is None else found | {"file": str(self.file), "sha256": self.sha256}
+            found
+            if self.file is None
+            else found | {"file": str(self.file), "sha256": checksum(self.data)}
         )
 
     def content(self) -> bytes | None:
@@ -181,9 +196,7 @@ def from_torch(
             )
         content = read_file(file)
         loaded = _module_in(content, file)
-        return TorchPolicy(
-            loaded, observation_space, action_space, mapping, file, checksum(content)
-        )
+        return TorchPolicy(loaded, observation_space, action_space, mapping, file, content)
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
     return TorchPolicy(module, observation_space, action_space, mapping)

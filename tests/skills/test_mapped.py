@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import cloudpickle
 import numpy as np
 import pytest
 from skills.mapped_models import ACTION, CASES, SPACE, Case, observations
@@ -79,3 +80,14 @@ def test_alone_it_acts_as_among_others(cases: dict[str, Case], name: str) -> Non
         actions, together = policy.act(together, obs)
         action, alone = policy.act(alone, obs[2:3])
         np.testing.assert_allclose(action[0], actions[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_acts_the_same_in_another_process(cases: dict[str, Case], name: str) -> None:
+    policy = fit(cases[name].policy)
+    sent = cloudpickle.loads(cloudpickle.dumps(policy))
+    memory, memories = policy.start(3), sent.start(3)
+    for obs in observations(3, 5, seed=3):
+        action, memory = policy.act(memory, obs)
+        other, memories = sent.act(memories, obs)
+        np.testing.assert_array_equal(other, action)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,9 @@ def test_an_image_alone_keeps_its_shape() -> None:
     scaled = seen(sw.Part("camera", scale=1 / 255), space, obs)
     np.testing.assert_allclose(scaled, obs["camera"] / 255)
     assert seen(sw.Part(), space, obs).shape == (2, 2)  # as of a network: without images
+    films = Dict({"eyes": Dict({"l": space["camera"], "r": space["camera"]})})
+    with pytest.raises(PolicyError, match="'eyes', which has images alone: name one of them"):
+        sw.from_function(zeros, sees="eyes").bind(films, ACTION, "it")
 
 
 def test_a_goal_that_is_given_to_act_replaces_the_fixed_one() -> None:
@@ -89,6 +93,24 @@ def test_a_goal_that_is_given_to_act_replaces_the_fixed_one() -> None:
     policy.act({}, obs)
     policy.act({}, obs, goal=np.array([[3, 4], [5, 6]]))
     assert found[-2:] == [[[2, 4], [2, 4]], [[6, 8], [10, 12]]]
+
+
+def test_goals_and_computed_numbers_keep_their_number() -> None:
+    widths = iter([2, 2, 2, 2, 3])
+
+    def grows(obs: Array) -> Array:
+        return np.zeros((len(obs), next(widths)))
+
+    policy = fit(sw.from_function(zeros, sees=("gyro", sw.Goal()), goal=(1, 2)))
+    with pytest.raises(PolicyError, match=r"the goal has shape \(2, 3\), but \(2,\) was"):
+        policy.act({}, observations(2, 1)[0], goal=np.zeros((2, 3)))
+    for how in ({"sees": ("gyro", grows)}, {"sees": sw.Goal(), "goal": grows}):
+        widths = iter([2, 2, 3])
+        policy = fit(sw.from_function(zeros, **how))
+        with pytest.raises(PolicyError, match=r"returned numbers of shape \(3,\).*\(2,\) at first"):
+            policy.act({}, observations(2, 1)[0])
+    with pytest.raises(PolicyError, match="returned a NaN or an infinity"):
+        fit(sw.from_function(lambda x: zeros(x) * np.nan, acts=sw.Acts(clip=(-1, 1))))
 
 
 def test_choices_of_a_policy_may_have_other_numbers_in_the_environment() -> None:
@@ -130,6 +152,8 @@ def test_a_program_of_torch_export_acts_with_a_batch_or_without(tmp_path: Any) -
         obs = observations(3, 1)[0]
         wanted = np.clip(obs["gyro"] @ weights(3, 5) + 0.5, -2, 2)
         np.testing.assert_allclose(policy.act({}, obs)[0], wanted, atol=1e-6)
+        again = pickle.loads(pickle.dumps(policy))  # as it is sent to another process
+        np.testing.assert_array_equal(again.act({}, obs)[0], policy.act({}, obs)[0])
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"trust": 1}])
