@@ -18,7 +18,6 @@ from skillweave.errors import PolicyError
 from skillweave.export.graphs import leaves_of, traced
 from skillweave.ops.device import FLOAT
 from skillweave.skills.mapped import MappedPolicy, invoke, parted
-from skillweave.skills.mapping import Computed
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.plan import Plan
 from skillweave.skills.sb3 import SB3Policy
@@ -70,20 +69,16 @@ def mapping_entry(
     acts = plan.mapping.acts
     entry = {"goal": None, "acts": None, "scaling": {}, "chunk": None} | mapping.to_json()
     entry |= {"every": mapping.every, "outputs": plan.outputs.count, "sees": None, "shapes": {}}
+    what = "observations (1, ...) to numbers (1, ...)"
+    names = {id(function): name_of(function, what) for function in mapping.functions().values()}
     if callable(mapping.goal):
-        what = "observations (1, ...) to a goal (1, numbers)"
-        entry["goal"] = {"function": name_of(mapping.goal, what)}
+        entry["goal"] = {"function": names[id(mapping.goal)]}
     if acts is not None and plan.outputs.to is not None:
         entry["acts"]["to"] = plan.outputs.to.tolist()
     if plan.inputs is not None:
         entry["sees"] = {}
         for name, given in plan.inputs.items():
-            described = given.to_json()
-            for part, (source, _) in zip(described, given.sources, strict=True):
-                if isinstance(source, Computed) and source.function is not None:
-                    what = "observations (1, ...) to numbers (1, ...)"
-                    part["function"] = name_of(source.function, what)
-            entry["sees"][name or only] = described
+            entry["sees"][name or only] = given.to_json(names)
             entry["shapes"][name or only] = list(given.shape)
         entry["scaling"] = {name or only: v for name, v in entry["scaling"].items()}
     return entry

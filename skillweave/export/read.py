@@ -31,7 +31,7 @@ from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.skills.mapping import PolicyMapping
+from skillweave.skills.mapping import PolicyMapping, checked_goal
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import space_from_json
@@ -176,13 +176,17 @@ class _Reading:
         self.spaces = self._space("observation_space"), self._space("action_space")
 
     def policy(self, goal: Any) -> Policy:
-        """Return the whole policy."""
-        entry = self.content["policy"]
+        """Return the whole policy, a single one with this ``goal``."""
+        policy = self._policy(self.content["policy"], "policy")
         if goal is not None:
-            if entry.get("kind") != "Model" or not isinstance(entry.get("sees"), dict):
-                raise DeclarationError(f"{self.folder}: its policy takes no goal")
-            entry = entry | {"goal": goal}
-        policy = self._policy(entry, "policy")
+            if not isinstance(policy, MappedPolicy):
+                raise DeclarationError(f"load_policy(): the policy in {self.folder} takes no goal")
+            try:
+                policy.mapping = replace(policy.mapping, goal=checked_goal(goal))
+                policy.mapping.check_goal()
+            except DeclarationError as error:
+                raise DeclarationError(f"load_policy(): {self.folder}: {error}") from None
+            policy.fit_mapping()
         if isinstance(policy, MappedPolicy):
             policy.try_out()
         return policy

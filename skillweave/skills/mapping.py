@@ -242,16 +242,30 @@ class PolicyMapping:
         """Return the user's functions in it, by the names under which ``to_json`` has them."""
         found = [s.function for s in self.sources() if isinstance(s, Computed)]
         found += [self.goal] if callable(self.goal) else []
-        return {function_name(f): f for f in found if f is not None}
+        named: dict[str, Callable[[Any], Any]] = {}
+        for function in found:
+            if function is not None and not any(function is other for other in named.values()):
+                name = function_name(function)
+                number = 2
+                while name in named:
+                    name = f"{function_name(function)}#{number}"
+                    number += 1
+                named[name] = function
+        return named
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON; settings that have their defaults are left out."""
+        names = {id(function): name for name, function in self.functions().items()}
         content: dict[str, Any] = {}
         if self.sees is not None:
-            content["sees"] = {k: [source_to_json(s) for s in v] for k, v in self.sees.items()}
-        if self.goal is not None:
-            goal = self.goal
-            content["goal"] = {"function": function_name(goal)} if callable(goal) else list(goal)
+            content["sees"] = {
+                name: [source_to_json(part, names) for part in parts]
+                for name, parts in self.sees.items()
+            }
+        if callable(self.goal):
+            content["goal"] = {"function": names[id(self.goal)]}
+        elif self.goal is not None:
+            content["goal"] = list(self.goal)
         if self.acts is not None:
             content["acts"] = _to_json(self.acts)
         content |= {"every": self.every} if self.every != 1 else {}
@@ -560,10 +574,18 @@ def _slice_of(text: str) -> slice | None:
     return slice(*values) if len(bounds) in (2, 3) else None
 
 
-def source_to_json(source: Source) -> dict[str, Any]:
-    """Return a source as JSON; settings that have their defaults are left out."""
+def source_to_json(source: Source, names: Mapping[int, str]) -> dict[str, Any]:
+    """Return a source as JSON; settings that have their defaults are left out.
+
+    Args:
+        source: the source.
+        names: of the user's functions, by ``id``.
+    """
     kind = next(name for name, kind in KINDS.items() if isinstance(source, kind))
-    return {"source": kind, **_to_json(source)}
+    content = {"source": kind, **_to_json(source)}
+    if isinstance(source, Computed):
+        content["function"] = names[id(source.function)]
+    return content
 
 
 def _to_json(settings: Any) -> dict[str, Any]:
@@ -572,10 +594,10 @@ def _to_json(settings: Any) -> dict[str, Any]:
         value = getattr(settings, entry.name)
         if entry.default is not MISSING and value == entry.default:
             continue
+        if callable(value):
+            continue
         if entry.name in ("places", "to"):
             value = places_to_json(value)
-        elif callable(value):
-            value = function_name(value)
         content[entry.name] = list(value) if isinstance(value, tuple) else value
     return content
 

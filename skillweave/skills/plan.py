@@ -236,11 +236,14 @@ class Input:
             x = scaling(x)
         return x.reshape(len(x), *self.shape) if self.reshaped else x
 
-    def to_json(self) -> list[dict[str, Any]]:
-        """Return its sources for files: each names one leaf, with its fields and choices."""
+    def to_json(self, names: Mapping[int, str]) -> list[dict[str, Any]]:
+        """Return its sources for files: each names one leaf, with its fields and choices.
+
+        ``names`` has the names of the user's functions, by ``id``.
+        """
         content = []
         for piece, (source, _) in zip(self.pieces, self.sources, strict=True):
-            entry = source_to_json(source)
+            entry = source_to_json(source, names)
             if isinstance(piece, _Read):
                 leaf = piece.leaf
                 hot = piece.one_hot and not piece.whole

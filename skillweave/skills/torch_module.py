@@ -220,7 +220,10 @@ def _module_in(content: bytes, file: Path) -> nn.Module:
     except zipfile.BadZipFile as error:
         raise PolicyError(wrong) from error
     script = any("/code/" in f"/{name}" for name in names)
-    exported = any("models/" in name or "serialized_exported_program" in name for name in names)
+    exported = any(
+        f"/{name}".endswith(("/archive_format", "/serialized_exported_program.json"))
+        for name in names
+    )
     if not script and not exported:
         raise PolicyError(wrong)
     try:

@@ -98,13 +98,17 @@ def test_models_of_stable_baselines3_are_exported(kind: str, env: str, tmp_path:
 
     less = {} if kind == "PPO" else {"buffer_size": 100}
     model = getattr(sb3, kind)("MlpPolicy", env, seed=0, device="cpu", **less)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for weight in model.policy.parameters():  # far from zeros, so that actions differ
+            weight += torch.randn_like(weight)
     policy = sw.from_sb3(model)
     write_export(tmp_path, policy, env)
     runner, loaded = Runner(tmp_path), Player(sw.load_policy(tmp_path))
     rng, size = np.random.default_rng(0), policy.observation_space.shape
     told = []
     for _ in range(30):
-        obs = 9.0 * rng.normal(size=size).astype(np.float32)
+        obs = rng.normal(size=size).astype(np.float32)
         wanted = model.predict(obs, deterministic=True)[0]
         np.testing.assert_allclose(runner.act(obs), wanted, atol=1e-5)
         np.testing.assert_allclose(loaded.act(obs), wanted, atol=1e-5)

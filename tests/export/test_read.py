@@ -141,10 +141,10 @@ def test_a_goal_may_be_replaced(tmp_path: Path) -> None:
     other: Any = sw.load_policy(tmp_path, goal=(1, -1))
     wanted = policy.act({}, obs, goal=np.array([[1.0, -1.0]] * 2))[0]
     np.testing.assert_allclose(other.act({}, obs)[0], wanted, atol=1e-6)
-    with pytest.raises(SkillweaveError, match=r"policy.json: policy.*goal"):
+    with pytest.raises(SkillweaveError, match=r"load_policy\(\): .*goal is .*out of the range"):
         sw.load_policy(tmp_path, goal=(2, 0))
     sw.save_policy(sw.from_onnx(onnx_file(tmp_path / "x.onnx")), tmp_path / "no", "CartPole-v1")
-    with pytest.raises(DeclarationError, match="its policy takes no goal"):
+    with pytest.raises(DeclarationError, match=r"load_policy\(\): .*no: goal is given, but"):
         sw.load_policy(tmp_path / "no", goal=1)
 
 

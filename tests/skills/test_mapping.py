@@ -361,6 +361,14 @@ def test_a_mapping_is_read_back_from_json() -> None:
         PolicyMapping.from_json(data)
 
 
+def test_functions_of_one_name_are_told_apart() -> None:
+    one, two = (lambda obs, k=k: obs["gyro"] * k for k in (1.0, 2.0))
+    mapping = sw.from_function(zeros, sees=(one, two, one, sw.Goal()), goal=two).mapping
+    assert len(mapping.functions()) == 2
+    data = json.loads(json.dumps(mapping.to_json()))
+    assert PolicyMapping.from_json(data, mapping.functions()) == mapping
+
+
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
