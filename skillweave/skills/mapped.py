@@ -198,7 +198,7 @@ class MappedPolicy(Foreign):
             after[key] = value
         if "last" in memory:
             assert last is not None
-            after["last"] = np.asarray(last, np.float64)
+            after["last"] = last.astype(np.float64)  # a copy, as all that is remembered
         return actions, after
 
     def source(self) -> dict[str, Any]:

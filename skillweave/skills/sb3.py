@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import copy
 import io
-import pickle
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from gymnasium import Space
+from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
-from skillweave.reading import read_file
+from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
@@ -197,7 +196,10 @@ def from_sb3(
 
 def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
     """Return the declared mapping, with the statistics of ``VecNormalize`` in it."""
-    scaling = {} if normalize is None else _statistics(normalize, trust, model.observation_space)
+    scaling: dict[str, Scaling] = {}
+    if normalize is not None:
+        spaces = model.observation_space, model.action_space
+        scaling = _statistics(normalize, trust, *spaces)
     if scaling and options["sees"] is None:
         space = model.observation_space
         whole: Any = Part(one_hot=False)
@@ -207,7 +209,26 @@ def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -
     return mapping_of("from_sb3()", **options, scaling=scaling)
 
 
-def _statistics(normalize: Any, trust: bool, space: Any) -> dict[str, Scaling]:
+def _opened_statistics(file: Path, space: Space[Any], action_space: Space[Any]) -> Any:
+    """Return the ``VecNormalize`` in a file, for a model with these spaces."""
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    # VecNormalize compares the spaces of its environment, and no more.
+    spaces = {"observation_space": space, "action_space": action_space}
+    stub: Any = type("Stub", (Env,), spaces)
+    check_file(file)
+    try:
+        return VecNormalize.load(str(file), DummyVecEnv([stub]))
+    except (Exception, SystemExit) as error:
+        raise PolicyError(
+            f"{file} could not be opened as the VecNormalize of observations {space}: "
+            f"{error_text(error)}"
+        ) from error
+
+
+def _statistics(
+    normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
+) -> dict[str, Scaling]:
     """Return the scaling of observations by ``VecNormalize``, by the name of the input."""
     if isinstance(normalize, str | Path):
         file = Path(normalize)
@@ -216,18 +237,14 @@ def _statistics(normalize: Any, trust: bool, space: Any) -> dict[str, Scaling]:
                 f"{file} was not opened: VecNormalize is saved as a pickle, which can run any code "
                 "on your machine. If you trust its author, add trust=True"
             )
-        content = read_file(file)
-        try:
-            normalize = pickle.loads(content)
-        except Exception as error:
-            raise PolicyError(
-                f"{file} could not be opened as VecNormalize: {error_text(error)}"
-            ) from error
+        normalize = _opened_statistics(file, space, action_space)
     rms: Any = getattr(normalize, "obs_rms", None)
     if not getattr(normalize, "norm_obs", True):
         return {}
     by_name = dict(rms) if isinstance(rms, dict) else {"": rms}
-    if rms is None or isinstance(space, Dict) != isinstance(rms, dict):
+    parts = dict(space.spaces) if isinstance(space, Dict) else {"": space}
+    shapes = {name: np.shape(getattr(one, "mean", 0.0)) for name, one in by_name.items()}
+    if any(name not in parts or parts[name].shape != shape for name, shape in shapes.items()):
         raise DeclarationError(
             f"normalize is {short(normalize)}; it must be the VecNormalize of the model, with "
             f"statistics of observations {space}"

@@ -81,7 +81,7 @@ class ScriptedPolicy(MappedPolicy):
                 if action.shape == (len(given), *shape):
                     probe(self.function, given, len(given), who, shape, PolicyError)
             return action, ()
-        before = model_state(state, mapping.state)
+        before = [read_only(x) for x in model_state(state, mapping.state)]
         value = called(
             lambda given: invoke(self.function, given, before, mapping.single_state),
             arguments,
@@ -89,7 +89,8 @@ class ScriptedPolicy(MappedPolicy):
             kind=PolicyError,
         )
         action, after = parted(value, mapping, who)
-        arrays = [as_array(x, who, PolicyError) for x in after]
+        # Copies: the function may return the same arrays each time.
+        arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
         return as_array(action, who, PolicyError), rows_first(arrays, mapping.state, who)
 
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:

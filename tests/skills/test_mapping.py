@@ -113,6 +113,31 @@ def test_goals_and_computed_numbers_keep_their_number() -> None:
         fit(sw.from_function(lambda x: zeros(x) * np.nan, acts=sw.Acts(clip=(-1, 1))))
 
 
+def test_what_is_remembered_is_no_array_of_the_users() -> None:
+    kept, out = np.zeros((2, 1)), np.zeros((2, 5))
+
+    def counts(x: Array, state: Array) -> Any:
+        kept[:] = state + 1  # the same arrays at each call
+        out[:] = kept / 100 + x[:, 3:] / 10
+        return out, kept
+
+    policy = sw.from_function(counts, sees=("gyro", sw.LastAction()), state=(None, 1))
+    policy = policy.bind(SPACE, ACTION, "it")
+    memory, obs = policy.start(2), observations(2, 1)[0]
+    _, first = policy.act(memory, obs)
+    _, second = policy.act(first, obs)
+    assert first["state.0"].tolist() == [[1], [1]]
+    assert second["state.0"].tolist() == [[2], [2]]
+    assert first["last"].max() < second["last"].max()
+
+    def changes(x: Array, state: Array) -> Any:
+        state += 1
+        return zeros(x), state
+
+    with pytest.raises(PolicyError, match=r"changes\(\) raised ValueError.*read-only"):
+        fit(sw.from_function(changes, state=(None, 1)))
+
+
 def test_choices_of_a_policy_may_have_other_numbers_in_the_environment() -> None:
     space = Box(-1, 1, (3,), np.float32)
     net = torch.nn.Identity()
@@ -163,6 +188,25 @@ def test_files_that_can_run_code_are_not_opened_without_trust(kwargs: Any, tmp_p
     pytest.importorskip("stable_baselines3")
     with pytest.raises(PolicyError, match=r"normal.pkl was not opened.*trust=True"):
         sw.from_sb3(a_model(), normalize=tmp_path / "normal.pkl", **kwargs)
+
+
+def test_statistics_of_another_model_are_refused(tmp_path: Any) -> None:
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    other = VecNormalize(make_vec_env("Pendulum-v1"))
+    other.save(str(tmp_path / "other.pkl"))
+    (tmp_path / "junk.pkl").write_bytes(b"junk")
+    for name in ("other", "junk"):
+        with pytest.raises(PolicyError, match=rf"{name}.pkl could not be opened as the VecNormal"):
+            sw.from_sb3(a_model(), normalize=tmp_path / f"{name}.pkl", trust=True)
+    with pytest.raises(RunError, match=r"none.pkl does not exist"):
+        sw.from_sb3(a_model(), normalize=tmp_path / "none.pkl", trust=True)
+    with pytest.raises(DeclarationError, match="normalize is 3; it must be the VecNormalize"):
+        sw.from_sb3(a_model(), normalize=3)
+    with pytest.raises(DeclarationError, match="statistics of observations Box"):
+        sw.from_sb3(a_model(), normalize=other)
 
 
 def a_model() -> Any:
