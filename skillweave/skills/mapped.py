@@ -125,7 +125,12 @@ class MappedPolicy(Foreign):
 
         ``goal`` (n, G) replaces the mapping's own goal.
         """
-        plan = self.plan
+        plan = self._plan or self.plan
+        if plan.remembers_nothing:
+            inputs = obs if plan.inputs is None else plan.read(obs, None, goal)
+            output, _ = self.call(inputs, (), mask, deterministic, rng)
+            act = plan.outputs
+            return act(output, len(obs), self.logits, mask, deterministic, rng)[0], memory
         period = plan.mapping.period
         how: Any = {"deterministic": deterministic, "rng": rng}
         if period == 1:
@@ -186,8 +191,6 @@ class MappedPolicy(Foreign):
             now = mask if i == 0 else None
             action, last = plan.outputs(one, n, self.logits, now, deterministic, rng)
             actions.append(action)
-        if not plan.state_keys and "last" not in memory:
-            return actions, dict(memory)
         after = dict(memory)
         for key, value in zip(plan.state_keys, state, strict=True):
             if value.shape != memory[key].shape:
@@ -198,7 +201,8 @@ class MappedPolicy(Foreign):
             after[key] = value
         if "last" in memory:
             assert last is not None
-            after["last"] = last.astype(np.float64)  # a copy, as all that is remembered
+            # A copy, as all that is remembered.
+            after["last"] = last.reshape(n, -1).astype(np.float64)
         return actions, after
 
     def source(self) -> dict[str, Any]:

@@ -94,6 +94,9 @@ class OnnxPolicy(MappedPolicy):
         if 1 not in batches and None not in axes:
             self._axes = tuple(axis for axis in axes if axis is not None)
 
+        self._plain = len(self.free) == 1 and not states and not self.extra
+        self._dtype = NUMBERS[self._inputs[self.free[0]].type]
+
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if k not in ("_session", "_inputs")}
 
@@ -161,6 +164,11 @@ class OnnxPolicy(MappedPolicy):
     ) -> tuple[Array, tuple[Array, ...]]:
         """Run the model."""
         free = self.free
+        if self._plain:
+            x: Any = inputs.get("", inputs.get(free[0])) if isinstance(inputs, dict) else inputs
+            if self._axes is not None or len(x) == 1:
+                rows = {free[0]: np.ascontiguousarray(x, self._dtype)}
+                return self._session.run([self.output], rows)[0], ()
         given = (
             inputs
             if isinstance(inputs, dict) and "" not in inputs

@@ -299,6 +299,12 @@ class Plan:
         self._goal_shape: tuple[int, ...] | None = None
         self._has_goal = any(isinstance(s, Goal) for s in mapping.sources())
         self.inputs: dict[str, Input] | None = None
+        self.remembers_nothing = (
+            mapping.period == 1
+            and mapping.chunk is None
+            and not self.states
+            and not mapping.remembers_output
+        )
         if mapping.remembers_output and not isinstance(action_space, Box):
             raise PolicyError(
                 f"{who}: sees has LastAction(), which needs actions of a Box, not {action_space}"
@@ -595,8 +601,7 @@ class Outputs:
         space = self.space
         if isinstance(space, Box):
             if acts is None:
-                action = self._checked(output, n, space, logits, mask, deterministic, rng)
-                return action, output.reshape(n, -1)
+                return self._checked(output, n, space, logits, mask, deterministic, rng), output
             numbers = self._numbers(output, n)
             return self._scaled(acts, numbers, space), numbers
         if self.to is None:

@@ -55,8 +55,7 @@ class ScriptedPolicy(MappedPolicy):
         """Return the function's actions, checked if the action space is known."""
         if self.action_space is None and self.mapping.is_identity:
             return self.call(obs, (), mask, deterministic, rng)[0], memory
-        how: Any = {"deterministic": deterministic, "rng": rng, "goal": goal}
-        return super().act(memory, obs, mask, **how)
+        return super().act(memory, obs, mask, deterministic=deterministic, rng=rng, goal=goal)
 
     def call(
         self,
@@ -69,18 +68,10 @@ class ScriptedPolicy(MappedPolicy):
         """Call the function."""
         who = self._who
         mapping = self.mapping
-        if isinstance(inputs, dict):
-            arguments = {k: read_only(v) for k, v in inputs.items()}
-        else:
-            arguments = {"": read_only(inputs)}
-        if not mapping.state and "" in arguments:
-            given = arguments[""]
-            action = as_array(called(self.function, given, who, kind=PolicyError), who, PolicyError)
-            if self.action_space is not None and mapping.acts is None and mapping.chunk is None:
-                shape = self.action_space.shape or ()
-                if action.shape == (len(given), *shape):
-                    probe(self.function, given, len(given), who, shape, PolicyError)
-            return action, ()
+        only = inputs.get("") if isinstance(inputs, dict) else inputs
+        if only is not None and not mapping.state:
+            return self._actions(read_only(only)), ()
+        arguments = {k: read_only(v) for k, v in inputs.items()} if only is None else {"": only}
         before = [read_only(x) for x in model_state(state, mapping.state)]
         value = called(
             lambda given: invoke(self.function, given, before, mapping.single_state),
@@ -92,6 +83,17 @@ class ScriptedPolicy(MappedPolicy):
         # Copies: the function may return the same arrays each time.
         arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
         return as_array(action, who, PolicyError), rows_first(arrays, mapping.state, who)
+
+    def _actions(self, given: Array) -> Array:
+        """Return what the function makes of its only input."""
+        who = self._who
+        action = as_array(called(self.function, given, who, kind=PolicyError), who, PolicyError)
+        mapping = self.mapping
+        if self.action_space is not None and mapping.acts is None and mapping.chunk is None:
+            shape = self.action_space.shape or ()
+            if action.shape == (len(given), *shape):
+                probe(self.function, given, len(given), who, shape, PolicyError)
+        return action
 
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
         """Return the declared shapes of its state, in float64."""
