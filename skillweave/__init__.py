@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skillweave.api.loading import from_hub, load
     from skillweave.api.options import make_options_env
     from skillweave.api.player import Player
+    from skillweave.api.policies import load_policy, save_policy
     from skillweave.collecting.cluster import Ray
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
     from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
+    from skillweave.skills.mapping import Acts, Goal, LastAction, Part
     from skillweave.training.callback import TrainEvent
     from skillweave.training.defaults import TrainDefaults
     from skillweave.training.evaluation import Evaluation, evaluate
@@ -61,6 +63,7 @@ __version__ = "0.1.0"
 _HOME = {
     "ActingParams": "algorithms.base",
     "ActionHead": "networks.heads",
+    "Acts": "skills.mapping",
     "Agent": "api",
     "AgentState": "algorithms.base",
     "Algorithm": "algorithms.base",
@@ -76,11 +79,13 @@ _HOME = {
     "Evaluation": "training.evaluation",
     "Evolution": "evolution.config",
     "Export": "export.write",
+    "Goal": "skills.mapping",
     "Guide": "hierarchy.settings",
     "Heir": "evolution.selection",
     "Hierarchy": "api",
     "HierarchyPolicy": "hierarchy.policy",
     "Interrupted": "errors",
+    "LastAction": "skills.mapping",
     "LastCall": "selectors",
     "Layout": "networks.stacked",
     "Lengths": "collecting.lengths",
@@ -94,6 +99,7 @@ _HOME = {
     "PPO": "algorithms.config",
     "ParameterGroup": "algorithms.parameters",
     "ParentSelection": "evolution.selection",
+    "Part": "skills.mapping",
     "Player": "api.player",
     "Policy": "types",
     "PolicyError": "errors",
@@ -133,6 +139,7 @@ _HOME = {
     "from_torch": "skills",
     "gae": "ops.returns",
     "load": "api.loading",
+    "load_policy": "api.policies",
     "make_options_env": "api.options",
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
@@ -140,6 +147,7 @@ _HOME = {
     "plot_curves": "reporting.curves_figure",
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
+    "save_policy": "api.policies",
     "train_agent": "api",
     "tree": "selectors",
 }
@@ -153,6 +161,7 @@ __all__ = [
     "TD3",
     "ActingParams",
     "ActionHead",
+    "Acts",
     "Agent",
     "AgentState",
     "Algorithm",
@@ -166,11 +175,13 @@ __all__ = [
     "Evaluation",
     "Evolution",
     "Export",
+    "Goal",
     "Guide",
     "Heir",
     "Hierarchy",
     "HierarchyPolicy",
     "Interrupted",
+    "LastAction",
     "LastCall",
     "Layout",
     "Lengths",
@@ -183,6 +194,7 @@ __all__ = [
     "OptionsEnv",
     "ParameterGroup",
     "ParentSelection",
+    "Part",
     "Player",
     "Policy",
     "PolicyError",
@@ -219,6 +231,7 @@ __all__ = [
     "from_torch",
     "gae",
     "load",
+    "load_policy",
     "make_options_env",
     "mask_logits",
     "masked_mean",
@@ -226,6 +239,7 @@ __all__ = [
     "plot_curves",
     "register_algorithm",
     "register_encoder",
+    "save_policy",
     "train_agent",
     "tree",
 ]

@@ -15,15 +15,15 @@ from skillweave import SkillweaveError
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = """
-ActingParams ActionHead Agent AgentState Algorithm Apart Array Automaton CNN DQN DeclarationError
-Encoder EnvError EnvSpec Evaluation Evolution Export Guide Heir Hierarchy HierarchyPolicy
-Interrupted LastCall Layout Lengths Linear MissingExtra Mutations Net Network OnPolicy OptionsEnv
-PPO ParameterGroup ParentSelection Player Policy PolicyError PoolWrapper RNN Range Ray Reflex
-Report Rollout Run RunError SAC Sample Seeds Selection SelfImitationPPO Skill SkillError
-SkillweaveError Step TD3 Together Tournament TrainDefaults TrainEvent TrainingError Truncation
-adam_ clip_grad_norm_ envpool evaluate from_function from_hub from_onnx from_sb3 from_torch gae
-load make_options_env mask_logits masked_mean normalise plot_curves register_algorithm
-register_encoder train_agent tree
+ActingParams ActionHead Acts Agent AgentState Algorithm Apart Array Automaton CNN DQN
+DeclarationError Encoder EnvError EnvSpec Evaluation Evolution Export Goal Guide Heir Hierarchy
+HierarchyPolicy Interrupted LastAction LastCall Layout Lengths Linear MissingExtra Mutations Net
+Network OnPolicy OptionsEnv PPO ParameterGroup ParentSelection Part Player Policy PolicyError
+PoolWrapper RNN Range Ray Reflex Report Rollout Run RunError SAC Sample Seeds Selection
+SelfImitationPPO Skill SkillError SkillweaveError Step TD3 Together Tournament TrainDefaults
+TrainEvent TrainingError Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub
+from_onnx from_sb3 from_torch gae load load_policy make_options_env mask_logits masked_mean
+normalise plot_curves register_algorithm register_encoder save_policy train_agent tree
 """
 
 

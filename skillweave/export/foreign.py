@@ -1,201 +1,188 @@
-"""Graphs of foreign networks, like those of trained agents.
+"""Models from elsewhere as ONNX files, beside the mapping that the runner applies around them.
 
-Stands alone because they are no agents: their inputs and outputs are their own.
+Stands alone because each kind of model is converted in its own way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
-from gymnasium.spaces import Box, MultiBinary
 from torch import Tensor, nn
+from torch.distributions import Distribution
 
-from skillweave.export.graphs import Graph, leaves_of, traced
-from skillweave.ops.device import BOOL, FLOAT
+from skillweave.errors import PolicyError
+from skillweave.export.graphs import leaves_of, traced
+from skillweave.ops.device import FLOAT
+from skillweave.skills.mapped import MappedPolicy, invoke, parted
 from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.plan import Plan
+from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.torch_module import TorchPolicy
-from skillweave.spaces import action_codec, obs_dtype
 from skillweave.spaces.packing import parts
-from skillweave.types import Array
+
+OBS = "obs"
+"""The name of a file's only input, where the model has none."""
 
 
-class _Module(nn.Module):
-    """A user's module on one observation, as ``TorchPolicy`` runs it."""
+@dataclass(frozen=True)
+class Model:
+    """An ONNX file's content, and the names in it."""
 
-    def __init__(self, policy: TorchPolicy, masked: bool) -> None:
-        super().__init__()
-        self.module, self.masked = policy.module, masked
-        self.spaces = policy.observation_space, policy.action_space
-
-    def forward(self, *given: Tensor) -> Tensor:
-        """Return the action; inputs: leaves, mask, noise."""
-        left = iter(given)
-        output = self.module(_nested(self.spaces[0], left))
-        mask = next(left) if self.masked else None
-        return _decoded(output, self.spaces[1], mask, next(left, None))
+    content: bytes
+    only: str
+    """The name of the input that a mapping calls ""."""
+    output: str
+    state: tuple[tuple[str, str, tuple[int, ...]], ...] = ()
+    """Inputs, outputs and shapes of the recurrent state of one environment."""
 
 
-def _nested(space: gym.Space[Any], leaves: Iterator[Tensor]) -> Any:
-    """Return the leaves in the structure of the module's input."""
-    inner = parts(space)
-    if inner is None:
-        return next(leaves).float()
-    values = {name: _nested(part, leaves) for name, part in inner.items()}
-    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
-
-
-def _decoded(
-    output: Tensor, space: gym.Space[Any], mask: Tensor | None, noise: Tensor | None
-) -> Tensor:
-    """Convert a network's output (1, …) to an action, as ``skills.outputs.decoded`` does."""
-    shape = (1, *(space.shape or ()))
-    dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
-    if isinstance(space, Box):
-        low, high = (torch.from_numpy(x) for x in (space.low, space.high))
-        return output.reshape(shape).to(dtype).clamp(low, high)
-    if not output.is_floating_point():
-        return output.reshape(shape).to(dtype)
-    if noise is not None:
-        output = output + noise
-    if isinstance(space, MultiBinary):
-        return (output > 0).reshape(shape).to(dtype)
-    if mask is not None:
-        output = output.masked_fill(~mask, -torch.inf)
-    codec = action_codec(space)
-    best = torch.stack([x.argmax(-1) for x in output.split(list(codec.parts), dim=1)], dim=1)
-    return (best.reshape(shape) + torch.from_numpy(_start(space))).to(dtype)
-
-
-def module_graph(policy: TorchPolicy, sampled: bool, where: str) -> Graph:
-    """Return the graph of a user's module; inputs and outputs as in ``agent_graph``.
+def model_of(policy: MappedPolicy, where: str) -> Model:
+    """Return a policy's model as an ONNX file that acts in one environment.
 
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    space = policy.observation_space
-    choices = _choices(policy)
-    noise = _noise(policy, sampled)
-    given = {leaf.name: leaf.example() for leaf in leaves_of(space)}
-    if choices:
-        given["mask"] = torch.ones(1, choices, **BOOL)
-    given |= {f"noise.{i}": torch.zeros(1, n, **FLOAT) for i, (_, n) in enumerate(noise)}
-    module = _Module(policy, bool(choices)).eval()
-    return Graph(traced(module, given, ["action"], where), choices, noise=noise)
+    match policy:
+        case OnnxPolicy():
+            return Model(policy.data, policy.free[0], policy.output, policy.single_states())
+        case TorchPolicy():
+            return _module_model(policy, where)
+        case SB3Policy():
+            return _sb3_model(policy, where)
+    raise PolicyError(f"{where} is a {type(policy).__name__}, which cannot be written as ONNX")
 
 
-def file_graph(policy: OnnxPolicy, sampled: bool) -> Graph:
-    """Return the graph around an ONNX file; inputs and outputs as in ``agent_graph``.
+def mapping_entry(
+    plan: Plan, only: str, name_of: Callable[[Callable[..., Any], str], str]
+) -> dict[str, Any]:
+    """Return a mapping as JSON for the runner: each part of an input names one leaf.
 
-    The file's own nodes stay as they are. Nodes before them convert an observation to the input;
-    nodes after them convert the output to an action, as ``skills.outputs.decoded`` does.
+    Args:
+        only: the name of the input that the mapping calls "".
+        name_of: returns the runner's name of a user's function; its second argument describes it.
     """
-    import onnx
-    from onnx import helper
-
-    model = onnx.compose.add_prefix(onnx.load_from_string(policy.data), "own.")
-    weights = {w.name for w in model.graph.initializer}
-    source = next(i for i in model.graph.input if i.name not in weights)
-    output = next(o for o in model.graph.output if o.name == f"own.{policy.output}")
-    choices, noise = _choices(policy), _noise(policy, sampled)
-    obs, space, dtype = policy.observation_space, policy.action_space, _onnx_type
-    nodes = _Nodes(model.graph)
-    seen = helper.make_node("Cast", ["obs"], [source.name], to=source.type.tensor_type.elem_type)
-    real = output.type.tensor_type.elem_type in _REAL
-    action = nodes.action(output.name, space, real, bool(choices), bool(noise))
-    given = [("obs", dtype(obs_dtype(obs)), [1, *obs.shape])]
-    given += [("mask", dtype(np.bool_), [1, choices])] * bool(choices)
-    given += [(f"noise.{i}", dtype(np.float32), [1, n]) for i, (_, n) in enumerate(noise)]
-    graph = helper.make_graph(
-        [seen, *model.graph.node, *nodes.added],
-        "policy",
-        [helper.make_tensor_value_info(*x) for x in given],
-        [helper.make_tensor_value_info(action, dtype(space.dtype), [1, *(space.shape or ())])],
-        model.graph.initializer,
-    )
-    whole = helper.make_model(graph, opset_imports=model.opset_import, functions=model.functions)
-    whole.ir_version = model.ir_version
-    return Graph(whole.SerializeToString(deterministic=True), choices, noise=noise)
+    mapping = plan.mapping
+    acts = plan.mapping.acts
+    entry = {"goal": None, "acts": None, "scaling": {}, "chunk": None} | mapping.to_json()
+    entry |= {"every": mapping.every, "outputs": plan.outputs.count, "sees": None, "shapes": {}}
+    what = "observations (1, ...) to numbers (1, ...)"
+    names = {id(function): name_of(function, what) for function in mapping.functions().values()}
+    if callable(mapping.goal):
+        entry["goal"] = {"function": names[id(mapping.goal)]}
+    if acts is not None and plan.outputs.to is not None:
+        entry["acts"]["to"] = plan.outputs.to.tolist()
+    if plan.inputs is not None:
+        entry["sees"] = {}
+        for name, given in plan.inputs.items():
+            entry["sees"][name or only] = given.to_json(names)
+            entry["shapes"][name or only] = list(given.shape)
+        entry["scaling"] = {name or only: v for name, v in entry["scaling"].items()}
+    return entry
 
 
-_REAL = (1, 10, 11, 16)  # ONNX's numbers of float32, float16, float64 and bfloat16
+class _Called(nn.Module):
+    """A user's module on one environment, as ``TorchPolicy`` calls it."""
+
+    def __init__(self, policy: TorchPolicy, names: list[str]) -> None:
+        super().__init__()
+        self.module = policy.module
+        self.mapping = policy.mapping
+        self.who = policy.name
+        self.space = policy.observation_space
+        self.names = names
+        weights = [*self.module.parameters(), *self.module.buffers()]
+        self.dtype = next((x.dtype for x in weights if x.is_floating_point()), torch.float32)
+
+    def forward(self, *given: Tensor) -> Any:
+        """Return the output, and the next state; inputs: of the module, then its state."""
+        count = len(given) - len(self.mapping.state)
+        if self.mapping.sees is None:
+            inputs = {"": _nested(self.space, iter(given[:count]), self.dtype)}
+        else:
+            values = (x.to(self.dtype) for x in given[:count])
+            inputs = dict(zip(self.names, values, strict=True))
+        state = [x.to(self.dtype) for x in given[count:]]
+        value = invoke(self.module, inputs, state, self.mapping.single_state)
+        output, after = parted(value, self.mapping, self.who)
+        return (output, *after)
 
 
-def _onnx_type(dtype: Any) -> int:
-    from onnx import helper
-
-    return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
-
-
-class _Nodes:
-    """Operations behind a file's own ones."""
-
-    def __init__(self, graph: Any) -> None:
-        self.graph, self.added = graph, list[Any]()
-
-    def then(self, kind: str, *given: str | Array, out: str = "", **attributes: Any) -> str:
-        """Add one operation on results of others and constants; return the name of its result."""
-        from onnx import helper, numpy_helper
-
-        out = out or f"then.{len(self.added)}"
-        names: list[str] = []
-        for value in given:
-            if not isinstance(value, str):
-                fixed = numpy_helper.from_array(value, f"{out}.{len(names)}")
-                self.graph.initializer.append(fixed)
-                value = fixed.name
-            names.append(value)
-        self.added.append(helper.make_node(kind, names, [out], **attributes))
-        return out
-
-    def action(self, x: str, space: Any, real: bool, masked: bool, noisy: bool) -> str:
-        """Add the conversion of an output ``x`` to an action; return the action's name."""
-        shape = np.array([1, *(space.shape or ())])
-        dtype = _onnx_type(space.dtype)
-        if isinstance(space, Box):
-            x = self.then("Reshape", self.then("Cast", x, to=dtype), shape)
-            x = self.then("Max", x, space.low[None])
-            return self.then("Min", x, space.high[None], out="action")
-        if real:
-            x = self.then("Cast", x, to=_onnx_type(np.float32))
-            x = self.then("Add", x, "noise.0") if noisy else x
-            x = self.chosen(x, space, masked)
-        return self.then("Cast", self.then("Reshape", x, shape), to=dtype, out="action")
-
-    def chosen(self, x: str, space: Any, masked: bool) -> str:
-        """Add the choice of the best by logits ``x``; return the name of the choices (1, K)."""
-        if isinstance(space, MultiBinary):
-            return self.then("Greater", x, np.zeros(1, np.float32))
-        if masked:
-            x = self.then("Where", "mask", x, np.full((1, 1), -np.inf, np.float32))
-        best, first = [], 0
-        for n in action_codec(space).parts:
-            part = self.then("Gather", x, np.arange(first, first + n), axis=1)
-            best.append(self.then("ArgMax", part, axis=1, keepdims=1))
-            first += n
-        joined = self.then("Concat", *best, axis=1)
-        return self.then("Add", joined, _start(space).reshape(1, -1))
+def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype) -> Any:
+    """Return the leaves in the structure of the module's input."""
+    inner = parts(space)
+    if inner is None:
+        return next(leaves).to(dtype)
+    values = {name: _nested(part, leaves, dtype) for name, part in inner.items()}
+    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
 
 
-def _start(space: Any) -> Array:
-    """Return the first choice of each part, in the shape of an action."""
-    return np.asarray(space.start, np.int64)
+def _examples(policy: MappedPolicy, inputs: Any) -> dict[str, Tensor]:
+    """Return one example of each input of a model, by the name in the file."""
+    if inputs is None:
+        leaves = leaves_of(policy.observation_space)
+        return {leaf.name: leaf.example() for leaf in leaves}
+    return {name or OBS: torch.zeros(1, *given.shape, **FLOAT) for name, given in inputs.items()}
 
 
-def _choices(policy: Any) -> int:
-    """Return the width of the mask; 0: there is none."""
-    space = policy.action_space
-    return 0 if isinstance(space, Box | MultiBinary) else action_codec(space).size
+def _module_model(policy: TorchPolicy, where: str) -> Model:
+    inputs = policy.plan.inputs
+    given = _examples(policy, inputs)
+    shapes = [tuple(1 if n is None else n for n in shape) for shape in policy.mapping.state]
+    states = [(f"state.{i}", f"state.{i}.after", shape) for i, shape in enumerate(shapes)]
+    given |= {name: torch.zeros(shape, **FLOAT) for name, _, shape in states}
+    outputs = ["output", *(after for _, after, _ in states)]
+    module = _Called(policy, list(inputs or ()))
+    module.training = False  # the policy's module is in evaluation mode already
+    return Model(traced(module, given, outputs, where), OBS, "output", tuple(states))
 
 
-def _noise(policy: Any, sampled: bool) -> tuple[tuple[str, int], ...]:
-    """Return the noise inputs that logits are sampled with."""
-    space = policy.action_space
-    if not sampled or isinstance(space, Box):
-        return ()
-    if isinstance(space, MultiBinary):  # one logit for each bit
-        return (("logistic", int(np.prod(space.shape))),)
-    return (("gumbel", action_codec(space).size),)
+class _Predicting(nn.Module):
+    """The policy of a Stable-Baselines3 model, as its ``predict`` acts greedily."""
+
+    def __init__(self, policy: SB3Policy, names: list[str]) -> None:
+        super().__init__()
+        self.policy = policy.policy
+        self.names = names
+        self.space = policy.model_space
+
+    def forward(self, *given: Tensor) -> Tensor:
+        """Return the actions in the model's own units."""
+        named = dict(zip(self.names, given, strict=True))
+        if isinstance(self.space, gym.spaces.Dict):
+            obs: Any = {k: _channels_first(named[k], part) for k, part in self.space.items()}
+        else:
+            obs = _channels_first(next(iter(named.values())), self.space)
+        action: Tensor = self.policy._predict(obs, deterministic=True)
+        space = self.policy.action_space
+        if not isinstance(space, gym.spaces.Box):
+            return action.reshape(-1, *(space.shape or ()))
+        action = action.reshape(-1, *space.shape)
+        low, high = (torch.from_numpy(x) for x in (space.low, space.high))
+        if self.policy.squash_output:
+            return low + 0.5 * (action + 1.0) * (high - low)
+        return action.clamp(low, high)
+
+
+def _channels_first(x: Tensor, space: gym.Space[Any]) -> Tensor:
+    """Return images with their channels where the model has them, as ``predict`` does."""
+    shape = tuple(space.shape or ())
+    turned = len(shape) == 3 and tuple(x.shape[1:]) == (*shape[1:], shape[0])
+    return x.permute(0, 3, 1, 2) if turned and tuple(x.shape[1:]) != shape else x
+
+
+def _sb3_model(policy: SB3Policy, where: str) -> Model:
+    inputs = policy.plan.inputs
+    given = _examples(policy, inputs)
+    names = list(inputs or ()) or [name.removeprefix(f"{OBS}.") for name in given]
+    module = _Predicting(policy, names).eval()
+    # Checks of a distribution's arguments depend on their values, which a graph cannot have.
+    checks = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        return Model(traced(module, given, ["output"], where), OBS, "output")
+    finally:
+        Distribution.set_default_validate_args(checks)

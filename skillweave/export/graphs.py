@@ -191,7 +191,10 @@ def traced(
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise MissingExtra("exporting to ONNX", "onnx") from error
+    names: Any = {"input_names": list(given), "output_names": list(outputs)}
     try:
+        if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
+            return _traced_script(module, given, names)
         with _quiet(), torch.no_grad():
             program = torch.onnx.export(
                 module,
@@ -200,8 +203,7 @@ def traced(
                 dynamo=True,
                 verbose=False,
                 opset_version=OPSET,
-                input_names=list(given),
-                output_names=list(outputs),
+                **names,
             )
     except Exception as error:  # torch's own errors have no common class
         raise PolicyError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
@@ -210,6 +212,17 @@ def traced(
     model.ClearField("metadata_props")
     _strip(model.graph)
     content: bytes = model.SerializeToString(deterministic=True)
+    return content
+
+
+def _traced_script(module: nn.Module, given: dict[str, Tensor], names: dict[str, Any]) -> bytes:
+    """Return the ONNX file of a module with TorchScript in it, which ``dynamo`` does not trace."""
+    file: Any = io.BytesIO()
+    example = tuple(given.values())
+    with _quiet(), torch.no_grad():
+        script = torch.jit.trace(module, example, check_trace=False)
+        torch.onnx.export(script, example, file, dynamo=False, opset_version=OPSET, **names)
+    content: bytes = file.getvalue()
     return content
 
 

@@ -18,6 +18,17 @@ import numpy as np
 import onnxruntime as ort
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = range(5)  # how a call has ended
+DTYPES = {  # of inputs, by ONNX's names
+    "float": "f4",
+    "double": "f8",
+    "float16": "f2",
+    "int64": "i8",
+    "int32": "i4",
+    "int16": "i2",
+    "int8": "i1",
+    "uint16": "u2",
+    "uint8": "u1",
+}
 
 
 class Runner:
@@ -30,7 +41,8 @@ class Runner:
         self.entry = json.loads((self.path / "policy.json").read_text(encoding="utf-8"))
         if needs := {k: v for k, v in self.entry["code"].items() if k not in self.code}:
             raise ValueError(f"{path} needs code: give Runner(code={{name: function}}) for {needs}")
-        self.dtype, self.root = np.dtype(self.entry["dtype"]), self.made(self.entry["policy"])
+        self.dtype, self.space = np.dtype(self.entry["dtype"]), self.entry["action_space"]
+        self.root = self.made(self.entry["policy"])
         self.reset()
 
     def reset(self) -> None:
@@ -66,7 +78,7 @@ class Runner:
 
     def made(self, entry: Any) -> Any:
         """Return the part of the policy that an entry of ``policy.json`` describes."""
-        kinds = (_Code, _Network, _Hierarchy, _Function, _Automaton)
+        kinds = (_Code, _Network, _Model, _Hierarchy, _Function, _Automaton)
         return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
     def asks(self, name: str, about: Any) -> bool:
@@ -75,10 +87,29 @@ class Runner:
 
     def action(self, value: Any) -> Any:
         """Return an action that code gave, within its space."""
-        space = self.entry["action"]
-        if space["low"] is not None:
-            value = np.clip(value, space["low"], space["high"])
-        return np.asarray(value, space["dtype"]).reshape(space["shape"])[()]
+        space = self.space
+        dtype = self.space.get("dtype", "int64")
+        shape = space.get("shape", np.shape(space.get("nvec", 0)))
+        if space["type"] == "MultiBinary":
+            shape = space["n"]
+            dtype = "int8"
+        if space["type"] == "Box":
+            low, high = (np.array(wide(space[k]), dtype) for k in ("low", "high"))
+            value = np.reshape(value, shape)
+            value = np.clip(value, *(x.reshape(shape) if x.ndim else x for x in (low, high)))
+        return np.asarray(value, dtype).reshape(shape)[()]
+
+
+def wide(bounds: Any) -> Any:
+    """Return bounds as numbers: infinities are texts in JSON."""
+    return [float(x) for x in bounds] if isinstance(bounds, list) else float(bounds)
+
+
+def opened(path: Path) -> Any:
+    """Return a session of an ONNX file, on one thread."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 class _Code:  # a skill that is a function of observations; and what all parts have
@@ -103,10 +134,7 @@ class _Code:  # a skill that is a function of observations; and what all parts h
 class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory and noise
     def __init__(self, runner: Runner, entry: Any) -> None:
         super().__init__(runner, entry)
-        options = ort.SessionOptions()
-        where = {"providers": ["CPUExecutionProvider"]}
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        self.session = ort.InferenceSession(str(runner.path / entry["file"]), options, **where)
+        self.session = opened(runner.path / entry["file"])
         self.reset()
 
     def reset(self) -> None:
@@ -121,6 +149,137 @@ class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory
         action, *after = self.session.run(None, feeds)
         self.memory = dict(zip(self.memory, after, strict=True))
         return action[0]
+
+
+class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        super().__init__(runner, entry)
+        self.session = opened(runner.path / entry["file"]) if entry["file"] else None
+        given = self.session.get_inputs() if self.session else ()
+        self.dtypes = {i.name: DTYPES[i.type[7:-1]] for i in given}
+        self.reset()
+
+    def reset(self) -> None:
+        self.phase = 0
+        self.last = np.zeros((1, self.entry["outputs"]))
+        states = ((s, self.dtypes.get(s["input"], "f8")) for s in self.entry["state"])
+        self.state = [np.zeros(s["shape"], dtype) for s, dtype in states]
+
+    def act(self, mask: Any, last: Any = None) -> Any:
+        if self.phase == 0:
+            self.held = self.inferred(mask)
+        action = self.held[self.phase // self.entry["every"]]
+        self.phase = (self.phase + 1) % (self.entry["every"] * len(self.held))
+        return action
+
+    def inferred(self, mask: Any) -> list[Any]:
+        """Return the actions of one inference, in their order."""
+        sees = self.entry["sees"]
+        chunk = self.entry["chunk"]
+        given = self.runner.feeds if self.session else {"": self.runner.obs}
+        if sees is not None:
+            given = {name: self.seen(name, parts) for name, parts in sees.items()}
+        output = self.called(given)
+        outputs = [output] if chunk is None else [output[:, i] for i in range(chunk)]
+        return [self.action(x, None if i else mask) for i, x in enumerate(outputs)]
+
+    def called(self, given: Any) -> Any:
+        """Return the output of the model, or of the function."""
+        entry = self.entry
+        if self.session:
+            feeds = {k: np.asarray(v, self.dtypes[k]) for k, v in given.items()}
+            feeds |= {s["input"]: x for s, x in zip(entry["state"], self.state, strict=True)}
+            names = [entry["output"], *(s["output"] for s in entry["state"])]
+            output, *self.state = self.session.run(names, feeds)
+            return output
+        function = self.runner.code[entry["code"]]
+        single = entry["single_state"] or not self.state
+        state: list[Any] = self.state if single else [tuple(self.state)]
+        if "" in given:
+            value = function(given[""], *state)
+        else:
+            value = function(**given, **({"state": state[0]} if state else {}))
+        if state:
+            value, after = value
+            self.state = [after] if entry["single_state"] else list(after)
+        return np.asarray(value)
+
+    def seen(self, name: str, parts: Any) -> Any:
+        """Return an input: its parts, joined and scaled."""
+        x = np.concatenate([scaled(self.part(part), part) for part in parts], axis=1)
+        return scaled(x, self.entry["scaling"].get(name, {})).reshape(
+            1, *self.entry["shapes"][name]
+        )
+
+    def part(self, part: Any) -> Any:
+        """Return the numbers of a part of an input, (1, K)."""
+        obs = self.runner.obs
+        goal = self.entry["goal"]
+        if part["source"] == "last_action":
+            return self.last
+        if part["source"] == "function":
+            return np.reshape(self.runner.code[part["function"]](obs), (1, -1))
+        if part["source"] == "goal":
+            if isinstance(goal, dict):
+                goal = self.runner.code[goal["function"]](obs)
+            low, high = (part.get(k) for k in ("low", "high"))
+            goal = np.maximum(np.reshape(goal, (1, -1)), -np.inf if low is None else low)
+            return np.minimum(goal, np.inf if high is None else high)
+        x = np.reshape(reduce(getitem, part["fields"], obs), (1, -1))
+        if part["choices"]:
+            hot = [np.eye(n)[x[:, i] - start] for i, (n, start) in enumerate(part["choices"])]
+            x = np.concatenate(hot, axis=1)
+        places = part["places"]
+        if isinstance(places, str):
+            places = slice(*(int(i) if i else None for i in places.split(":")))
+        return x if places is None else x[:, places]
+
+    def action(self, x: Any, mask: Any) -> Any:
+        """Return the action that an output (1, ...) means."""
+        space = self.runner.space
+        acts = self.entry["acts"] or {}
+        to = acts.get("to")
+        if space["type"] == "Box":
+            x = np.reshape(x, (1, -1))
+            x = np.clip(x, *acts["clip"]) if acts.get("clip") else x
+            self.last = x = np.asarray(x, np.float64)
+            x = x * np.array(acts.get("scale", 1.0)) + np.array(acts.get("offset", 0.0))
+            if to is not None:
+                size = int(np.prod(space["shape"]))
+                full = np.zeros((1, size))
+                others = np.setdiff1d(np.arange(size), to)
+                full[:, others] = acts.get("rest", 0.0) if len(others) else 0.0
+                full[:, to] = x
+                x = full
+            return self.runner.action(x)
+        if x.dtype.kind == "f" and self.entry["logits"]:
+            return self.runner.action(self.chosen(x, space, to, mask))
+        return self.runner.action(x if to is None else np.array(to)[x] + space["start"])
+
+    def chosen(self, x: Any, space: Any, to: Any, mask: Any) -> Any:
+        """Return the best choices by logits (1, ...), or those that are drawn."""
+        binary = space["type"] == "MultiBinary"
+        rng = self.runner.rng
+        if self.entry["sampled"]:
+            x = x + (rng.logistic if binary else rng.gumbel)(size=x.shape)
+        if binary:
+            return x > 0
+        if mask is not None:
+            allowed = mask if to is None else mask[:, to]
+            x = np.where(allowed, x, -np.inf) if allowed.shape == x.shape else x
+        if to is not None:
+            return to[int(x.argmax())] + space["start"]
+        sizes = np.ravel(space["n"] if space["type"] == "Discrete" else space["nvec"])
+        parts = np.split(x[0], np.cumsum(sizes)[:-1])
+        return (
+            np.reshape([part.argmax() for part in parts], np.shape(space["start"])) + space["start"]
+        )
+
+
+def scaled(x: Any, by: Any) -> Any:
+    """Return numbers (1, K) less an offset, times a scale, and clipped."""
+    x = (x - np.array(by.get("offset", 0.0))) * np.array(by.get("scale", 1.0))
+    return np.clip(x, *by["clip"]) if by.get("clip") else x
 
 
 class _Hierarchy(_Code):  # a selector and its skills; it decides where a call ends

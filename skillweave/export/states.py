@@ -13,16 +13,19 @@ import numpy as np
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
-from skillweave.export.foreign import file_graph, module_graph
+from skillweave.export.foreign import mapping_entry, model_of
 from skillweave.export.graphs import Graph, agent_graph, worth_graph
+from skillweave.export.network import ExportedNetwork
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.selectors import Automaton
 from skillweave.selectors.base import function_name
 from skillweave.selectors.function import FunctionSelector
 from skillweave.skills import Reflex
+from skillweave.skills.mapped import MappedPolicy
+from skillweave.skills.mapping import function_name as written_name
 from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.skills.torch_module import TorchPolicy
 from skillweave.types import Policy
 
 
@@ -57,12 +60,12 @@ class States:
                 return self._hierarchy(policy, f"{name}/" if name else "", sampled)
             case AgentPolicy():
                 return self._network(agent_graph(policy, sampled, where), name)
-            case TorchPolicy():
-                return self._network(module_graph(policy, sampled, where), name)
-            case OnnxPolicy():
-                return self._network(file_graph(policy, sampled), name)
-            case ScriptedPolicy():
+            case ExportedNetwork():
+                return self._exported(policy, name)
+            case ScriptedPolicy() if policy.mapping.is_identity:
                 acts: Any = policy.function
+            case MappedPolicy():
+                return self._model(policy, name, where, sampled)
             case _:
                 acts = policy
         if policy.start(1):
@@ -96,10 +99,15 @@ class States:
             "margin": None,
         }
         if cuts is not None:
-            if not isinstance(cuts.critic, AgentPolicy):
-                raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
-            graph = worth_graph(cuts.critic, "the skill critic")
-            entry |= {"critic": self._network(graph, f"{prefix}critic"), "margin": cuts.margin}
+            name = f"{prefix}critic"
+            match cuts.critic:
+                case AgentPolicy():
+                    critic = self._network(worth_graph(cuts.critic, "the skill critic"), name)
+                case ExportedNetwork():
+                    critic = self._exported(cuts.critic, name)
+                case _:
+                    raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
+            entry |= {"critic": critic, "margin": cuts.margin}
         return entry
 
     def _skill(self, skills: SkillSet, i: int, prefix: str, needs_success: bool) -> dict[str, Any]:
@@ -135,15 +143,77 @@ class States:
         return [condition, code, fixed]
 
     def _network(self, graph: Graph, name: str) -> dict[str, Any]:
-        file = f"{name.replace('/', '.') or 'agent'}.onnx"
-        self.files[file] = graph.content
         return {
             "kind": "Network",
-            "file": file,
+            "file": self._file(name, graph.content),
             "choices": graph.choices,
             "memory": {"memory": graph.memory} if graph.memory else {},
             "noise": [list(n) for n in graph.noise],
         }
+
+    def _exported(self, policy: ExportedNetwork, name: str) -> dict[str, Any]:
+        """Return the entry of a network that was loaded from an export, with its new file."""
+        return {"kind": "Network", **policy.entry, "file": self._file(name, policy.data)}
+
+    def _model(self, policy: MappedPolicy, name: str, where: str, sampled: bool) -> dict[str, Any]:
+        if sampled and isinstance(policy, SB3Policy):
+            raise PolicyError(
+                f"{where} samples by Stable-Baselines3's own code, which the runner does not have: "
+                "let skills act greedily, greedy_skills=True"
+            )
+
+        def name_of(function: Any, what: str) -> str:
+            plain = written_name(function).rpartition(":")[2]
+            return self._asks(f"{name}.{plain}", function, what)
+
+        entry: dict[str, Any] = {
+            "kind": "Model",
+            "file": None,
+            "code": None,
+            "output": None,
+            "state": [],
+            "single_state": policy.mapping.single_state,
+            "logits": policy.logits,
+            "sampled": sampled,
+        }
+        if isinstance(policy, ScriptedPolicy):
+            what = "its inputs to outputs (1, ...), as the mapping in policy.json says"
+            entry["code"] = self._asks(f"{name}.policy", policy.function, what)
+            entry["state"] = [
+                {
+                    "input": None,
+                    "output": None,
+                    "shape": [1 if n is None else n for n in shape],
+                    "axis": shape.index(None),
+                }
+                for shape in policy.mapping.state
+            ]
+            return mapping_entry(policy.plan, "", name_of) | entry
+        model = model_of(policy, where)
+        entry["file"] = self._file(name, model.content)
+        entry["output"] = model.output
+        entry["state"] = [
+            {"input": given, "output": after, "shape": list(shape), "axis": None}
+            for given, after, shape in model.state
+        ]
+        mapped = mapping_entry(policy.plan, model.only, name_of)
+        if mapped["sees"] is None and isinstance(policy, OnnxPolicy):
+            shape = list(policy.observation_space.shape or ())
+            whole: dict[str, Any] = {
+                "source": "observation",
+                "key": "",
+                "places": None,
+                "fields": [],
+            }
+            mapped["sees"] = {model.only: [whole | {"choices": [], "one_hot": False}]}
+            mapped["shapes"] = {model.only: shape}
+        return mapped | entry
+
+    def _file(self, name: str, content: bytes) -> str:
+        """Add a file of a part of the policy; return its name."""
+        file = f"{name.replace('/', '.') or 'agent'}.onnx"
+        self.files[file] = content
+        return file
 
     def _selector(self, selector: Policy, name: str, sampled: bool) -> dict[str, Any]:
         match selector:
@@ -166,6 +236,8 @@ class States:
                 }
             case AgentPolicy():
                 return self._network(agent_graph(selector, sampled, name), name)
+            case ExportedNetwork():
+                return self._exported(selector, name)
         raise PolicyError(
             f"{name} is a {getattr(selector, 'kind', type(selector).__name__)}, which the runner "
             "cannot run: select by an Automaton, by a function, or train the selector"

@@ -15,13 +15,16 @@ from skillweave.envs.infos import observes_mask
 from skillweave.export.graphs import leaves_of
 from skillweave.export.states import States
 from skillweave.runs.files import write_bytes
-from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.skills.foreign_policy import checksum
+from skillweave.spaces import obs_dtype, obs_shape, space_to_json
 from skillweave.spaces.packing import parts
 from skillweave.terminal import printable
 from skillweave.types import Policy
 
-FORMAT = 1
+FORMAT = 2
 """Version of ``policy.json``."""
+MANIFEST = "policy.json"
+"""The name of the file that describes a policy."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,16 @@ class Export:
         return printable(f"{summary}\n{runner} needs\n{needs}")
 
 
-def write_export(path: Path, policy: Policy, env: str) -> Export:
+def write_export(
+    path: Path, policy: Policy, env: str, *, licence: str = "", origin: str = ""
+) -> Export:
     """Write a policy for machines without this library; files of the same names are replaced.
 
     Args:
         path: the folder.
         env: the environment's name, for readers of ``policy.json``.
+        licence: of the policy, for them.
+        origin: of the policy, for them: an address, for example.
 
     Raises:
         PolicyError: a part of it cannot be exported; the message names it, and what to do.
@@ -61,17 +68,21 @@ def write_export(path: Path, policy: Policy, env: str) -> Export:
     content = {
         "format": FORMAT,
         "env": env,
+        "licence": licence,
+        "origin": origin,
+        "files": {name: checksum(data) for name, data in states.files.items()},
         "code": states.code,
         "dtype": _dtype_to_json(obs_dtype(space)),
         "shape": list(obs_shape(space)),
         "inputs": _inputs(space),
-        "action": _action_to_json(policy.action_space),
+        "observation_space": space_to_json(space),
+        "action_space": space_to_json(policy.action_space),
         "observed_mask": observes_mask(space, policy.action_space),
         "policy": entry,
     }
     text = json.dumps(content, indent=1, allow_nan=False)
     runner = Path(__file__).with_name("runner.py").read_bytes()
-    files = states.files | {"policy.json": text.encode(), "runner.py": runner}
+    files = states.files | {MANIFEST: text.encode(), "runner.py": runner}
     for name, data in files.items():
         write_bytes(path / name, data)
     return Export(path, tuple(files), states.code, states.functions)
@@ -111,11 +122,3 @@ def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
         "offsets": [at for _, at in fields],
         "itemsize": dtype.itemsize,
     }
-
-
-def _action_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    entry: dict[str, Any] = {"dtype": np.dtype(space.dtype).str, "shape": list(space.shape or ())}
-    if not isinstance(space, gym.spaces.Box):
-        return entry | {"low": None, "high": None}
-    bounds = {"low": space.low, "high": space.high}  # infinities are no JSON
-    return entry | {k: np.nan_to_num(v.astype(np.float64)).tolist() for k, v in bounds.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -27,6 +27,8 @@ MADE_BY_THE_HUB = ".gitattributes"
 LINES = ("run.json", "evaluation.json", "metrics.jsonl", "lineage.jsonl")
 WANTED = (*LINES, "policies/*.safetensors")
 """The downloaded files, from which a run is read."""
+OF_A_POLICY = ("policy.json", "*.onnx")
+"""The downloaded files, from which a policy is read."""
 FILMS = (".gif", ".mp4")
 FIGURES = "figures"
 """The folder of pictures on the hub."""
@@ -235,6 +237,23 @@ def download(name: str, revision: str | None = None) -> Path:
         DeclarationError: ``revision`` is not a text.
         MissingExtra: the extra 'hub' is not installed.
     """
+    return _download(name, revision, WANTED, _check_kinds)
+
+
+def download_policy(name: str, revision: str | None = None) -> Path:
+    """Return the folder with a policy's ``policy.json`` and ONNX files; see ``download``.
+
+    Other files of the repository are not downloaded.
+    """
+    return _download(name, revision, OF_A_POLICY, _check_policy)
+
+
+def _download(
+    name: str,
+    revision: str | None,
+    wanted: Sequence[str],
+    check: Callable[[str, Sequence[str]], None],
+) -> Path:
     api = hub_api()
     if revision is not None and not (isinstance(revision, str) and revision):
         raise DeclarationError(
@@ -242,11 +261,11 @@ def download(name: str, revision: str | None = None) -> Path:
         )
     with hub_errors(api, name, revision=revision):
         info = _info(api, name, revision)
-        options = {"revision": revision, "allow_patterns": list(WANTED)}
+        options = {"revision": revision, "allow_patterns": list(wanted)}
         if isinstance(info, Exception):  # no answer
             path = _downloaded_before(api, name, options, info)
         else:
-            _check_kinds(name, [file.rfilename for file in info.siblings or ()])
+            check(name, [file.rfilename for file in info.siblings or ()])
             path = Path(api.snapshot_download(name, **options))
             if path.name != info.sha:
                 raise RunError(f"{name} was changed while it was downloaded; try again")
@@ -269,6 +288,12 @@ def _downloaded_before(api: Any, name: str, options: Mapping[str, Any], error: E
         return Path(api.snapshot_download(name, local_files_only=True, **options))
     except Exception:
         raise error from None
+
+
+def _check_policy(name: str, files: Sequence[str]) -> None:
+    """Raise a RunError where files are not those of a policy."""
+    if "policy.json" not in files:
+        raise RunError(f"{name} holds no policy of Skillweave: it has no policy.json")
 
 
 def _check_kinds(name: str, files: Sequence[str]) -> None:

@@ -78,6 +78,14 @@ class Foreign(Memoryless):
         """Return this policy with the ``content`` from a run."""
         raise NotImplementedError
 
+    def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
+        """Return this policy with the recorded mapping ``data``.
+
+        Raises:
+            RunError: it has none; the message begins with ``where``.
+        """
+        raise RunError(f"{where} had a policy with a mapping, but now it has none")
+
     def try_out(self) -> None:
         """Act once on two example observations, to find errors before training.
 
@@ -128,6 +136,8 @@ class Source(TypedDict):
     file: NotRequired[str]
     sha256: NotRequired[str]
     """Checksum of its content, if it can be computed."""
+    mapping: NotRequired[dict[str, Any]]
+    """Its mapping from observations to actions, if it has one."""
 
 
 def source_of(policy: Policy) -> dict[str, Any]:
@@ -150,8 +160,8 @@ def as_recorded(
     """Return the policy at the time when ``recorded`` was its source; ``read`` reads the copy.
 
     Raises:
-        RunError: the policy has another kind, or another checksum without a copy; or the copy is
-            damaged, or does not fit.
+        RunError: the policy has another kind, or another checksum without a copy; or the copy or
+            the recorded mapping is damaged, or does not fit.
     """
     if recorded is None:  # an old run, without sources
         return policy
@@ -160,6 +170,10 @@ def as_recorded(
         raise RunError(
             f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
         )
+    if recorded.get("mapping") != now.get("mapping"):
+        if not isinstance(policy, Foreign):
+            raise RunError(f"{where} had a policy with a mapping, but now it has none")
+        policy = policy.remapped(recorded.get("mapping"), where)
     if recorded.get("sha256") in (None, now.get("sha256")):
         return policy
     content = read() if isinstance(policy, Foreign) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,26 +10,37 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
-from skillweave.skills.foreign_policy import Foreign, qualified
-from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.foreign_policy import qualified
+from skillweave.skills.mapped import (
+    MappedPolicy,
+    invoke,
+    model_state,
+    parted,
+    rows_first,
+    state_shapes,
+)
+from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.skills.outputs import as_array, called
 from skillweave.skills.probing import probe
 from skillweave.types import Array, Memory, read_only
 
 
-class ScriptedPolicy(Foreign):
+class ScriptedPolicy(MappedPolicy):
     """A function from observations (n, *obs_shape) to actions (n, *action_shape) as a policy."""
 
     kind = "function"
+    logits = False
 
     def __init__(
         self,
-        function: Callable[[Array], Any],
+        function: Callable[..., Any],
         observation_space: Any = None,
         action_space: Any = None,
+        mapping: PolicyMapping | None = None,
     ) -> None:
         self.function = function
         name = getattr(function, "__name__", type(function).__name__)
-        super().__init__(f"function {name}()", observation_space, action_space)
+        super().__init__(f"function {name}()", observation_space, action_space, mapping)
 
     def act(
         self,
@@ -39,24 +50,72 @@ class ScriptedPolicy(Foreign):
         *,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
+        goal: Array | None = None,
     ) -> tuple[Array, Memory]:
         """Return the function's actions, checked if the action space is known."""
-        action = called(self.function, read_only(obs), self._who, kind=PolicyError)
-        if self.action_space is None:
-            return as_array(action, self._who, PolicyError), memory
-        n, shape = len(obs), self.action_space.shape or ()
-        actions = checked_actions(action, n, self.action_space, self._who)
-        probe(self.function, obs, n, self._who, shape, PolicyError)
-        return actions, memory
+        if self.action_space is None and self.mapping.is_identity:
+            return self.call(obs, (), mask, deterministic, rng)[0], memory
+        return super().act(memory, obs, mask, deterministic=deterministic, rng=rng, goal=goal)
+
+    def call(
+        self,
+        inputs: Any,
+        state: tuple[Array, ...],
+        mask: Array | None,
+        deterministic: bool,
+        rng: np.random.Generator | None,
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Call the function."""
+        who = self._who
+        mapping = self.mapping
+        only = inputs.get("") if isinstance(inputs, dict) else inputs
+        if only is not None and not mapping.state:
+            return self._actions(read_only(only)), ()
+        arguments = {k: read_only(v) for k, v in inputs.items()} if only is None else {"": only}
+        before = [read_only(x) for x in model_state(state, mapping.state)]
+        value = called(
+            lambda given: invoke(self.function, given, before, mapping.single_state),
+            arguments,
+            who,
+            kind=PolicyError,
+        )
+        action, after = parted(value, mapping, who)
+        # Copies: the function may return the same arrays each time.
+        arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
+        return as_array(action, who, PolicyError), rows_first(arrays, mapping.state, who)
+
+    def _actions(self, given: Array) -> Array:
+        """Return what the function makes of its only input."""
+        who = self._who
+        action = as_array(called(self.function, given, who, kind=PolicyError), who, PolicyError)
+        mapping = self.mapping
+        if self.action_space is not None and mapping.acts is None and mapping.chunk is None:
+            shape = self.action_space.shape or ()
+            if action.shape == (len(given), *shape):
+                probe(self.function, given, len(given), who, shape, PolicyError)
+        return action
+
+    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
+        """Return the declared shapes of its state, in float64."""
+        return state_shapes(self.mapping, np.float64)
 
     def source(self) -> dict[str, Any]:
-        """Return the function's name."""
-        return {"kind": self.kind, "name": qualified(self.function)}
+        """Return the function's name, and the mapping."""
+        return super().source() | {"name": qualified(self.function)}
 
 
 @checked_names
 def from_function(
-    function: Callable[[Array], Any], *, observation_space: Any = None, action_space: Any = None
+    function: Callable[..., Any],
+    *,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    chunk: int | None = None,
+    state: Any = None,
+    observation_space: Any = None,
+    action_space: Any = None,
 ) -> ScriptedPolicy:
     """Return a Python function as a skill's policy; a skill takes the bare function too.
 
@@ -67,9 +126,19 @@ def from_function(
     print(sw.evaluate(lean, "CartPole-v1", episodes=2))
     ```
 
+    With ``state`` the function takes it as its second argument (by the name ``state``, where the
+    inputs have names), and returns the action and the next state.
+
     Args:
         function: maps observations (n, *obs_shape) to actions (n, *action_shape), whole numbers for
             discrete spaces. Keep no state in it: it is called for any environments in any order.
+        sees: the parts of the observation that the function takes; see ``from_onnx``.
+        goal: the value of ``Goal()`` in ``sees``; see ``from_onnx``.
+        acts: the meaning of the result, ``Acts(...)``; None: it is the action.
+        every: each action is held for this number of steps.
+        chunk: the number of actions that are used of each result (n, H, ...).
+        state: the shape of a recurrent state, None as the axis of the environments: (None, 8); or a
+            list of shapes. It starts with zeros.
         observation_space: None: the environment's.
         action_space: None: the environment's.
 
@@ -77,10 +146,13 @@ def from_function(
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        DeclarationError: it is not a function of observations.
+        DeclarationError: it is not a function of observations, or an argument is wrong.
     """
     if not callable(function):
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    return ScriptedPolicy(function, observation_space, action_space)
+    mapping = mapping_of(
+        "from_function()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
+    )
+    return ScriptedPolicy(function, observation_space, action_space, mapping)

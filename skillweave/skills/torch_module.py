@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import copy
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -11,76 +15,118 @@ from gymnasium import Space
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
-from skillweave.skills.foreign_policy import Foreign, checksum, qualified
-from skillweave.skills.outputs import decoded
-from skillweave.types import Array, Memory
+from skillweave.reading import read_file
+from skillweave.skills.foreign_policy import checksum, qualified
+from skillweave.skills.mapped import (
+    MappedPolicy,
+    invoke,
+    model_state,
+    parted,
+    rows_first,
+    state_shapes,
+)
+from skillweave.skills.mapping import PolicyMapping, mapping_of
+from skillweave.types import Array
 
 if TYPE_CHECKING:
     from torch import nn
 
 
-class TorchPolicy(Foreign):
-    """A module whose forward takes observations and returns logits or actions."""
+class TorchPolicy(MappedPolicy):
+    """A module whose forward takes observations and returns logits or actions.
+
+    Args:
+        module: the module.
+        file: the file that it was loaded from, if any.
+        content: the content of that file.
+    """
 
     kind = "torch"
     suffix = ".safetensors"
 
     def __init__(
-        self, module: nn.Module, observation_space: Any = None, action_space: Any = None
+        self,
+        module: nn.Module,
+        observation_space: Any = None,
+        action_space: Any = None,
+        mapping: PolicyMapping | None = None,
+        file: Path | None = None,
+        content: bytes = b"",
     ) -> None:
-        super().__init__(f"module {type(module).__name__}", observation_space, action_space)
+        name = str(file) if file else f"module {type(module).__name__}"
+        super().__init__(name, observation_space, action_space, mapping)
         self.module = module
+        self.file = file
+        self.data = content
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        if self.file is not None:  # such modules cannot be pickled
+            del state["module"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self.file is not None:
+            self.module = _module_in(self.data, self.file)
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy in evaluation mode, independent of later changes of the module."""
         bound = super().bind(observation_space, action_space, who)
-        bound.module = copy.deepcopy(self.module).eval()
+        if self.file is None:  # a file's is its own, and one of torch.export has a fixed mode
+            bound.module = copy.deepcopy(self.module).eval()
         return bound
 
-    def act(
+    def call(
         self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return the module's actions; logits are sampled with ``rng`` if not ``deterministic``."""
+        inputs: Any,
+        state: tuple[Array, ...],
+        mask: Array | None,
+        deterministic: bool,
+        rng: np.random.Generator | None,
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """Call the module."""
         import torch
 
         from skillweave.spaces import unpack
 
-        self.must_be_bound()
-        state = [*self.module.parameters(), *self.module.buffers()]
-        device = state[0].device if state else None
-        dtype = next((x.dtype for x in state if x.is_floating_point()), torch.float32)
+        mapping = self.mapping
+        weights = [*self.module.parameters(), *self.module.buffers()]
+        device = weights[0].device if weights else None
+        dtype = next((x.dtype for x in weights if x.is_floating_point()), torch.float32)
+        if isinstance(inputs, dict):
+            given = {name: _tensors(x, device, dtype) for name, x in inputs.items()}
+        else:
+            given = {"": _tensors(unpack(self.observation_space, inputs), device, dtype)}
+        before = [_tensors(x, device, dtype) for x in model_state(state, mapping.state)]
         with torch.inference_mode():
-            output = self.module(_tensors(unpack(self.observation_space, obs), device, dtype))
-        if not isinstance(output, torch.Tensor):
-            raise PolicyError(
-                f"{self._who} returned a {type(output).__name__}; forward must return one tensor"
-            )
+            value = invoke(self.module, given, before, mapping.single_state)
+        output, after = parted(value, mapping, self._who)
+        for part, what in ((output, "one tensor"), *((x, "tensors as its state") for x in after)):
+            if not isinstance(part, torch.Tensor):
+                raise PolicyError(
+                    f"{self._who} returned a {type(part).__name__}; forward must return {what}"
+                )
         output = output.float() if output.is_floating_point() else output
-        action = decoded(
-            output.cpu().numpy(),
-            len(obs),
-            self.action_space,
-            self._who,
-            mask=mask,
-            deterministic=deterministic,
-            rng=rng,
-        )
-        return action, memory
+        arrays = [x.to(torch.float64).cpu().numpy() for x in after]
+        return output.cpu().numpy(), rows_first(arrays, mapping.state, self._who)
+
+    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
+        """Return the declared shapes of its state, in float64, which holds any module's."""
+        return state_shapes(self.mapping, np.float64)
 
     def source(self) -> dict[str, Any]:
-        """Return the module's class, and the checksum of its weights."""
-        name = qualified(type(self.module))
-        return {"kind": self.kind, "name": name, "sha256": checksum(self.content())}
+        """Return the module's class, the checksum of its weights or its file, and the mapping."""
+        found = super().source() | {"name": qualified(type(self.module))}
+        return (
+            found
+            if self.file is None
+            else found | {"file": str(self.file), "sha256": checksum(self.data)}
+        )
 
-    def content(self) -> bytes:
-        """Return its weights."""
-        return weights_of(self.module, self._who)
+    def content(self) -> bytes | None:
+        """Return its weights; None for a file, which can run code."""
+        return None if self.file else weights_of(self.module, self._who)
 
     def restored(self, content: bytes) -> Self:
         """Return a copy with these weights."""
@@ -91,18 +137,42 @@ class TorchPolicy(Foreign):
 
 @checked_names
 def from_torch(
-    module: nn.Module, *, observation_space: Any = None, action_space: Any = None
+    module: nn.Module | str | Path,
+    *,
+    trust: bool = False,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    chunk: int | None = None,
+    state: Any = None,
+    observation_space: Any = None,
+    action_space: Any = None,
 ) -> TorchPolicy:
     """Return a PyTorch module as a skill's policy; a skill takes the bare module too.
 
     ``forward`` receives observations (n, *obs_shape) of the type of its weights (float32 without
-    weights), images unscaled, for a Dict or Tuple a dict or tuple of such. It returns logits for
-    Discrete (concatenated for MultiDiscrete, one for each bit of MultiBinary), actions for Box
-    (clipped to its bounds); whole numbers are always actions. Its weights are copied into the run;
-    loading the run replaces the weights of the recipe's module by them.
+    weights), images unscaled, for a Dict or Tuple a dict or tuple of such; with ``sees``, its
+    inputs. It returns logits for Discrete (concatenated for MultiDiscrete, one for each bit of
+    MultiBinary), actions for Box (clipped to its bounds); whole numbers are always actions. With
+    ``state``, it takes that as its second argument (by the name ``state``, where the inputs have
+    names), and returns the output and the next state.
+
+    Its weights are copied into the run; loading the run replaces the weights of the recipe's module
+    by them. A file is recorded by its path and checksum, without a copy.
 
     Args:
-        module: acts in evaluation mode, as a copy made when training starts.
+        module: acts in evaluation mode, as a copy made when training starts; or a file of
+            TorchScript (``torch.jit.save``) or of an exported program (``torch.export.save``).
+        trust: True if you trust the author of the file: opening it may run any code in it.
+        sees: the parts of the observation that the module takes, a list, or one for each of its
+            arguments by name; see ``from_onnx``.
+        goal: the value of ``Goal()`` in ``sees``; see ``from_onnx``.
+        acts: the meaning of the output, ``Acts(...)``; None: it is the action.
+        every: each action is held for this number of steps.
+        chunk: the number of actions that are used of each output (n, H, ...).
+        state: the shape of a recurrent state, None as the axis of the environments: (1, None, 64);
+            or a list of shapes, for a tuple of tensors. It starts with zeros.
         observation_space: None: the environment's.
         action_space: None: the environment's.
 
@@ -110,11 +180,92 @@ def from_torch(
         The policy, for a skill's ``policy`` or ``evaluate``.
 
     Raises:
-        DeclarationError: it is not an instance of a module.
+        DeclarationError: it is not an instance of a module, or an argument is wrong.
+        PolicyError: the file is not trusted, or holds no module.
+        RunError: the file does not exist.
     """
+    mapping = mapping_of(
+        "from_torch()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
+    )
+    if isinstance(module, str | Path):
+        file = Path(module)
+        if trust is not True:
+            raise PolicyError(
+                f"{file} was not opened: TorchScript and exported programs can run code on your "
+                f"machine. If you trust its author: from_torch({str(file)!r}, trust=True)"
+            )
+        content = read_file(file)
+        loaded = _module_in(content, file)
+        return TorchPolicy(loaded, observation_space, action_space, mapping, file, content)
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
-    return TorchPolicy(module, observation_space, action_space)
+    return TorchPolicy(module, observation_space, action_space, mapping)
+
+
+def _module_in(content: bytes, file: Path) -> nn.Module:
+    """Return the module in a file of TorchScript, or of an exported program.
+
+    Raises:
+        PolicyError: it holds neither.
+    """
+    import torch
+
+    wrong = (
+        f"{file} holds neither TorchScript nor an exported program. Make the module, load its "
+        "weights, and give the module: from_torch(module)"
+    )
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = archive.namelist()
+    except zipfile.BadZipFile as error:
+        raise PolicyError(wrong) from error
+    script = any("/code/" in f"/{name}" for name in names)
+    exported = any(
+        f"/{name}".endswith(("/archive_format", "/serialized_exported_program.json"))
+        for name in names
+    )
+    if not script and not exported:
+        raise PolicyError(wrong)
+    try:
+        if exported:
+            return _program_of(torch.export.load(io.BytesIO(content)))
+        module: nn.Module = torch.jit.load(io.BytesIO(content), map_location="cpu")
+        return module.eval()
+    except Exception as error:  # torch's own errors have no common class
+        raise PolicyError(f"{file} could not be opened: {shortened(str(error))}") from error
+
+
+def _program_of(program: Any) -> nn.Module:
+    """Return an exported program as a module that takes rows, and inputs by name or position.
+
+    A program that was exported for one row is called once for each.
+    """
+    import torch
+    from torch.utils import _pytree as pytree
+
+    class Program(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = program.module()
+            wanted = [x for x in program.graph_signature.user_inputs if isinstance(x, str)]
+            example = program.example_inputs
+            by_name = 0 if example is None else len(example[1])
+            self.names = wanted[: len(wanted) - by_name]
+            nodes = {node.name: node for node in program.graph.nodes}
+            self.single = all(nodes[name].meta["val"].shape[:1] == (1,) for name in self.names)
+
+        def forward(self, *given: Any, **named: Any) -> Any:
+            given = (*given, *(named.pop(name) for name in self.names if name in named))
+            if not self.single or len(given[0]) == 1:
+                return self.inner(*given, **named)
+            rows = [
+                self.inner(*(x[i : i + 1] for x in given), **named) for i in range(len(given[0]))
+            ]
+            leaves = [pytree.tree_leaves(row) for row in rows]
+            joined = [torch.cat(x) for x in zip(*leaves, strict=True)]
+            return pytree.tree_unflatten(joined, pytree.tree_structure(rows[0]))
+
+    return Program()
 
 
 def _tensors(obs: Any, device: Any, dtype: Any) -> Any:

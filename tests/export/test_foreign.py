@@ -13,8 +13,8 @@ from test_networks import NESTED, one_by_one, same
 
 from skillweave import from_onnx, from_torch
 from skillweave.api.player import Player
-from skillweave.export.foreign import file_graph
 from skillweave.export.runner import Runner
+from skillweave.export.states import States
 from skillweave.export.write import write_export
 
 pytest.importorskip("onnxscript")
@@ -77,25 +77,33 @@ def test_whole_numbers_of_a_file_are_actions(tmp_path: Path) -> None:
     assert len(compare(policy, tmp_path / "out", 0)) > 1
 
 
-@pytest.mark.parametrize(("kind", "noise"), [("Discrete", "gumbel"), ("MultiBinary", "logistic")])
-def test_logits_of_a_file_are_sampled_with_the_noise_given(
-    kind: str, noise: str, tmp_path: Path
-) -> None:
-    import onnxruntime
+class Drawn:
+    """Stands for a random generator whose next draw is set."""
 
+    def __init__(self) -> None:
+        self.next = np.zeros(0)
+
+    def gumbel(self, size: Any) -> Any:
+        assert self.next.shape == size
+        return self.next
+
+    logistic = gumbel
+
+
+@pytest.mark.parametrize("kind", ["Discrete", "MultiBinary"])
+def test_logits_of_a_file_are_sampled_with_the_noise_given(kind: str, tmp_path: Path) -> None:
     space, outputs = SPACES[kind]
     policy = from_onnx(linear(tmp_path / "net.onnx", outputs, 17)).bind(OBS, space, "it")
-    graph = file_graph(policy, True)
-    assert graph.noise == ((noise, outputs),)
-    session = onnxruntime.InferenceSession(graph.content)
-    feeds = {"obs": np.zeros((1, 4)), "noise.0": np.full((1, outputs), -1.0, np.float32)}
-    if kind == "Discrete":
-        feeds |= {"mask": np.ones((1, 3), bool)}
+    states = States(space)
+    assert states.policy(policy, sampled=True)["sampled"]
+    write_export(tmp_path / "out", policy, "toy")
+    runner, noise = Runner(tmp_path / "out"), Drawn()
+    runner.root.entry["sampled"], runner.rng = True, noise
     for best in range(outputs):
-        feeds["noise.0"][:] = -1.0
-        feeds["noise.0"][0, best] = 1.0
+        noise.next = np.full((1, outputs), -1.0)
+        noise.next[0, best] = 1.0
         wanted = best - 1 if kind == "Discrete" else np.eye(outputs, dtype=np.int8)[best]
-        assert (session.run(["action"], feeds)[0][0] == wanted).all()
+        assert (runner.act(np.zeros(4)) == wanted).all()
 
 
 class Sees(torch.nn.Module):

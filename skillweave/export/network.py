@@ -1,0 +1,87 @@
+"""Networks of an export as policies: their entry in ``policy.json``, and how they act.
+
+Stands alone because ``states`` writes such entries and ``read`` reads them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypedDict
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.settings import Check
+from skillweave.skills.mapping import Part, PolicyMapping, Source
+from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.plan import leaves_of
+from skillweave.types import Array
+
+FileName = Annotated[
+    str,
+    Check(
+        "the name of an ONNX file in the folder",
+        lambda x: x.endswith(".onnx") and not set(x) & set("/\\\0") and not x.startswith("."),
+    ),
+]
+Width = Annotated[int, Check("at least 0 and at most 100,000,000", lambda x: 0 <= x <= 10**8)]
+
+
+class NetworkEntry(TypedDict):
+    """A network that was trained by this library; kind "Network"."""
+
+    file: FileName
+    choices: Width
+    """The width of its input ``mask``; 0: it has none."""
+    memory: dict[str, Width]
+    """The widths of its recurrent state, by the name of its input."""
+    noise: list[tuple[Literal["gumbel", "standard_normal", "random", "logistic"], Width]]
+    """The distribution and width of each of its inputs ``noise.0``, ``noise.1``, …"""
+
+
+def leaf_inputs(space: gym.Space[Any]) -> dict[str, tuple[Source, ...]]:
+    """Return the inputs of a file that takes each leaf of an observation by itself."""
+    leaves = leaves_of(space)
+    names = [f"obs.{leaf.name}" if leaf.fields else "obs" for leaf in leaves]
+    parts = [(Part(leaf.name, one_hot=False),) for leaf in leaves]
+    return dict(zip(names, parts, strict=True))
+
+
+class ExportedNetwork(OnnxPolicy):
+    """A network of an export: it returns actions, and takes a mask and noise."""
+
+    logits = False
+
+    def __init__(
+        self,
+        content: bytes,
+        file: Path,
+        entry: NetworkEntry,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+    ) -> None:
+        self.entry = entry
+        self.extra = tuple(
+            [f"noise.{i}" for i in range(len(entry["noise"]))] + ["mask"] * bool(entry["choices"])
+        )
+        mapping = PolicyMapping(
+            sees=leaf_inputs(observation_space),
+            state=tuple((name, f"{name}.after") for name in entry["memory"]),
+        )
+        super().__init__(content, file, None, observation_space, action_space, mapping)
+
+    def more_inputs(
+        self, n: int, mask: Array | None, rng: np.random.Generator | None
+    ) -> dict[str, Array]:
+        """Return the mask, and noise from ``rng``."""
+        given: dict[str, Array] = {}
+        if choices := self.entry["choices"]:
+            given["mask"] = np.ones((n, choices), bool) if mask is None else mask
+        rng = rng or np.random.default_rng()
+        for i, (kind, width) in enumerate(self.entry["noise"]):
+            given[f"noise.{i}"] = getattr(rng, kind)(size=(n, width)).astype(np.float32)
+        return given
+
+    def outputs_of(self, obs: Array) -> Array:
+        """Return the outputs (n, …) of a critic for observations."""
+        return self.call(self.plan.read(obs, None, None), (), None, True, None)[0]

@@ -1,0 +1,305 @@
+"""Policies in folders act the same where they are loaded; what is damaged is named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from hub_server import go_to, serve
+from reference_calls import Left, Right, T, Zigzag, shy
+from skills.foreign_models import onnx_file
+from skills.mapped_models import ACTION, CASES, SPACE, observations, onnx_model, weights
+from test_networks import NESTED, agent
+from test_state_machine import (
+    AUTOMATON,
+    POLICIES,
+    Careful,
+    Free,
+    LongWalk,
+    network,
+    ready,
+    skill_set,
+    traced_once,
+    trained,
+)
+
+import skillweave as sw
+from skillweave import DQN, PPO, RNN, Network
+from skillweave.api.player import Player
+from skillweave.collecting.guide import ActiveGuide
+from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
+from skillweave.export.write import write_export
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.selectors import ready_selector
+from skillweave.skills.foreign_policy import made_up
+from skillweave.types import Array, Policy
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("stable_baselines3")
+torch.set_num_threads(1)
+_ = traced_once  # of all tests here, too
+
+
+def acts_alike(one: Policy, other: Policy, batches: Any) -> None:
+    """Let both act with memories of their own; some environments start again."""
+    memory, memories = one.start(len(batches[0])), other.start(len(batches[0]))
+    rng, found = np.random.default_rng(0), []
+    for obs in batches:
+        action, memory = one.act(memory, obs)
+        actions, memories = other.act(memories, obs)
+        np.testing.assert_allclose(actions, action, atol=1e-5)
+        found.append(np.round(action, 3))
+        rows = np.flatnonzero(rng.random(len(obs)) < 0.2)
+        for policy, kept in ((one, memory), (other, memories)):
+            for k, v in policy.start(len(rows)).items():
+                kept[k][rows] = v
+    assert len(np.unique(found)) > 1
+
+
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize("name", CASES)
+def test_a_saved_policy_acts_the_same_where_it_is_loaded(name: str, tmp_path: Path) -> None:
+    policy = CASES[name](tmp_path).policy.bind(SPACE, ACTION, "it")
+    export = sw.save_policy(policy, tmp_path / "out", licence="MIT", origin="made here")
+    for file in tmp_path.glob("*.*"):
+        file.unlink()  # the folder is enough
+    loaded = sw.load_policy(tmp_path / "out", code=export.functions)
+    assert loaded.observation_space == SPACE
+    assert loaded.action_space == ACTION
+    acts_alike(policy, loaded, observations(3, 20, seed=5))
+    content = json.loads((tmp_path / "out/policy.json").read_text())
+    assert (content["licence"], content["origin"]) == ("MIT", "made here")
+    again = sw.save_policy(loaded, tmp_path / "again")
+    copied = sw.load_policy(tmp_path / "again", code=again.functions)
+    acts_alike(policy, copied, observations(3, 10, seed=6))
+
+
+AGENTS: dict[str, Any] = {
+    "ppo": (PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(4)),
+    "lstm": (
+        PPO(network=Network((8,), rnn=RNN("lstm", 4))),
+        gym.spaces.Box(-1, 1, (3,), np.float64),
+        gym.spaces.MultiDiscrete([2, 3]),
+    ),
+    "box": (PPO(network=Network((8,))), gym.spaces.MultiBinary(3), gym.spaces.Box(-2, 3, (2,))),
+}
+
+
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize("name", AGENTS)
+def test_an_export_of_a_trained_agent_is_loaded(name: str, tmp_path: Path) -> None:
+    config, space, action = AGENTS[name]
+    policy = agent(config, space, action)
+    write_export(tmp_path, policy, "toy")
+    loaded = sw.load_policy(tmp_path)
+    acts_alike(policy, loaded, [made_up(space, 6)[i : i + 3] for i in (0, 1, 2, 3)])
+
+
+def test_masks_reach_a_loaded_network(tmp_path: Path) -> None:
+    space = gym.spaces.Box(-1, 1, (3,), np.float32)
+    policy = agent(DQN(network=Network((8,))), space, gym.spaces.Discrete(4))
+    write_export(tmp_path, policy, "toy")
+    loaded, rng = sw.load_policy(tmp_path), np.random.default_rng(0)
+    for _ in range(5):
+        obs, mask = rng.normal(size=(4, 3)).astype(np.float32), rng.random((4, 4)) < 0.5
+        mask[:, 0] = True
+        np.testing.assert_array_equal(
+            loaded.act({}, obs, mask)[0], policy.act(policy.start(4), obs, mask)[0]
+        )
+
+
+def test_a_policy_without_spaces_gets_those_of_an_environment(tmp_path: Path) -> None:
+    policy = sw.from_onnx(onnx_file(tmp_path / "lean.onnx"))
+    with pytest.raises(PolicyError, match=r"lean.onnx has no spaces yet: give the environment"):
+        sw.save_policy(policy, tmp_path)
+    export = sw.save_policy(policy, tmp_path, "CartPole-v1")
+    assert export.files == ("agent.onnx", "policy.json", "runner.py")
+    loaded = sw.load_policy(tmp_path / "policy.json")
+    assert sw.evaluate(loaded, "CartPole-v1", episodes=2).mean > 0
+    with pytest.raises(SkillweaveError, match=r"save_policy\(\): .*takes observations of shape"):
+        sw.save_policy(policy, tmp_path, "Pendulum-v1")
+
+
+def test_a_goal_may_be_replaced(tmp_path: Path) -> None:
+    net = onnx_model(
+        tmp_path / "net.onnx",
+        [("MatMul", ["obs", "w"], ["a"])],
+        {"obs": ["n", 5]},
+        {"a": ["n", 5]},
+        {"w": weights(5, 5)},
+    )
+    policy = sw.from_onnx(net, sees=(sw.Goal(low=-1, high=1), "gyro"), goal=(0.5, 0))
+    policy = policy.bind(SPACE, ACTION, "it")
+    sw.save_policy(policy, tmp_path)
+    obs = observations(2, 1)[0]
+    other: Any = sw.load_policy(tmp_path, goal=(1, -1))
+    wanted = policy.act({}, obs, goal=np.array([[1.0, -1.0]] * 2))[0]
+    np.testing.assert_allclose(other.act({}, obs)[0], wanted, atol=1e-6)
+    with pytest.raises(SkillweaveError, match=r"load_policy\(\): .*goal is .*out of the range"):
+        sw.load_policy(tmp_path, goal=(2, 0))
+    sw.save_policy(sw.from_onnx(onnx_file(tmp_path / "x.onnx")), tmp_path / "no", "CartPole-v1")
+    with pytest.raises(DeclarationError, match=r"load_policy\(\): .*no: goal is given, but"):
+        sw.load_policy(tmp_path / "no", goal=1)
+
+
+# Hierarchies
+
+GUIDED = ActiveGuide(
+    ready_selector(AUTOMATON, ("careful", "left", "zigzag", "right")),  # type: ignore[arg-type]
+)
+
+
+def choose(obs: Array, last: sw.LastCall) -> Array:
+    return np.where(last.succeeded, 1, (obs[:, T].astype(int) + last.skill) % 2)
+
+
+HIERARCHIES: dict[str, Any] = {
+    "automaton": lambda: ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right)),
+    "function": lambda: ready(choose, skill_set(Careful, Zigzag, reflexes=(shy(),))),
+    "guide": lambda: HierarchyPolicy(
+        network(4, seed=7), skill_set(Careful, Left, Zigzag, Right), GUIDED
+    ),
+    "lengths": lambda: trained(skill_set(Left, Free, call_steps=sw.Lengths(1, 3))),
+    **POLICIES,
+}
+
+
+def episodes(policy: Policy, n: int) -> list[tuple[str, int]]:
+    """Play whole episodes; return the names of the skills that acted, and the actions."""
+    env, player, found = LongWalk(), Player(policy), []
+    for episode in range(n):
+        obs, info = env.reset(seed=episode)
+        player.reset()
+        reward, over = 0.0, False
+        while not over:
+            action = player.act(obs, reward=reward, info=info)
+            found.append((policy.acts(player.memory), int(action)))  # type: ignore[attr-defined]
+            obs, reward, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+    return found
+
+
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize("name", HIERARCHIES)
+def test_an_export_of_a_hierarchy_is_loaded(name: str, tmp_path: Path) -> None:
+    policy = HIERARCHIES[name]()
+    export = write_export(tmp_path / "out", policy, "walk")
+    loaded = sw.load_policy(tmp_path / "out", code=export.functions)
+    wanted = episodes(policy, 5)
+    assert episodes(loaded, 5) == wanted
+    assert len(set(wanted)) > 2
+    again = write_export(tmp_path / "again", loaded, "walk")
+    copied = sw.load_policy(tmp_path / "again", code=again.functions)
+    assert episodes(copied, 2) == episodes(policy, 2)
+
+
+# What is damaged, or does not fit
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    onnx_model(
+        tmp_path / "net.onnx",
+        [("MatMul", ["obs", "w"], ["a"]), ("Tanh", ["h"], ["h_out"])],
+        {"obs": ["n", 4], "h": ["n", 2]},
+        {"a": ["n", 5], "h_out": ["n", 2]},
+        {"w": weights(4, 5)},
+    )
+    policy = sw.from_onnx(
+        tmp_path / "net.onnx",
+        sees=("gyro", sw.Goal(low=-1, high=1)),
+        goal=0.5,
+        acts=sw.Acts(scale=2.0),
+        state={"h": "h_out"},
+        every=2,
+    )
+    sw.save_policy(policy.bind(SPACE, ACTION, "it"), tmp_path / "saved")
+    assert sw.load_policy(tmp_path / "saved")
+    return tmp_path / "saved"
+
+
+def changed(folder: Path, change: Callable[[Any], Any]) -> None:
+    path = folder / "policy.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x: x.update(format=1), "has format 1, but this version reads 2"),
+        (lambda x: x.pop("licence"), "no field 'licence'"),
+        (lambda x: x["files"].update({"agent.onnx": "0" * 64}), "agent.onnx has another checksum"),
+        (lambda x: x["files"].clear(), "policy.file is 'agent.onnx', which files does not list"),
+        (lambda x: x["policy"].update(kind="Magic"), "policy.kind is 'Magic'"),
+        (lambda x: x["policy"].update(file="../net.onnx"), "policy.file is .*name of an ONNX file"),
+        (lambda x: x["policy"].update(file=None), "policy has neither file nor code"),
+        (lambda x: x["policy"].update(output="b"), "policy: .*has no output 'b'"),
+        (lambda x: x["policy"].update(every=0), "policy.every is 0; it must be a whole number"),
+        (lambda x: x["policy"].update(chunk=4), r"chunk=4 needs \(n, 4, ...\)"),
+        (lambda x: x["policy"]["acts"].update(scale="x"), "policy.acts: Acts.scale is 'x'"),
+        (lambda x: x["policy"]["acts"].update(to=[0, 9]), "acts.to is .* does not exist"),
+        (lambda x: x["policy"].update(goal=[2.0]), "policy.goal is .2.0.*out of the range"),
+        (lambda x: x["policy"]["sees"]["obs"][0].update(key="gyr"), "sees.*reads 'gyr'.*'gyro'"),
+        (lambda x: x["policy"]["sees"]["obs"].pop(0), r"gives 1 numbers .*takes 4: 3 stay unset"),
+        (lambda x: x["policy"]["state"][0].update(shape=[1, 3]), r"policy.state has the shape"),
+        (lambda x: x["policy"]["state"].clear(), "policy: .*does not set the input 'h'"),
+        (lambda x: x["observation_space"].update(type="Ball"), "observation_space: .*Ball"),
+        (lambda x: x["action_space"].update(shape=[4], low=-2.0, high=2.0), r"\(2, 5\)|5 numbers"),
+        (lambda x: x["code"].update(f="a function"), "needs Python code.*'f': a function"),
+    ],
+)
+def test_a_manifest_that_does_not_fit_names_file_and_field(
+    change: Any, message: str, saved: Path
+) -> None:
+    changed(saved, change)
+    with pytest.raises((RunError, PolicyError), match=rf"saved.*{message}"):
+        sw.load_policy(saved)
+
+
+def test_files_that_are_missing_or_damaged_are_named(saved: Path) -> None:
+    content = (saved / "agent.onnx").read_bytes()
+    (saved / "agent.onnx").write_bytes(content[:-1])
+    with pytest.raises(RunError, match=r"agent.onnx has another checksum than .*policy.json"):
+        sw.load_policy(saved)
+    (saved / "agent.onnx").unlink()
+    with pytest.raises(RunError, match=r"agent.onnx does not exist"):
+        sw.load_policy(saved)
+    (saved / "policy.json").write_text("{")
+    with pytest.raises(RunError, match=r"policy.json is damaged"):
+        sw.load_policy(saved)
+    with pytest.raises(RunError, match=r"nothing/at/all does not exist"):
+        sw.load_policy("nothing/at/all")
+
+
+def test_other_spaces_than_the_environments_are_both_named(saved: Path) -> None:
+    class Walk(sw.Skill):
+        policy = sw.load_policy(saved)
+
+    with pytest.raises(SkillweaveError, match=r"skill 'walk'.*Dict.*CartPole-v1 has Box"):
+        sw.Hierarchy("CartPole-v1", [Walk()], selector=sw.PPO()).train(saved / "run", quiet=True)
+
+
+def test_a_policy_of_the_hub_is_loaded_without_what_is_not_data(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("huggingface_hub")
+    files = {p.name: p.read_bytes() for p in saved.iterdir()}
+    with serve() as hub:
+        go_to(hub.url, tmp_path / "cache", monkeypatch)
+        hub.make("ada/walk", files | {"train.py": b"mine"})
+        hub.make("ada/else", {"README.md": b"nothing"})
+        loaded = sw.load_policy("ada/walk")
+        acts_alike(sw.load_policy(saved), loaded, observations(2, 4))
+        names = {p.name for p in (tmp_path / "cache").rglob("*")}
+        assert "agent.onnx" in names
+        assert not names & {"train.py", "runner.py"}
+        with pytest.raises(RunError, match=r"ada/else holds no policy.*policy.json"):
+            sw.load_policy("ada/else")

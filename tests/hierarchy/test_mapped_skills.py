@@ -1,0 +1,103 @@
+"""Skills behind mappings in a hierarchy: trained, stopped, resumed, loaded and exported."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from declaring import plainly
+from small_runs import assert_same, stopped_run
+from torch import nn
+
+import skillweave as sw
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Skill, TrainDefaults
+
+pytestmark = pytest.mark.slow  # quick ones: tests/skills/test_mapped.py
+SELECTOR = PPO(num_envs=3, n_steps=8, batch_size=24, network=Network((8,)))
+
+
+class Recurrent(nn.Module):
+    """A network with a state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.cell, self.head = nn.GRUCell(4, 6), nn.Linear(6, 1)
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor) -> Any:
+        after = self.cell(x, state)
+        return 3.0 * self.head(after), after
+
+
+class Swing(Skill):
+    """Remembers its last action, and acts in each second step."""
+
+    policy = sw.from_torch(
+        Recurrent(), sees=(slice(0, 3), sw.LastAction(scale=0.5)), state=(None, 6), every=2
+    )
+
+
+def plan(x: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.stack([x[:, :1] * k for k in (-1.0, 0.5, 2.0)], axis=1)
+
+
+class Planned(Skill):
+    """Three actions of each inference, against the speed."""
+
+    policy = sw.from_function(plan, sees=sw.Part(places=(2,), scale=0.2), chunk=3)
+
+
+def declare() -> Hierarchy:
+    return Hierarchy(
+        EnvSpec("Pendulum-v1", engine="sync", workers=1),
+        [Swing(), Planned()],
+        call_steps=5,
+        selector=SELECTOR,
+        train_defaults=TrainDefaults(checkpoint_every=75),
+        **plainly({"selector_steps": 900}),
+    )
+
+
+def test_a_run_that_is_stopped_in_the_middle_of_calls_goes_on_bit_for_bit(tmp_path: Path) -> None:
+    whole = declare().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(declare(), tmp_path / "cut", 3)
+    resumed = declare().resume(tmp_path / "cut", quiet=True)
+    assert_same(resumed.path, whole.path)
+    recorded = json.loads((whole.path / "run.json").read_text())["skills"][0]["policy"]
+    assert recorded["mapping"]["every"] == 2
+    assert recorded["mapping"]["sees"][""][1] == {"source": "last_action", "scale": 0.5}
+
+
+def test_a_loaded_run_acts_by_its_recorded_mapping(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = declare().train(tmp_path / "run", seed=3, quiet=True)
+    weights = run.save_weights(tmp_path / "weights.safetensors")
+    other = sw.from_torch(Recurrent(), sees=(slice(0, 3), 0), state=(None, 6))
+    monkeypatch.setattr(Swing, "policy", other)
+    wanted = run.evaluate(2, skill="swing").returns
+    for loaded in (declare().load(run.path), declare().load_weights(weights)):
+        assert loaded.evaluate(2, skill="swing").returns == wanted
+    assert sw.evaluate(other, "Pendulum-v1", episodes=2).returns != wanted
+
+
+def test_a_hierarchy_of_mapped_skills_is_exported_and_loaded(tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    from skillweave.export.runner import Runner
+
+    run = declare().train(tmp_path / "run", seed=3, quiet=True)
+    export = run.export(tmp_path / "out")
+    runner, player = Runner(tmp_path / "out", export.functions), run.player()
+    loaded = sw.Player(sw.load_policy(tmp_path / "out", code=export.functions))
+    rng, skills = np.random.default_rng(0), set()
+    for _ in range(60):
+        obs = rng.uniform(-1, 1, 3).astype(np.float32)
+        action = player.act(obs)
+        np.testing.assert_allclose(runner.act(obs), action, atol=1e-5)
+        np.testing.assert_allclose(loaded.act(obs), action, atol=1e-5)
+        skills.add(int(player.memory["skill"][0]))
+    assert skills == {0, 1}

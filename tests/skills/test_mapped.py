@@ -1,0 +1,109 @@
+"""Policies from elsewhere act behind their mappings as their sources do, called by hand."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+from skills import mapped_models
+from skills.mapped_models import ACTION, CASES, SPACE, Case, observations
+
+from skillweave.skills.foreign_policy import fitted
+from skillweave.types import Array
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("stable_baselines3")
+    folder = tmp_path_factory.mktemp("mapped")
+    return {name: make(folder) for name, make in CASES.items()}
+
+
+def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
+    return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
+
+
+def one(obs: Array, i: int) -> dict[str, Any]:
+    """An observation as an environment returns it."""
+    return {
+        "gyro": obs["gyro"][i],
+        "state": obs["state"][i],
+        "arm": {"joints": obs["arm"]["joints"][i], "grip": obs["arm"]["grip"][i]},
+    }
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_mapped_policy_acts_as_its_source(cases: dict[str, Case], name: str) -> None:
+    case, n = cases[name], 3
+    policy, sources = fit(case.policy), [case.source() for _ in range(n)]
+    memory = policy.start(n)
+    for obs in observations(n, 20):
+        action, memory = policy.act(memory, obs)
+        assert action.dtype == np.float32
+        wanted = [s.act(one(obs, i)) for i, s in enumerate(sources)]
+        np.testing.assert_allclose(action, wanted, atol=1e-5)
+    assert len(np.unique(np.round(wanted, 3))) > 3  # it does something
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_environments_start_again_and_act_at_different_times(
+    cases: dict[str, Case], name: str
+) -> None:
+    case, n = cases[name], 5
+    policy, sources = fit(case.policy), [case.source() for _ in range(n)]
+    memory, rng = policy.start(n), np.random.default_rng(1)
+    for obs in observations(n, 30, seed=1):
+        fresh = np.flatnonzero(rng.random(n) < 0.2)
+        for k, v in policy.start(len(fresh)).items():
+            memory[k][fresh] = v
+        for i in fresh:
+            sources[i] = case.source()
+        rows = np.flatnonzero(rng.random(n) < 0.7)
+        if not len(rows):
+            continue
+        before = {k: v.copy() for k, v in memory.items()}
+        action, after = policy.act({k: v[rows] for k, v in memory.items()}, obs[rows])
+        for k, v in memory.items():
+            np.testing.assert_array_equal(v, before[k])  # a memory is not changed in place
+            v[rows] = after[k]
+        wanted = [sources[i].act(one(obs, i)) for i in rows]
+        np.testing.assert_allclose(action, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_alone_it_acts_as_among_others(cases: dict[str, Case], name: str) -> None:
+    policy = fit(cases[name].policy)
+    together, alone = policy.start(4), policy.start(1)
+    for obs in observations(4, 12, seed=2):
+        actions, together = policy.act(together, obs)
+        action, alone = policy.act(alone, obs[2:3])
+        np.testing.assert_allclose(action[0], actions[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_acts_the_same_in_another_process(cases: dict[str, Case], name: str) -> None:
+    policy = fit(cases[name].policy)
+    sent = cloudpickle.loads(cloudpickle.dumps(policy))
+    memory, memories = policy.start(3), sent.start(3)
+    for obs in observations(3, 5, seed=3):
+        action, memory = policy.act(memory, obs)
+        other, memories = sent.act(memories, obs)
+        np.testing.assert_array_equal(other, action)
+
+
+def test_each_is_declared_in_a_few_lines() -> None:
+    source = Path(mapped_models.__file__).read_text()
+    lines = {
+        function.name: statement.end_lineno - statement.lineno + 1
+        for function in ast.parse(source).body
+        if isinstance(function, ast.FunctionDef) and function.name.endswith("_case")
+        for statement in function.body
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "policy"
+    }
+    assert len(lines) == len(CASES)
+    assert max(lines.values()) <= 15
