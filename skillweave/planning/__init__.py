@@ -2,7 +2,7 @@
 
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
-from skillweave.planning.goal import Goal, reached
+from skillweave.planning.goal import GoalTask, reached
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, either, in_any_order
@@ -16,7 +16,7 @@ __all__ = [
     "CallLog",
     "Chain",
     "Explorer",
-    "Goal",
+    "GoalTask",
     "HandOver",
     "Mission",
     "Planner",

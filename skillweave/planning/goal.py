@@ -19,21 +19,21 @@ from skillweave.types import Array, Step, read_only
 
 
 @checked_names
-class Goal:
+class GoalTask:
     """A task that pays 1 where a goal is reached, and ends there.
 
     ```python
     import numpy as np
 
-    from skillweave.planning import Goal
+    from skillweave.planning import GoalTask
 
 
     def near(obs, goal):
         return np.hypot(*(obs[:, :2] - goal).T) < 0.45
 
 
-    to_a_point = Goal(near, goal=[3.0, -1.0])
-    as_observed = Goal(near, columns=(4, 5))  # each episode's observations hold its goal
+    to_a_point = GoalTask(near, goal=[3.0, -1.0])
+    as_observed = GoalTask(near, columns=(4, 5))  # each episode's observations hold its goal
     ```
 
     Args:
@@ -55,10 +55,11 @@ class Goal:
     ) -> None:
         if not callable(reached) or isinstance(reached, type):
             raise DeclarationError(
-                f"a Goal's reached is {short(reached)}; give a function of observations and goals"
+                f"a GoalTask's reached is {short(reached)}; give a function of observations and "
+                "goals"
             )
         if (goal is None) == (columns is None):
-            raise DeclarationError("a Goal needs either goal= or columns=")
+            raise DeclarationError("a GoalTask needs either goal= or columns=")
         self.reached, self.columns = reached, columns
         self.goal = None if goal is None else _goal(goal)
         # A slice or a list: both are indices of an axis.
@@ -70,14 +71,14 @@ class Goal:
             return np.broadcast_to(self.goal, (len(obs), len(self.goal)))
         if obs.ndim != 2:
             raise DeclarationError(
-                f"a Goal's columns are places in vectors, but observations have shape "
+                f"a GoalTask's columns are places in vectors, but observations have shape "
                 f"{obs.shape[1:]}; give goal= and a function that reads it"
             )
         try:
             goals: Array = obs[:, self._at].astype(np.float64)
         except (IndexError, TypeError) as error:
             raise DeclarationError(
-                f"a Goal's columns are {short(self.columns)}, but observations have "
+                f"a GoalTask's columns are {short(self.columns)}, but observations have "
                 f"{obs.shape[1]} numbers"
             ) from error
         return goals
@@ -122,7 +123,7 @@ def reached(function: Callable[[Array, Array], Any], goal: Any) -> Predicate:
     Raises:
         DeclarationError: the goal is not finite numbers.
     """
-    task = Goal(function, goal=goal)
+    task = GoalTask(function, goal=goal)
     fixed = _goal(goal)
     place = ", ".join(f"{x:g}" for x in fixed[:4])
     return Predicate(lambda obs: task.holds(obs, fixed), f"{function_name(function)}({place})")

@@ -19,7 +19,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
-from skillweave.planning.goal import Goal
+from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
 from skillweave.planning.neighbours import SOFT, feature_maps, nearest, weights_of
 from skillweave.planning.states import PlanningStates
@@ -279,7 +279,7 @@ class CallGraph:
             put(rows, worth, self.pieces.then[rows])
         return worth
 
-    def for_goal(self, goal: Goal, place: Array) -> tuple[Near, Array]:
+    def for_goal(self, goal: GoalTask, place: Array) -> tuple[Near, Array]:
         """Return the nearest pieces to the ends, and what may follow, where the goal is ``place``.
 
         They differ from the usual ones only for skills that see the goal.

@@ -18,7 +18,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
-from skillweave.planning.goal import Goal
+from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
@@ -73,8 +73,8 @@ class Planner(ReadySelector):
 
     Args:
         log: calls of these skills in this environment.
-        task: a ``Mission`` or its text, a ``RewardMachine``, a ``Goal``, a predicate, or a function
-            of a ``Step`` that returns the reward.
+        task: a ``Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a predicate, or a
+            function of a ``Step`` that returns the reward.
         predicates: by name, for a text.
         skills: a policy with the skills, or its ``SkillSet``; the log is compared with them. None:
             nothing is compared, and initiation sets are those that were recorded.
@@ -125,7 +125,7 @@ class Planner(ReadySelector):
         self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
         self._own_end = _own_end(self.task, self.graph)
-        self._machine = self.task.own() if isinstance(self.task, Goal) else self.task
+        self._machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
         self._states = PlanningStates(self._machine)
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
             if not known:
@@ -149,7 +149,7 @@ class Planner(ReadySelector):
         readings = read_log(task, self.graph.log)
         check_possible(task, readings, self.graph.log)
         near, may = graph.after, graph.may
-        if place is not None and isinstance(self.task, Goal):
+        if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
         judged = graph.judge(task, self._states, readings, self._gamma, self._own_end)
         worth, sweeps = graph.solve(judged, near, may, caution=self._caution)
@@ -157,7 +157,7 @@ class Planner(ReadySelector):
 
     def _plan_of(self, goal: Array) -> Plan:
         """Return the plan of a goal (G,), solved when it is first needed."""
-        assert isinstance(self.task, Goal)
+        assert isinstance(self.task, GoalTask)
         key = np.asarray(goal, np.float64).tobytes()
         if key in self._plans:
             self._plans.move_to_end(key)
@@ -181,7 +181,7 @@ class Planner(ReadySelector):
         return self._values(self.graph.near(obs), obs, state)
 
     def _values(self, near: Near, obs: Array, state: Array) -> Array:
-        if not isinstance(self.task, Goal):
+        if not isinstance(self.task, GoalTask):
             return self._values_in(self._plan, near, state)
         goals = self.task.of(obs)
         values = np.empty((len(obs), self.log.choices), np.float32)
@@ -304,7 +304,7 @@ def _own_end(task: Task, graph: CallGraph) -> Array | None:
 
     An episode that ended at its own goal would go on there for another one.
     """
-    if not isinstance(task, Goal) or task.columns is None:
+    if not isinstance(task, GoalTask) or task.columns is None:
         return None
     over: Array = graph.terminated.copy()
     rows = np.flatnonzero(over)

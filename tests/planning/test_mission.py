@@ -12,7 +12,7 @@ from planning.steps import column, step_to
 
 from skillweave.errors import DeclarationError
 from skillweave.planning import (
-    Goal,
+    GoalTask,
     Mission,
     Predicate,
     RewardMachine,
@@ -275,11 +275,11 @@ def wrong(make: Any, message: str) -> Any:
             "more than 10,000 states",
         ),
         wrong(lambda: as_task(3), "the task is 3; give a Mission"),
-        wrong(lambda: Goal(3, goal=[1]), "reached is 3"),
-        wrong(lambda: Goal(column(0)), "needs either goal= or columns="),
-        wrong(lambda: Goal(column(0), goal=[np.nan]), "one row of finite numbers"),
-        wrong(lambda: Goal(column(0), goal="x"), "give numbers"),
-        wrong(lambda: Goal(column(0), columns=(7,)).of(np.zeros((1, 3))), "have 3 numbers"),
+        wrong(lambda: GoalTask(3, goal=[1]), "reached is 3"),
+        wrong(lambda: GoalTask(column(0)), "needs either goal= or columns="),
+        wrong(lambda: GoalTask(column(0), goal=[np.nan]), "one row of finite numbers"),
+        wrong(lambda: GoalTask(column(0), goal="x"), "give numbers"),
+        wrong(lambda: GoalTask(column(0), columns=(7,)).of(np.zeros((1, 3))), "have 3 numbers"),
     ],
 )
 def test_a_wrong_mission_is_refused(make: Any, message: str) -> None:
@@ -305,7 +305,7 @@ def near(obs: Any, goal: Any) -> Any:
 
 
 def test_goals() -> None:
-    own = Goal(near, columns=(1,))
+    own = GoalTask(near, columns=(1,))
     obs = np.array([[0, 3], [0, 0]], np.float32)
     assert own.of(obs).tolist() == [[3], [0]]
     assert own.put(obs, np.array([7])).tolist() == [[0, 7], [0, 7]]
@@ -313,7 +313,7 @@ def test_goals() -> None:
     machine = own.own()
     _, reward, done = machine.step(machine.start(2), step_to(obs, obs))
     assert (reward.tolist(), done.tolist()) == ([0, 1], [False, True])
-    fixed = Goal(near, goal=[4])
+    fixed = GoalTask(near, goal=[4])
     assert fixed.of(obs).tolist() == [[4], [4]]
     task = fixed.at(np.array([0.0]))
     assert task.step(task.start(2), step_to(obs))[2].tolist() == [True, True]

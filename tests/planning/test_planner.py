@@ -19,7 +19,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.planning import (
     CallLog,
     Explorer,
-    Goal,
+    GoalTask,
     Mission,
     Planner,
     Predicate,
@@ -240,7 +240,7 @@ def test_goals_that_observations_hold() -> None:
                 ((p, 3), [(i, inside[: None if stops is None else stops + 1], False, why)])
             )
     log = log_of(["left", "right"], calls, size=2)
-    task = Goal(near, columns=(1,))
+    task = GoalTask(near, columns=(1,))
     planner = Planner(log, task, features=[0], neighbours=1, gamma=GAMMA, caution=0.0)
     for goal in (0, 3, 8, 10):
         q = planner.values(np.float32([[p, goal] for p in range(LINE + 1)]))
