@@ -33,6 +33,7 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
+from skillweave.api.planning import planned
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, evolving, go_on
@@ -58,6 +59,7 @@ from skillweave.hierarchy.weights import (
 )
 from skillweave.messages import as_path, shown_path, whole_number
 from skillweave.paths import AGENT, join, level_of, name_of
+from skillweave.planning import CallLog, Planner, record_calls
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -733,6 +735,59 @@ class Run:
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
         return run.manifest | {k: v.to_json() for k, v in scores.items() if v is not None}
+
+    @checked_names
+    def log_calls(
+        self,
+        steps: int = 20_000,
+        *,
+        choose: Any = "random",
+        num_envs: int = 16,
+        seed: int = 0,
+        info: Sequence[str] = (),
+    ) -> CallLog:
+        """Let the skills act without its selector, and return the log of their calls.
+
+        Args:
+            steps: environment steps to record; open calls are completed, so there are a few more.
+            choose: "random": uniformly among the skills that may start; or a selector: any policy
+                over the skills, a ready selector, or a ``planning.Explorer``.
+            num_envs: environments side by side.
+            seed: of the environments and of all that is sampled.
+            info: keys of the environment's ``info`` to record, so that tasks may read them.
+
+        Returns:
+            The log, for ``plan``, ``planning.hand_over`` and ``planning.chain``; its ``save``
+            writes it into a file.
+
+        Raises:
+            DeclarationError: this is a plain agent, or an argument is wrong.
+        """
+        spec = self.hierarchy.spec
+        return record_calls(
+            spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
+        )
+
+    @checked_names
+    def plan(self, task: Any, log: CallLog, **settings: Any) -> Run:
+        """Return the skills with a selector that plans a new task on logged calls; no training.
+
+        Evaluations, films and players are about the task: its reward, its end, its success. Nothing
+        is written, so ``evaluate(save=True)``, ``report`` and ``export`` are not for it.
+
+        Args:
+            task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
+                predicate, or a function of a ``Step`` that returns the reward.
+            log: of calls of these skills, from ``log_calls``.
+            **settings: of ``planning.Planner``: ``predicates`` for a text, ``features``, ``gamma``.
+
+        Raises:
+            DeclarationError: this is a plain agent, or a setting is wrong.
+            RunError: the log is of other skills, or no step of it does what the task needs.
+        """
+        planner = Planner(log, task, skills=self.policy, **settings)
+        hierarchy, policy = planned(self.hierarchy, self.policy, planner)
+        return Run(hierarchy, Path(f"{self.path.name.removesuffix('.safetensors')}-plan"), policy)
 
     def _training_envs(self) -> int | None:
         """Return the number of environments in training; None: nothing was trained."""

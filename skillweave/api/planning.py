@@ -1,0 +1,42 @@
+"""A hierarchy whose selector is a planner, in an environment that is scored by its task.
+
+Stands alone because nothing of it is trained or written, unlike all else that makes a run.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import gymnasium as gym
+
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.paths import SELECTOR
+from skillweave.planning import Planner
+from skillweave.planning.task_env import Tasked
+from skillweave.types import Policy
+
+D = TypeVar("D", bound=Declaration)
+
+
+def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, HierarchyPolicy]:
+    """Return a hierarchy and its policy with a planner in place of the outermost selector.
+
+    Its environment has the task's reward and ends, so that evaluations, films and players are about
+    the task. The selector's guide, interruption and target are left out: they belong to its
+    training.
+    """
+    assert isinstance(policy, HierarchyPolicy)
+    skills = replace(policy.skills, interruption=None)
+    spaces = policy.selector.observation_space, gym.spaces.Discrete(skills.choices)
+    selector: Any = planner.among(tuple(s.name for s in skills.skills)).bind(*spaces, SELECTOR)
+    hierarchy = copy.copy(declared)
+    spec = declared.spec
+    hierarchy.env = replace(spec, wrappers=(*spec.wrappers, Tasked(planner.task)))
+    hierarchy.selector = planner
+    hierarchy.guide = None
+    hierarchy.together = replace(declared.together, interrupt=False)
+    hierarchy.selection = replace(declared.selection, target_return=None)
+    return hierarchy, HierarchyPolicy(selector, skills)
