@@ -60,10 +60,12 @@ def test_a_new_task_is_planned_and_scored_by_itself(run: Run, log: CallLog) -> N
     assert run.hierarchy.spec == SPEC, "the run itself does not change"
     player = planned.player()
     env = planned.declaration.spec.make()
-    obs, paid, done = env.reset(seed=3)[0], 0.0, False
+    obs, info = env.reset(seed=3)
+    paid, done = 0.0, False
     while not done:
-        obs, reward, ended, cut, info = env.step(player.act(obs))
-        paid, done = paid + reward, ended or cut
+        obs, reward, ended, cut, info = env.step(player.act(obs, info=info))
+        paid += reward
+        done = ended or cut
     assert (round(paid, 6), info["success"], info["env_reward"]) == (1.0, True, 0.0)
 
 
