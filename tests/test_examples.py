@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 12
+COUNT = 13
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 BRIEFLY = """
 import runpy, sys
@@ -31,6 +31,7 @@ SMALL = {
     "foreign_skills.py": ("--steps", "3000"),
     "four_rooms.py": ("--steps", "3000"),
     "nested.py": ("--steps", "5000", "--out", "{folder}/run"),
+    "new_mission.py": ("left then land", "--steps", "3000", "--episodes", "1"),
     "own_algorithm.py": ("--steps", "2000", "--out", "{folder}/run"),
     "own_network.py": ("--steps", "2000", "--out", "{folder}/run"),
     "sb3_selector.py": ("--steps", "3000", "--episodes", "2"),
@@ -42,6 +43,7 @@ NEEDS = {
     "doorkey.py": ("minigrid",),
     "key_door.py": ("PIL",),
     "foreign_skills.py": ("stable_baselines3", "onnx", "onnxruntime"),
+    "new_mission.py": ("Box2D",),
     "sb3_selector.py": ("stable_baselines3",),
     "tutorial.py": ("Box2D", "PIL"),
 }
@@ -52,6 +54,7 @@ SAYS = {
     "four_rooms.py": "steps from the corner to the goal: ",
     "key_door.py": "over 100 episodes",
     "nested.py": "both errands done: ",
+    "new_mission.py": "over 1 episodes",
     "own_algorithm.py": "mean return: ",
     "own_network.py": "mean return: ",
     "ready_selectors.py": "automaton  return 1.00",
