@@ -2,9 +2,9 @@
 
     python examples/new_mission.py "right then left then hover for 100 steps then land"
 
-The words are left, right, hover and land: what the four skills of ``lander-missions`` are for. Once,
-their calls are logged (in calls.safetensors); then each new mission takes a second to plan. It needs
-box2d: ``pip install 'skillweave[box2d]'``.
+The words are left, right, hover and land: what the four skills of ``lander-missions`` are for.
+Their calls are logged once (in calls.safetensors); then each new mission takes a second to plan. It
+needs box2d: ``pip install 'skillweave[box2d]'``.
 """
 
 from __future__ import annotations
