@@ -33,7 +33,7 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
-from skillweave.api.planning import planned
+from skillweave.api.planning import planned, untasked
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, evolving, go_on
@@ -494,6 +494,7 @@ class Run:
         if save and (skill is not None or engine != "sync"):
             raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
         if save:
+            self._check_written()
             must_be_own(self.path)  # an error comes before anything is played
         policy = self._policy(skill)
         with EpisodeProgress(episodes, quiet=quiet) as progress:
@@ -655,6 +656,7 @@ class Run:
         Raises:
             RunError: this is no run but a weights file, or the file cannot be written.
         """
+        self._check_written()
         run = RunDirectory.open(self.path)
         return write_report(
             run,
@@ -678,6 +680,7 @@ class Run:
         Returns:
             The path.
         """
+        self._check_written()
         path = as_path(path, "path")
         must_be_own(path.parent)
         if isinstance(self.policy, AgentPolicy):
@@ -706,6 +709,7 @@ class Run:
             RunError: the run is not finished or damaged, ``name`` may not be written or
                 holds something else, or the hub does not answer.
         """
+        self._check_written()
         return push_run(self.path, name, private)
 
     @checked_names
@@ -729,6 +733,7 @@ class Run:
 
         One that sampled actions on request is under ``evaluation_sampled``.
         """
+        self._check_written()
         run = RunDirectory.open(self.path)
         scores = {
             "evaluation": load_evaluation(run),
@@ -763,7 +768,7 @@ class Run:
         Raises:
             DeclarationError: this is a plain agent, or an argument is wrong.
         """
-        spec = self.hierarchy.spec
+        spec = self._own_spec()
         return record_calls(
             spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
         )
@@ -785,9 +790,19 @@ class Run:
             DeclarationError: this is a plain agent, or a setting is wrong.
             RunError: the log is of other skills, or no step of it does what the task needs.
         """
+        if "skills" in settings:
+            raise DeclarationError("plan() takes no skills: they are the run's own")
+        declared = self.hierarchy
         planner = Planner(log, task, skills=self.policy, **settings)
-        hierarchy, policy = planned(self.hierarchy, self.policy, planner)
-        return Run(hierarchy, Path(f"{self.path.name.removesuffix('.safetensors')}-plan"), policy)
+        hierarchy, policy = planned(declared, self.policy, planner)
+        return PlannedRun(hierarchy, self.path, policy)
+
+    def _own_spec(self) -> EnvSpec:
+        """Return the environment of the hierarchy's own task."""
+        return self.hierarchy.spec
+
+    def _check_written(self) -> None:
+        """Raise a RunError where this is not what is written under ``path``."""
 
     def _training_envs(self) -> int | None:
         """Return the number of environments in training; None: nothing was trained."""
@@ -805,6 +820,24 @@ class Run:
         level = parts_of(roles_of(self.hierarchy), self.policy)[level_of(skill)]
         assert isinstance(level, HierarchyPolicy)
         return SkillAlone(level.skills, name_of(skill), skill)
+
+
+class PlannedRun(Run):
+    """Skills of a run with a planner for a new task; nothing of it is written."""
+
+    def _film_path(self, skill: str | None) -> Path:
+        """Return the default path of a film: where Python runs, not in the skills' run."""
+        ending = "" if skill is None else "-" + skill.replace("/", ".")
+        return Path(f"{self.path.name.removesuffix('.safetensors')}-plan{ending}.gif")
+
+    def _own_spec(self) -> EnvSpec:
+        return untasked(self.hierarchy.spec)
+
+    def _check_written(self) -> None:
+        raise RunError(
+            "this run was planned, so nothing of it is written or loaded again: use the run that "
+            f"its skills are from, {shown_path(self.path)}, and plan again"
+        )
 
 
 OneRun = str | Path | Run

@@ -11,14 +11,23 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 
+from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.paths import SELECTOR
 from skillweave.planning import Planner
-from skillweave.planning.task_env import Tasked
-from skillweave.types import Policy
+from skillweave.planning.task_env import Tasked, own_step
+from skillweave.types import Memory, Policy, Step
 
 D = TypeVar("D", bound=Declaration)
+
+
+class PlannedPolicy(HierarchyPolicy):
+    """Skills under a planner, which observe what the environment itself gives, not their score."""
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Return the ``memory`` after a ``step``, of the environment or of its ``TaskEnv``."""
+        return super().observe(memory, own_step(step))
 
 
 def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, HierarchyPolicy]:
@@ -33,10 +42,15 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     spaces = policy.selector.observation_space, gym.spaces.Discrete(skills.choices)
     selector: Any = planner.among(tuple(s.name for s in skills.skills)).bind(*spaces, SELECTOR)
     hierarchy = copy.copy(declared)
-    spec = declared.spec
+    spec = untasked(declared.spec)
     hierarchy.env = replace(spec, wrappers=(*spec.wrappers, Tasked(planner.task)))
     hierarchy.selector = planner
     hierarchy.guide = None
     hierarchy.together = replace(declared.together, interrupt=False)
     hierarchy.selection = replace(declared.selection, target_return=None)
-    return hierarchy, HierarchyPolicy(selector, skills)
+    return hierarchy, PlannedPolicy(selector, skills)
+
+
+def untasked(spec: EnvSpec) -> EnvSpec:
+    """Return an environment without the score of a planned task."""
+    return replace(spec, wrappers=tuple(w for w in spec.wrappers if not isinstance(w, Tasked)))

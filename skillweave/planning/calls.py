@@ -283,6 +283,8 @@ def join(logs: Iterable[CallLog]) -> CallLog:
         DeclarationError: no log is given.
         RunError: the logs are of other skills, spaces or ``info`` keys.
     """
+    if isinstance(logs, CallLog):
+        raise DeclarationError("join() takes a list of logs: join([log, other])")
     logs = list(logs)
     if not logs:
         raise DeclarationError("join() needs at least one log")

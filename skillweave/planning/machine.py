@@ -7,7 +7,7 @@ Specification". An event that must hold for n steps has a counter, so n states a
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -118,7 +118,8 @@ class RewardMachine:
 
     After every step the transitions of the current state are checked in the order of declaration;
     the first whose event holds is taken, and no other in this step. Accepting and failing states
-    end the task. A counter of ``held`` starts at 0 where its state is entered.
+    end the task. Where nothing pays, an accepting state pays 1. A counter of ``held`` starts at 0
+    where its state is entered.
 
     Args:
         transitions: by (from, to), the event: a predicate, a function of observations or of a
@@ -144,7 +145,13 @@ class RewardMachine:
         failing: Collection[str] = (),
         each_step: Any = 0.0,
     ) -> None:
-        self._build(_declared(transitions, start, accepting, failing, each_step))
+        plan = _declared(transitions, start, accepting, failing, each_step)
+        if not _pays(plan):
+            plan.arrows = [
+                replace(arrow, reward=float(arrow.target in plan.accepting))
+                for arrow in plan.arrows
+            ]
+        self._build(plan)
 
     def _build(self, plan: Plan) -> None:
         """Turn the parts of a machine into arrays, one row for each state."""
@@ -309,6 +316,11 @@ class RewardMachine:
                 true = np.where(atom >= plain, counted, true)
             holds &= true
         return holds
+
+    @property
+    def pays(self) -> bool:
+        """True if a transition or a step of it has a reward."""
+        return _pays(self.plan)
 
     def is_over(self, state: Array) -> Array:
         """Return where the task is over, (n, …) bool."""
@@ -504,6 +516,11 @@ def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_s
         if state not in over:
             plan.each_step[state] = reward
     return plan
+
+
+def _pays(plan: Plan) -> bool:
+    rewards = [*plan.each_step.values(), *(arrow.reward for arrow in plan.arrows)]
+    return any(callable(reward) or reward != 0.0 for reward in rewards)
 
 
 def atom_of(event: Event, slot: int) -> Atom:

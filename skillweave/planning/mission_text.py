@@ -136,6 +136,9 @@ class _Parser:
         if token.kind != "word" or token.text in KEYWORDS:
             self.fail("the name of a predicate is expected here", token)
         if token.text not in self.predicates:
+            if not self.predicates:
+                name = token.text
+                self.fail(f"{name!r} is no known predicate: give predicates={{{name!r}: …}}", token)
             known = ", ".join(self.predicates)
             close = close_matches(token.text, self.predicates)
             self.fail(f"{token.text!r} is no known predicate; known are: {known}.{close}", token)

@@ -115,6 +115,11 @@ class Planner(ReadySelector):
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
         self.log, self.task = log, as_task(task, predicates)
+        if isinstance(self.task, RewardMachine) and not self.task.pays:
+            raise DeclarationError(
+                "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
+                "reward, {('from', 'to'): (event, 1.0)}, or name accepting states, which then pay 1"
+            )
         self.graph = CallGraph(
             log,
             features,

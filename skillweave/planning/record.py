@@ -20,8 +20,9 @@ from skillweave.errors import DeclarationError, EnvError
 from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums
 from skillweave.seeding import Seeds, global_generators
-from skillweave.selectors import ReadySelector
+from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.skills.info_words import missing_key
+from skillweave.spaces import same_space
 from skillweave.types import Array, Memory, Memoryless
 
 MOST_BYTES = 4 * 2**30
@@ -105,6 +106,8 @@ def record_calls(
         raise DeclarationError(
             f"record_calls(): {short(skills)} has no skills; give a run's policy, run.policy"
         )
+    if isinstance(info, str):
+        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seeds = Seeds(seed) / "calls"
     with global_generators(seeds), closing(make_engine(spec, num_envs)) as engine:
@@ -118,20 +121,29 @@ def record_calls(
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
-    if choose == "random":
+    names = tuple(s.name for s in skills.skills)
+    choices = gym.spaces.Discrete(skills.choices)
+    if isinstance(choose, str) and choose == "random":
         return RandomChoice(skills.choices)
-    if isinstance(choose, str) or not hasattr(choose, "act"):
-        raise DeclarationError(
-            f"choose is {short(choose)}; it must be 'random', or a selector: a policy over the "
-            "skills"
-        )
-    if isinstance(choose, ReadySelector):
-        names = tuple(s.name for s in skills.skills)
-        choices = gym.spaces.Discrete(skills.choices)
-        return choose.among(names).bind(engine.observation_space, choices, "selector")
-    if isinstance(choose, LearnsFromCalls):
+    if isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
         choose.begin(skills.choices)
-    return choose
+        return choose
+    if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
+        if (ready := ready_selector(choose, names)) is not None:
+            return ready.bind(engine.observation_space, choices, "selector")
+    elif hasattr(choose, "start") and not isinstance(choose, type):
+        space = getattr(choose, "action_space", choices)
+        if not same_space(space, choices):
+            raise DeclarationError(
+                f"choose is a policy with the actions {space}, but it has to choose among "
+                f"{len(names)} skills ({', '.join(names)}): give a policy over the skills, "
+                "run.policy.selector for example"
+            )
+        return choose
+    raise DeclarationError(
+        f"choose is {short(choose)}; it must be 'random', an Explorer, a function of observations "
+        "that returns names of skills, another ready selector, or a policy over the skills"
+    )
 
 
 def _play(

@@ -5,7 +5,7 @@ Stands alone because it is an environment; all else here plans or judges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -17,6 +17,22 @@ from skillweave.planning.task import Task
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import put_observation
 from skillweave.types import Array, Step
+
+OWN_REWARD = "env_reward"
+OWN_SUCCESS = "env_success"
+SUCCESS = "success"
+"""Keys of info."""
+
+
+def own_step(step: Step) -> Step:
+    """Return a step of a ``TaskEnv`` as the environment itself gave it; another is unchanged."""
+    if OWN_REWARD not in step.info:
+        return step
+    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
+    for mark in ("", "_"):  # batches mark under "_key" where a key is there
+        if mark + OWN_SUCCESS in info:
+            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
+    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
 
 
 @dataclass(frozen=True)
@@ -33,8 +49,9 @@ class Tasked:
 class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
     """An environment with the reward of a task, which ends the episode where it is over.
 
-    ``info["success"]`` says in each step whether the task has succeeded, unless it is a reward
-    alone; ``info["env_reward"]`` is the environment's own reward.
+    ``info["success"]`` says in each step whether the task has succeeded, if it can. The reward and
+    the success of the environment itself are ``info["env_reward"]`` and ``info["env_success"]``:
+    skills and planners go by these, see ``own_step``.
     """
 
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
@@ -68,9 +85,11 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         )
         self._state, paid, over = self.machine.step(self._state, step)
         self._obs = after
-        info = {**info, "env_reward": float(reward)}
+        info = {**info, OWN_REWARD: float(reward)}
+        if SUCCESS in info:
+            info[OWN_SUCCESS] = info.pop(SUCCESS)
         if self.machine.accepting.any():
-            info["success"] = bool(self.machine.has_succeeded(self._state)[0])
+            info[SUCCESS] = bool(self.machine.has_succeeded(self._state)[0])
         return obs, float(paid[0]), bool(terminated or over[0]), bool(truncated), info
 
     def _batch_of_one(self, obs: Any) -> Array:

@@ -17,13 +17,24 @@ from ready_selectors.chain import (
     Leave,
     OpenDoor,
     Wait,
+    always,
     hierarchy,
 )
 
 import skillweave as sw
 from skillweave.api import Run
-from skillweave.errors import DeclarationError, RunError
-from skillweave.planning import CallLog, GoalTask, Mission, held, reached
+from skillweave.errors import DeclarationError, RunError, SkillweaveError
+from skillweave.planning import (
+    CallLog,
+    Explorer,
+    GoalTask,
+    Mission,
+    RewardMachine,
+    call_ends,
+    held,
+    join,
+    reached,
+)
 from skillweave.planning.task import as_task
 from skillweave.planning.task_env import Tasked, TaskEnv
 
@@ -97,9 +108,21 @@ def test_what_cannot_be_planned_is_refused(run: Run, log: CallLog, tmp_path: Pat
     for written in (
         lambda: planned.evaluate(1, save=True, quiet=True),
         lambda: planned.report(tmp_path / "report.html"),
+        lambda: planned.save_weights(tmp_path / "weights.safetensors"),
+        lambda: planned.info(),
     ):
-        with pytest.raises(RunError):
+        with pytest.raises(RunError, match="this run was planned, so nothing of it is written"):
             written()
+    with pytest.raises(DeclarationError, match="plan\\(\\) takes no skills"):
+        run.plan(at_four, log, skills=run.policy)
+    with pytest.raises(DeclarationError, match=r"give predicates=\{'four'"):
+        run.plan("four", log)
+    nothing = {("on", "there"): at_four}
+    with pytest.raises(DeclarationError, match="pays nothing"):
+        run.plan(RewardMachine(nothing), log)
+    assert (
+        run.plan(RewardMachine(nothing, accepting={"there"}), log).evaluate(5, quiet=True).mean == 1
+    )
     agent = Run(sw.Agent(SPEC, sw.PPO(), 10), tmp_path, run.policy)
     with pytest.raises(DeclarationError, match="no hierarchy"):
         agent.log_calls(10)
@@ -142,3 +165,67 @@ def test_the_environment_of_a_task_by_hand() -> None:
         pass
     assert env._state[0, 0] == 1
     assert reached(there, [6.0]).at(np.array([[6.0, 0, 0]])).tolist() == [True]
+
+
+def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> None:
+    """The score of a planned run is the task's; what is planned and played is not judged by it."""
+
+    class Paying(Corridor):
+        def step(self, action: int) -> Any:
+            obs, _, _, cut, info = super().step(action)
+            self.door = 1  # there is a way behind the wall
+            info["success"] = self.place == 4
+            return obs, 10.0 * (self.place == 2), False, cut, info
+
+    class ToPay(Leave):
+        max_steps = 9
+
+        def termination(self, step: Any) -> Any:
+            return step.reward > 5
+
+    class Back(ToPay):
+        policy = GetKey.policy
+
+    def paid(step: Any) -> Any:
+        return step.reward > 5
+
+    def won(step: Any) -> Any:
+        return step.info["success"]
+
+    skills = [ToPay(), Back(), Wait()]
+    declared = sw.Hierarchy(
+        sw.EnvSpec(Paying), skills, call_steps=None, selector=lambda obs: ["wait"] * len(obs)
+    )
+    run = Run(declared, Path("runs/paying"), hierarchy(declared.selector, skills=tuple(skills)))
+    log = run.log_calls(5_000, info=("success",))
+    planned = run.plan(Mission(won, paid, won, paid), log)
+    assert planned.evaluate(20, quiet=True).success_rate == 1.0
+    reasons = call_ends(log, "back").reasons
+    again = call_ends(planned.log_calls(3_000), "back").reasons
+    assert again["own"] / sum(again.values()) == pytest.approx(
+        reasons["own"] / sum(reasons.values()), abs=0.1
+    )
+
+
+@pytest.mark.parametrize(
+    ("choose", "says"),
+    [
+        ("explore", "'random', an Explorer"),
+        (Explorer, "'random', an Explorer"),
+        (sw.Automaton, "'random', an Explorer"),
+        (always(1), "among 4 skills"),
+        (lambda obs: ["nobody"] * len(obs), "nobody"),
+    ],
+)
+def test_what_cannot_choose_is_refused(run: Run, choose: Any, says: str) -> None:
+    with pytest.raises(SkillweaveError, match=says):
+        run.log_calls(50, choose=choose)
+
+
+def test_functions_choose(run: Run) -> None:
+    log = run.log_calls(50, choose=lambda obs: ["wait"] * len(obs))
+    assert set(log.choice) == {3}
+    with pytest.raises(DeclarationError, match=r"info=\('door',\)"):
+        run.log_calls(50, info="door")
+    with pytest.raises(DeclarationError, match=r"join\(\[log"):
+        join(log)
