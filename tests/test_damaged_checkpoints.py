@@ -98,7 +98,6 @@ CASES = [
     ("together", "collector.0.kept.player.skill", "nobody"),
     ("together", "collector.0.kept.player.end", "far too large"),
     ("together", "collector.0.open.obs", "infinite"),
-    ("together", "collector.0.kept.leaf", "far too large"),
     ("together", "collector.0.kept.action", "negative"),
     ("together", "collector.0.open.dist_params", "doubles"),
     ("together", "collector.0.open.dist_params", "infinite"),

@@ -191,8 +191,7 @@ EXAMPLE = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
 BRIEFLY = {
     "STEPS = 120_000": """STEPS = 4_096
 from skillweave.hierarchy import select_best
-from skillweave.runs import kept
-select_best.EPISODES = kept.EPISODES = 4""",
+select_best.MOST = 4""",
     "run.evaluate(50)": "run.evaluate(5)",
     "run.render(episodes=2)": "run.render(max_steps=20)",
 }

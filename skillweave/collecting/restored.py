@@ -71,9 +71,9 @@ def opened(
     for name, value in open_calls.items():
         if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
             found[name] = value.copy().view(obs.dtype).reshape(obs.shape)
-            # Where no call has begun yet, nothing was written.
-            begun = kept[join(level_of(name), "tau")] > 0
-            codec.check(to_tensor(found[name][begun]))
+            # What calls that are over were decided on is not kept.
+            is_open = kept[join(level_of(name), "open")]
+            codec.check(to_tensor(found[name][is_open]))
             continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:
             raise ValueError(f"{name!r} of open calls is {value.dtype} {value.shape}")

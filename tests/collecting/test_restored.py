@@ -12,11 +12,11 @@ SEEN = np.array([1, 4, 5])
 
 
 def kept(tau, prefix=""):
-    return {f"{prefix}tau": np.array(tau)}
+    return {f"{prefix}tau": np.array(tau), f"{prefix}open": np.array(tau) > 0}
 
 
 @pytest.mark.parametrize("prefix", ["", "inner/", "inner/deepest/"])
-def test_only_where_a_call_has_begun_is_an_observation_looked_at(prefix):
+def test_only_where_a_call_is_open_is_an_observation_looked_at(prefix):
     written = {f"{prefix}obs": np.array([2, 0, 3])}  # nothing was written for the second
     found = opened(written, kept([4, 0, 1], prefix), SEEN, SPACE)
     assert found[f"{prefix}obs"].tolist() == [2, 0, 3]
