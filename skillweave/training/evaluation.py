@@ -250,6 +250,8 @@ def _evaluate(
         if isinstance(policy, Foreign):
             policy = policy.bind(*spaces, "the policy")
         _check_spaces(policy, *spaces, spec.name)
+        if isinstance(policy, Foreign):
+            policy.try_out()
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS

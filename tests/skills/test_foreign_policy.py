@@ -10,8 +10,8 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
 
-from skillweave import from_function, from_onnx, from_sb3, from_torch
-from skillweave.errors import MissingExtra, SkillweaveError
+from skillweave import evaluate, from_function, from_onnx, from_sb3, from_torch
+from skillweave.errors import MissingExtra, PolicyError, SkillweaveError
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
 
@@ -330,3 +330,8 @@ def test_a_copy_that_is_damaged_missing_or_of_another_shape_is_said():
         load(from_torch(torch.nn.Linear(4, 3)), then.content())
     with pytest.raises(SkillweaveError, match=r"kind torch .*Linear.*now it is function .*lean"):
         load(from_function(lean), then.content())
+
+
+def test_a_policy_that_fails_is_named_before_it_is_scored():
+    with pytest.raises(PolicyError, match="the policy: module Linear fails on observations"):
+        evaluate(from_torch(torch.nn.Linear(3, 2)), "CartPole-v1", episodes=1)
