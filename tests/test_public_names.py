@@ -27,7 +27,7 @@ normalise plot_curves register_algorithm register_encoder save_policy train_agen
 """
 
 
-SHIPPED = ("skillweave.toys",)
+SHIPPED = ("skillweave.toys", "skillweave.planning")
 """Modules that users import from, beside the package itself."""
 
 
