@@ -425,6 +425,9 @@ class Run:
         policy: the trained policy.
     """
 
+    _mark = ""
+    """In names of files, where this is not what is written under ``path``."""
+
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
         self._player: Player | None = None
@@ -568,9 +571,9 @@ class Run:
     def _film_path(self, skill: str | None) -> Path:
         """Return the default path of a film."""
         ending = "" if skill is None else "-" + skill.replace("/", ".")
-        if self.path.is_dir() and not is_copy_of_hub(self.path):
+        if not self._mark and self.path.is_dir() and not is_copy_of_hub(self.path):
             return self.path / f"film{ending}.gif"
-        return Path(f"{self.path.name.removesuffix('.safetensors')}{ending}.gif")
+        return Path(f"{self.path.name.removesuffix('.safetensors')}{self._mark}{ending}.gif")
 
     @checked_names
     def act(self, obs: Any, **given: Any) -> Any:
@@ -825,10 +828,7 @@ class Run:
 class PlannedRun(Run):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
-    def _film_path(self, skill: str | None) -> Path:
-        """Return the default path of a film: where Python runs, not in the skills' run."""
-        ending = "" if skill is None else "-" + skill.replace("/", ".")
-        return Path(f"{self.path.name.removesuffix('.safetensors')}-plan{ending}.gif")
+    _mark = "-plan"
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

@@ -217,11 +217,11 @@ class CallLog:
         )
 
     def within(self, steps: int) -> CallLog:
-        """Return the first calls that have at most so many steps together."""
+        """Return the first calls, as many as have at most ``steps`` steps in all."""
         return self.take(np.flatnonzero(self.offset[1:] <= steps))
 
     def latest(self, steps: int) -> CallLog:
-        """Return the last calls that have at most so many steps together."""
+        """Return the last calls, as many as have at most ``steps`` steps in all."""
         return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
 
     def check_skills(self, skills: SkillSet) -> None:

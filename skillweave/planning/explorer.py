@@ -58,7 +58,7 @@ class Explorer(Memoryless):
         self._worth: Array = np.zeros(0)
 
     def begin(self, choices: int) -> None:
-        """Prepare for a recording of skills with so many choices."""
+        """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
         self._choices = choices
 
     def learn(self, log: CallLog) -> None:

@@ -37,7 +37,7 @@ class LearnsFromCalls(Protocol):
     """Steps after which it plans again."""
 
     def begin(self, choices: int) -> None:
-        """Prepare for a recording of skills with so many choices."""
+        """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
         ...
 
     def learn(self, log: CallLog) -> None:
@@ -149,7 +149,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
 def _play(
     recorder: Recorder, player: Player, steps: int, turn: Turn, seed: int, choose: Any
 ) -> None:
-    """Play until so many steps are recorded, and complete the open calls."""
+    """Play until ``steps`` steps are recorded, then complete the open calls."""
     engine = recorder.engine
     n = engine.num_envs
     memory, obs = player.start(n), np.array(engine.reset(seed))
@@ -203,7 +203,7 @@ class Recorder:
         self._call = np.full(n, -1)  # the open call of each environment
         self._episode, self._order = np.full(n, -1), np.zeros(n, np.int64)
         self._episodes = self._calls = 0
-        self._begun: list[tuple[Array, ...]] = []
+        self._starts: list[tuple[Array, ...]] = []
         self._ended: list[tuple[Array, ...]] = []
         self._steps: list[tuple[Array, ...]] = []
         self._limit = steps
@@ -230,7 +230,7 @@ class Recorder:
         if lengths:
             choice = choice * len(lengths) + np.searchsorted(lengths, memory["limit"][rows])
         episode, order = self._episode[rows].copy(), self._order[rows].copy()
-        self._begun.append((call, obs.copy(), choice, episode, order, age.copy()))
+        self._starts.append((call, obs.copy(), choice, episode, order, age.copy()))
         self._order[rows] += 1
 
     def add(self, rows: Array, action: Array, raw: RawStep) -> None:
@@ -259,7 +259,7 @@ class Recorder:
     def log(self) -> CallLog:
         """Return the calls that have ended so far."""
         ended = [np.concatenate(c) for c in zip(*self._ended, strict=True)]
-        begun = [np.concatenate(c) for c in zip(*self._begun, strict=True)]
+        starts = [np.concatenate(c) for c in zip(*self._starts, strict=True)]
         steps = [np.concatenate(c) for c in zip(*self._steps, strict=True)]
         by_call = np.argsort(ended[0], kind="stable")
         ended = [c[by_call] for c in ended]
@@ -267,7 +267,7 @@ class Recorder:
         rows = np.flatnonzero(np.isin(of, known))
         rows = rows[np.argsort(of[rows], kind="stable")]
         counts = np.bincount(of, minlength=self._calls)[known]
-        _, start, choice, episode, order, age = (c[known] for c in begun)
+        _, start, choice, episode, order, age = (c[known] for c in starts)
         end_reason, succeeded, terminated, truncated, may = ended[1:]
         _, next_obs, action, reward, *info = (c[rows] for c in steps)
         return CallLog(
