@@ -65,6 +65,8 @@ SCHEMA: dict[str, Column] = {
     "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
+    "call_limit": Column(raw=True, rollout=False),  # (T, N) int64, the length that was chosen
+    "call_succeeded": Column(raw=True, rollout=False),  # (T, N) bool, where calls ended
     "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
     "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices
     # Under the path of a learner (``inner/selector/decided``), where it decided:

@@ -15,6 +15,7 @@ from skillweave.collecting.call_end import EPISODE, OWN, RUNNING
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
+from skillweave.messages import short
 from skillweave.skills import Skill
 from skillweave.skills.info_words import missing_key
 from skillweave.types import Array, Step
@@ -56,6 +57,26 @@ def rewards_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array) -
 def successes_of(trace: Trace, skill: Skill, acts: Array, elapsed: Array) -> Array:
     """Return where a skill has succeeded, (T, N) bool; see ``steps_of``."""
     return _spread(acts, judged(trace, skill, "success", acts, elapsed), np.bool_)
+
+
+def call_successes(trace: Trace, skills: Sequence[Skill], path: str, over: Array) -> Array:
+    """Return which calls of a level have succeeded, (T, N) bool.
+
+    By the skill's ``success`` in the call's last step; of a skill without one, if its own
+    termination ended the call.
+
+    Args:
+        skills: of the level.
+        path: of the level, before the names of its columns.
+        over: (T, N) bool, the steps in which its calls ended.
+    """
+    running, elapsed = trace[path + "skill"], trace[path + "call_elapsed"]
+    succeeded: Array = over & (trace[path + "call_end"] == OWN)
+    for i, skill in enumerate(skills):
+        last = over & (running == i) if skill.defines("success") else None
+        if last is not None and last.any():
+            succeeded[last] = judged(trace, skill, "success", last, elapsed)
+    return succeeded
 
 
 def timed_out(trace: Trace, skill: Skill, elapsed: Array) -> Array:
@@ -128,6 +149,25 @@ def rows_of(trace: Trace, steps: Batch, path: str, elapsed: Array, record: Seque
         found["call_elapsed"] = elapsed
     found |= {k: trace.get(path + k) for k in own} | {"steps": np.ones(trace.lead, np.int64)}
     return steps.replace(**found)
+
+
+def info_numbers_of(trace: Trace, key: str) -> Array:
+    """Return a key of ``info`` in all steps, (T, N, …) numbers.
+
+    Raises:
+        EnvError: a step has no such key, or no number for each environment.
+    """
+    for info in trace.infos:
+        if key not in info:
+            raise EnvError(f"info[{key!r}] is to be recorded, but {missing_key(info)}")
+    values = [np.asarray(info[key]) for info in trace.infos]
+    for value, info in zip(values, trace.infos, strict=True):
+        if value.dtype.kind not in "biuf" or value.shape[:1] != trace.lead[1:]:
+            raise EnvError(
+                f"info[{key!r}] is to be recorded, but it is {short(info[key])}; a number for each "
+                "environment is needed"
+            )
+    return np.stack(values)
 
 
 def _info_column(trace: Trace, name: str) -> Array:
