@@ -466,6 +466,8 @@ class Run:
         max_steps: int | None = None,
         save: bool = False,
         engine: EngineName = "sync",
+        log_calls: bool = False,
+        info: Sequence[str] = (),
         quiet: bool = False,
     ) -> Evaluation:
         """Score it in whole episodes.
@@ -486,13 +488,17 @@ class Run:
                 one before. A sampled one is kept beside the score, and does not replace it. Not
                 with ``skill`` or another engine.
             engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
+            log_calls: record the calls of the skills: ``Evaluation.calls`` is a log as of
+                ``Run.log_calls``. The selector made them, so it may hold few calls of some skills.
+            info: keys of the environment's ``info`` to record with the calls.
             quiet: no progress; else it is shown where an evaluation takes longer than a second.
 
         Returns:
             Returns, lengths, and what each skill did.
 
         Raises:
-            DeclarationError: no such skill or engine; or ``save`` where it cannot be.
+            DeclarationError: no such skill or engine; or ``save`` or ``log_calls`` where it cannot
+                be.
         """
         if save and (skill is not None or engine != "sync"):
             raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
@@ -500,6 +506,8 @@ class Run:
             self._check_written()
             must_be_own(self.path)  # an error comes before anything is played
         policy = self._policy(skill)
+        if log_calls:
+            self._check_logged()
         with EpisodeProgress(episodes, quiet=quiet) as progress:
             score = evaluate(
                 policy,
@@ -511,6 +519,8 @@ class Run:
                 max_steps=max_steps,
                 watch=progress.watch,
                 engine=engine,
+                log_calls=log_calls,
+                info=info,
             )
         if save:
             save_evaluation(RunDirectory.open(self.path), score, seed, deterministic)
@@ -807,6 +817,9 @@ class Run:
     def _check_written(self) -> None:
         """Raise a RunError where this is not what is written under ``path``."""
 
+    def _check_logged(self) -> None:
+        """Raise a DeclarationError where evaluations do not show whole calls."""
+
     def _training_envs(self) -> int | None:
         """Return the number of environments in training; None: nothing was trained."""
         if self.path.is_dir():
@@ -832,6 +845,13 @@ class PlannedRun(Run):
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)
+
+    def _check_logged(self) -> None:
+        raise DeclarationError(
+            "episodes of a planned run end with its task, so the calls in them are cut there: "
+            "leave out log_calls, and record whole calls with "
+            "run.log_calls(choose=run.policy.selector)"
+        )
 
     def _check_written(self) -> None:
         raise RunError(
