@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -39,6 +39,7 @@ TYPES = {
     "terminated": np.bool_,
     "truncated": np.bool_,
     "episode": np.int64,
+    "seed": np.int64,
     "order": np.int64,
     "age": np.int64,
     "may_follow": np.bool_,
@@ -46,6 +47,14 @@ TYPES = {
     "reward": np.float32,
 }
 """Types of all columns but observations and actions."""
+
+
+class LoggedRun(TypedDict):
+    """The run whose calls a log in its directory holds."""
+
+    id: str | None
+    skills: str
+    """Checksum of the weights of all its skills."""
 
 
 class CallsHeader(TypedDict):
@@ -60,10 +69,19 @@ class CallsHeader(TypedDict):
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
+    run: NotRequired[LoggedRun]
 
 
-def write_calls(path: str | Path, columns: Mapping[str, Array], about: Mapping[str, Any]) -> None:
+def write_calls(
+    path: str | Path,
+    columns: Mapping[str, Array],
+    about: Mapping[str, Any],
+    run: LoggedRun | None = None,
+) -> None:
     """Write the columns of a log, and the fields that are no arrays, into a file.
+
+    Args:
+        run: the run in whose directory the file is; None: in none.
 
     Raises:
         RunError: the file cannot be written.
@@ -75,6 +93,7 @@ def write_calls(path: str | Path, columns: Mapping[str, Array], about: Mapping[s
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
     }
+    header |= {} if run is None else {"run": run}
     tensors = {name: to_tensor(value) for name, value in columns.items()}
     write_tensors(as_path(path, "save(): path"), tensors, header)
 
@@ -172,6 +191,7 @@ def _check_values(columns: dict[str, Array], steps: int, choices: int) -> None:
         "order": bool((columns["order"] >= 0).all()),
         "age": bool(((columns["age"] >= 0) & (columns["age"] < 2**31)).all()),
         "episode": bool(((columns["episode"] >= 0) & (columns["episode"] < 2**62)).all()),
+        "seed": bool(((columns["seed"] >= -1) & (columns["seed"] < 2**31)).all()),
         "reward": bool((np.abs(columns["reward"]) <= LARGEST_REWARD).all()),
     }
     if wrong := [name for name, right in in_range.items() if not right]:

@@ -28,6 +28,7 @@ PER_CALL = (
     "terminated",
     "truncated",
     "episode",
+    "seed",
     "order",
     "age",
     "may_follow",
@@ -57,6 +58,8 @@ class CallLog:
         terminated: (C,) bool, the episode ended in the call.
         truncated: (C,) bool, the episode's time limit cut the call.
         episode: (C,) int64, the number of the episode.
+        seed: (C,) int64, the seed of the episode, from which its environment repeats it with the
+            same actions; −1: unknown, of EnvPool.
         order: (C,) int64, the call's number in its episode, from 0.
         age: (C,) int64, the steps of the episode before the call.
         may_follow: (C, choices) bool, the choices that may start at the call's end.
@@ -81,6 +84,7 @@ class CallLog:
     terminated: Array
     truncated: Array
     episode: Array
+    seed: Array
     order: Array
     age: Array
     may_follow: Array

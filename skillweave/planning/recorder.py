@@ -196,6 +196,7 @@ class Recorder:
             terminated=terminated,
             truncated=truncated,
             episode=episode,
+            seed=np.full(len(episode), -1),
             order=order,
             age=age,
             may_follow=may,

@@ -55,6 +55,7 @@ def log_of(
         terminated=why == "end",
         truncated=why == "cut",
         episode=np.array(columns["episode"], np.int64),
+        seed=np.array(columns["episode"], np.int64),
         order=np.array(columns["order"], np.int64),
         age=np.array(columns["age"], np.int64),
         may_follow=np.ones((calls, choices), bool),
