@@ -31,6 +31,8 @@ from skillweave.types import LARGEST_REWARD, Array
 
 KIND = "calls"
 INFO = "info."
+PLAIN = ("checksums", "recurrent", "own_success")
+"""Entries of the header with a value for each skill."""
 SPACES = ("observation", "action")
 TYPES = {
     "choice": np.int64,
@@ -66,6 +68,7 @@ class CallsHeader(TypedDict):
     checksums: list[str]
     sees: list[list[Count] | None]
     recurrent: list[bool]
+    own_success: list[bool]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
@@ -88,7 +91,7 @@ def write_calls(
     """
     header = {
         "kind": KIND,
-        **{name: list(about[name]) for name in ("skills", "lengths", "checksums", "recurrent")},
+        **{name: list(about[name]) for name in ("skills", "lengths", *PLAIN)},
         "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
@@ -125,7 +128,7 @@ def _fields(
         raise ValueError("its skills have no names, or two the same")
     if list(lengths) != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
-    if any(len(header[k]) != len(skills) for k in ("checksums", "sees", "recurrent")):
+    if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
     columns = {name: value.numpy() for name, value in tensors.items()}
     expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
@@ -150,8 +153,7 @@ def _fields(
         | {
             "skills": skills,
             "lengths": lengths,
-            "checksums": tuple(header["checksums"]),
-            "recurrent": tuple(header["recurrent"]),
+            **{name: tuple(header[name]) for name in PLAIN},
             "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
         }

@@ -188,6 +188,7 @@ class Recorder:
             skill_checksums(skills),
             seen_places(skills),
             tuple(bool(policy.start(1)) for policy in skills.policies),
+            tuple(skill.defines("success") for skill in skills.skills),
             *self.spaces,
             start=start,
             choice=choice,

@@ -46,6 +46,7 @@ def log_of(
         ("",) * len(skills),
         (None,) * len(skills),
         (False,) * len(skills),
+        (True,) * len(skills),
         gym.spaces.Box(-np.inf, np.inf, (size,), np.float32),
         gym.spaces.Discrete(2),
         start=np.array(columns["start"], np.float32).reshape(calls, size),
