@@ -22,6 +22,7 @@ from skillweave.api.applying import (
     load_policy,
     spec_of,
 )
+from skillweave.api.calls import RunCalls
 from skillweave.api.hub import push_run
 from skillweave.api.notebook_tables import (
     agent_facts,
@@ -430,6 +431,7 @@ class Run:
 
     def __init__(self, declaration: Hierarchy | Agent, path: Path, policy: Policy) -> None:
         self.declaration, self.path, self.policy = declaration, path, policy
+        self._calls = RunCalls(path)
         self._player: Player | None = None
 
     def __repr__(self) -> str:
@@ -704,7 +706,7 @@ class Run:
         return path
 
     @checked_names
-    def push(self, name: str, *, private: bool = False) -> dict[str, Any]:
+    def push(self, name: str, *, private: bool = False, calls: bool = False) -> dict[str, Any]:
         """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
 
         Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
@@ -714,6 +716,7 @@ class Run:
         Args:
             name: ``owner/name``; made if it is not there. An older run there is replaced.
             private: others may not read it.
+            calls: with the log of calls, so that others can plan without recording one.
 
         Returns:
             ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
@@ -723,7 +726,7 @@ class Run:
                 holds something else, or the hub does not answer.
         """
         self._check_written()
-        return push_run(self.path, name, private)
+        return push_run(self.path, name, private, calls)
 
     @checked_names
     def as_skill(self, name: str, **attributes: Any) -> Skill:
@@ -761,33 +764,55 @@ class Run:
         *,
         choose: Any = "random",
         num_envs: int = 16,
-        seed: int = 0,
+        seed: int | None = None,
         info: Sequence[str] = (),
     ) -> CallLog:
-        """Let the skills act without its selector, and return the log of their calls.
+        """Let the skills act without the selector, record their calls, and keep them in the run.
+
+        The run's directory keeps all recorded calls, the latest million steps, in
+        ``calls.safetensors``; ``calls`` reads them. Calls of the skills before they learnt on are
+        replaced. A run without a directory of its own (a weights file, a copy of the hub's) keeps
+        calls in memory.
 
         Args:
             steps: environment steps to record; open calls are completed, so there are a few more.
             choose: "random": uniformly among the skills that may start; or a selector: any policy
                 over the skills, a ready selector, or a ``planning.Explorer``.
             num_envs: environments side by side.
-            seed: of the environments and of all that is sampled.
-            info: keys of the environment's ``info`` to record, so that tasks may read them.
+            seed: of the environments and of all that is sampled; None: 0, or a new one if the run
+                has calls, so that more are recorded. With the same seed the same calls are
+                recorded, which the run keeps once.
+            info: keys of the environment's ``info`` to record, so that tasks may read them; those
+                of earlier calls are added.
 
         Returns:
-            The log, for ``plan``, ``planning.hand_over`` and ``planning.chain``; its ``save``
-            writes it into a file.
+            The calls that were recorded now; ``calls`` has all.
 
         Raises:
             DeclarationError: this is a plain agent, or an argument is wrong.
+            RunError: the run's file of calls is damaged, or cannot be written.
         """
         spec = self._own_spec()
-        return record_calls(
+        seed, info = self._calls.begin(seed, info)
+        log = record_calls(
             spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
         )
+        self._calls.add(log)
+        return log
+
+    @property
+    def calls(self) -> CallLog:
+        """All calls that ``log_calls`` recorded in this run.
+
+        Raises:
+            DeclarationError: this is the run of a plain agent.
+            RunError: none were recorded, or their file is damaged or of other skills.
+        """
+        _ = self.hierarchy
+        return self._calls.read(self.policy)
 
     @checked_names
-    def plan(self, task: Any, log: CallLog, **settings: Any) -> Run:
+    def plan(self, task: Any, log: CallLog | None = None, **settings: Any) -> Run:
         """Return the skills with a selector that plans a new task on logged calls; no training.
 
         Evaluations, films and players are about the task: its reward, its end, its success. Nothing
@@ -796,16 +821,18 @@ class Run:
         Args:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
                 predicate, or a function of a ``Step`` that returns the reward.
-            log: of calls of these skills, from ``log_calls``.
+            log: calls of these skills; None: all that ``log_calls`` recorded in this run.
             **settings: of ``planning.Planner``: ``predicates`` for a text, ``features``, ``gamma``.
 
         Raises:
             DeclarationError: this is a plain agent, or a setting is wrong.
-            RunError: the log is of other skills, or no step of it does what the task needs.
+            RunError: there is no log, it is of other skills, or no step of it does what the task
+                needs.
         """
         if "skills" in settings:
             raise DeclarationError("plan() takes no skills: they are the run's own")
         declared = self.hierarchy
+        log = self.calls if log is None else log
         planner = Planner(log, task, skills=self.policy, **settings)
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)

@@ -10,6 +10,7 @@ from typing import Any
 
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
+from skillweave.planning.run_log import needed_calls
 from skillweave.reporting.card import write_card
 from skillweave.reporting.plots import plot_run
 from skillweave.runs import hub
@@ -17,14 +18,16 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import load_evaluation
 
 
-def push_run(path: Path, name: str, private: bool = False) -> dict[str, Any]:
+def push_run(path: Path, name: str, private: bool = False, calls: bool = False) -> dict[str, Any]:
     """Put the run at ``path`` on the hub; see ``Run.push``."""
     hub.hub()  # a missing extra is reported first
     run, name = RunDirectory.open(path), hub.check_name(name)
     hub.must_be_own(run.path)
     hub.check_whole(run)
+    if calls:
+        needed_calls(run)
     files: dict[str, Path | bytes] = {}
-    run_files, stays = hub.run_files(run)
+    run_files, stays = hub.run_files(run, calls)
     films = hub.run_films(run)
     missing = [f"{f} is no safetensors file: it stays" for f in stays]
     if not films:

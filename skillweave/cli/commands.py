@@ -275,6 +275,8 @@ class Push(Output):
     """OWNER/NAME on the hub; made if it is not there. An older run there is replaced."""
     private: bool = False
     """Others may not read it."""
+    calls: bool = False
+    """With the log of calls, so that others can plan without recording one."""
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ def _export(command: commands.Export) -> None:
 def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
     """Put a run on the hub; return the result as JSON and for people."""
     _no_bars()
-    pushed = push_run(command.run, command.name, command.private)
+    pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
     lines.append(f"load it: skillweave.from_hub({command.name!r})")
     return pushed, "\n".join(lines)

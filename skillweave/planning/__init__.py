@@ -3,7 +3,7 @@
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.goal import GoalTask, reached
-from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
+from skillweave.planning.hand_over import CallEnds, Chain, HandOver
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, either, in_any_order
 from skillweave.planning.planner import Planner
@@ -23,10 +23,7 @@ __all__ = [
     "Predicate",
     "RewardMachine",
     "as_task",
-    "call_ends",
-    "chain",
     "either",
-    "hand_over",
     "held",
     "in_any_order",
     "join",

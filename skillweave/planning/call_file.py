@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +31,8 @@ from skillweave.types import LARGEST_REWARD, Array
 
 KIND = "calls"
 INFO = "info."
+PLAIN = ("checksums", "recurrent", "own_success")
+"""Entries of the header with a value for each skill."""
 SPACES = ("observation", "action")
 TYPES = {
     "choice": np.int64,
@@ -39,6 +41,7 @@ TYPES = {
     "terminated": np.bool_,
     "truncated": np.bool_,
     "episode": np.int64,
+    "seed": np.int64,
     "order": np.int64,
     "age": np.int64,
     "may_follow": np.bool_,
@@ -46,6 +49,14 @@ TYPES = {
     "reward": np.float32,
 }
 """Types of all columns but observations and actions."""
+
+
+class LoggedRun(TypedDict):
+    """The run whose calls a log in its directory holds."""
+
+    id: str | None
+    skills: str
+    """Checksum of the weights of all its skills."""
 
 
 class CallsHeader(TypedDict):
@@ -57,24 +68,35 @@ class CallsHeader(TypedDict):
     checksums: list[str]
     sees: list[list[Count] | None]
     recurrent: list[bool]
+    own_success: list[bool]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
+    run: NotRequired[LoggedRun]
 
 
-def write_calls(path: str | Path, columns: Mapping[str, Array], about: Mapping[str, Any]) -> None:
+def write_calls(
+    path: str | Path,
+    columns: Mapping[str, Array],
+    about: Mapping[str, Any],
+    run: LoggedRun | None = None,
+) -> None:
     """Write the columns of a log, and the fields that are no arrays, into a file.
+
+    Args:
+        run: the run in whose directory the file is; None: in none.
 
     Raises:
         RunError: the file cannot be written.
     """
     header = {
         "kind": KIND,
-        **{name: list(about[name]) for name in ("skills", "lengths", "checksums", "recurrent")},
+        **{name: list(about[name]) for name in ("skills", "lengths", *PLAIN)},
         "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
     }
+    header |= {} if run is None else {"run": run}
     tensors = {name: to_tensor(value) for name, value in columns.items()}
     write_tensors(as_path(path, "save(): path"), tensors, header)
 
@@ -106,7 +128,7 @@ def _fields(
         raise ValueError("its skills have no names, or two the same")
     if list(lengths) != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
-    if any(len(header[k]) != len(skills) for k in ("checksums", "sees", "recurrent")):
+    if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
     columns = {name: value.numpy() for name, value in tensors.items()}
     expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
@@ -131,8 +153,7 @@ def _fields(
         | {
             "skills": skills,
             "lengths": lengths,
-            "checksums": tuple(header["checksums"]),
-            "recurrent": tuple(header["recurrent"]),
+            **{name: tuple(header[name]) for name in PLAIN},
             "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
         }
@@ -172,6 +193,7 @@ def _check_values(columns: dict[str, Array], steps: int, choices: int) -> None:
         "order": bool((columns["order"] >= 0).all()),
         "age": bool(((columns["age"] >= 0) & (columns["age"] < 2**31)).all()),
         "episode": bool(((columns["episode"] >= 0) & (columns["episode"] < 2**62)).all()),
+        "seed": bool(((columns["seed"] >= -1) & (columns["seed"] < 2**31)).all()),
         "reward": bool((np.abs(columns["reward"]) <= LARGEST_REWARD).all()),
     }
     if wrong := [name for name, right in in_range.items() if not right]:

@@ -3,42 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import close_matches, shortened
 from skillweave.planning.call_file import INFO, read_calls, write_calls
+from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
+from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.spaces import same_space
-from skillweave.types import Array, Step
-
-PER_CALL = (
-    "start",
-    "choice",
-    "end_reason",
-    "succeeded",
-    "terminated",
-    "truncated",
-    "episode",
-    "order",
-    "age",
-    "may_follow",
-)
-"""Columns with a row for each call."""
-PER_STEP = ("next_obs", "action", "reward")
-"""Columns with a row for each step."""
+from skillweave.types import Array
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class CallLog:
+class CallLog(CallColumns):
     """C calls of skills, in the order of their starts, and the T steps inside them.
 
     Attributes:
@@ -47,6 +30,7 @@ class CallLog:
         checksums: of each skill, what decides its actions and its ends.
         sees: of each skill, the places in the flat observation that its network sees; None: all.
         recurrent: of each skill, whether its policy has a memory within a call.
+        own_success: of each skill, whether it defines ``success``.
         observation_space: of the environment.
         action_space: of the environment.
         start: (C, *obs_shape), the observation of the decision.
@@ -57,6 +41,8 @@ class CallLog:
         terminated: (C,) bool, the episode ended in the call.
         truncated: (C,) bool, the episode's time limit cut the call.
         episode: (C,) int64, the number of the episode.
+        seed: (C,) int64, the seed of the episode, from which its environment repeats it with the
+            same actions; −1: unknown, of EnvPool.
         order: (C,) int64, the call's number in its episode, from 0.
         age: (C,) int64, the steps of the episode before the call.
         may_follow: (C, choices) bool, the choices that may start at the call's end.
@@ -67,162 +53,60 @@ class CallLog:
         info: by key, (T, …) values of the environment's ``info``.
     """
 
-    skills: tuple[str, ...]
-    lengths: tuple[int, ...]
-    checksums: tuple[str, ...]
-    sees: tuple[tuple[int, ...] | None, ...]
-    recurrent: tuple[bool, ...]
-    observation_space: gym.Space[Any]
-    action_space: gym.Space[Any]
-    start: Array
-    choice: Array
-    end_reason: Array
-    succeeded: Array
-    terminated: Array
-    truncated: Array
-    episode: Array
-    order: Array
-    age: Array
-    may_follow: Array
-    offset: Array
-    next_obs: Array
-    action: Array
-    reward: Array
-    info: dict[str, Array] = field(default_factory=dict)
+    @checked_names
+    def hand_over(
+        self, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
+    ) -> HandOver:
+        """Count how often each skill is done after each other one.
 
-    def __len__(self) -> int:
-        return len(self.choice)
+        A row counts the calls that follow a call of its skill. Calls that the episode's time limit
+        cut before they were done are left out.
 
-    def __repr__(self) -> str:
-        counts = np.bincount(self.skill, minlength=len(self.skills)).tolist()
-        each = ", ".join(f"{n} {c}" for n, c in zip(self.skills, counts, strict=True))
-        return f"<CallLog: {len(self):,} calls ({shortened(each, 300)}), {self.steps:,} steps>"
-
-    @property
-    def steps(self) -> int:
-        """The steps of all calls together, T."""
-        return len(self.reward)
-
-    @property
-    def choices(self) -> int:
-        """The number of choices: each skill with each length."""
-        return len(self.skills) * max(1, len(self.lengths))
-
-    @property
-    def skill(self) -> Array:
-        """The skill of each call, (C,) int64."""
-        skill: Array = self.choice // max(1, len(self.lengths))
-        return skill
-
-    @property
-    def tau(self) -> Array:
-        """The steps of each call, (C,) int64."""
-        return np.diff(self.offset)
-
-    @property
-    def end(self) -> Array:
-        """The observation after each call, (C, *obs_shape), always the true successor."""
-        end: Array = self.next_obs[self.offset[1:] - 1]
-        return end
-
-    @property
-    def before(self) -> Array:
-        """The observation before each step, (T, *obs_shape)."""
-        before = np.roll(self.next_obs, 1, axis=0)
-        before[self.offset[:-1]] = self.start
-        return before
-
-    @property
-    def owner(self) -> Array:
-        """The call of each step, (T,) int64."""
-        return np.repeat(np.arange(len(self)), self.tau)
-
-    @property
-    def elapsed(self) -> Array:
-        """The steps of its call until each step, this one included, (T,) int64."""
-        elapsed: Array = np.arange(self.steps) - self.offset[self.owner] + 1
-        return elapsed
-
-    @property
-    def was_cut(self) -> Array:
-        """(C,) bool: the episode's time limit cut the call."""
-        cut: Array = self.truncated & ~self.terminated & (self.end_reason == CallEnd.EPISODE)
-        return cut
-
-    @cached_property
-    def followed_by(self) -> Array:
-        """The next call of the same episode, (C,) int64; −1: none was logged."""
-        following = np.full(len(self), -1)
-        rows = np.lexsort((self.order, self.episode))
-        a, b = rows[:-1], rows[1:]
-        joined = (self.episode[a] == self.episode[b]) & (self.order[a] + 1 == self.order[b])
-        following[a[joined]] = b[joined]
-        return following
-
-    def returns(self, gamma: float) -> Array:
-        """Return Σ γᵏ rₖ of each call, (C,) float64."""
-        weighted = self.reward.astype(np.float64) * gamma ** (self.elapsed - 1)
-        sums: Array = np.add.reduceat(weighted, self.offset[:-1]) if len(self) else np.zeros(0)
-        return sums
-
-    def as_steps(self) -> Step:
-        """Return all steps as one ``Step`` of T rows, to judge tasks by.
-
-        ``elapsed`` counts the steps of the episode, as it does where a task is followed.
-        """
-        last = np.zeros(self.steps, bool)
-        last[self.offset[1:] - 1] = True
-        return Step(
-            obs=self.before,
-            action=self.action,
-            next_obs=self.next_obs,
-            reward=self.reward,
-            terminated=last & self.terminated[self.owner],
-            truncated=last & self.truncated[self.owner],
-            timed_out=np.zeros(self.steps, bool),
-            elapsed=self.age[self.owner] + self.elapsed,
-            info=self.info,
-        )
-
-    def number(self, skill: str) -> int:
-        """Return the place of a skill in ``skills``.
+        Args:
+            done: by skill, the event that its calls are for, in place of the skill's ``success``:
+                a predicate, a function of observations or of a ``Step``, or ``held(...)``; a call
+                is done if it happened within the call. A call of a skill with neither is done if it
+                ended by itself.
+            only_after_done: leave out calls that follow a call that was not done.
 
         Raises:
-            DeclarationError: the log has no skill of this name; similar names are given.
+            DeclarationError: ``done`` names an unknown skill, or holds no event.
         """
-        if skill not in self.skills:
-            raise DeclarationError(
-                f"the log has no skill {skill!r}; its skills are: {', '.join(self.skills)}."
-                f"{close_matches(str(skill), self.skills)}"
-            )
-        return self.skills.index(skill)
+        return hand_over(self, done, only_after_done=only_after_done)
 
-    def of(self, skill: str) -> CallLog:
-        """Return the calls of one skill."""
-        return self.take(np.flatnonzero(self.skill == self.number(skill)))
+    @checked_names
+    def chain(
+        self, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
+    ) -> Chain:
+        """Estimate how often skills are done one after another, a call each, from episodes' starts.
 
-    def take(self, rows: Array) -> CallLog:
-        """Return some calls, in the order of ``rows`` (k,), with their steps."""
-        rows = np.asarray(rows, np.int64)
-        tau = self.tau[rows]
-        offset = np.concatenate([[0], np.cumsum(tau)]).astype(np.int64)
-        # The k-th step of a call is k behind its first.
-        steps = np.arange(offset[-1]) + np.repeat(self.offset[rows] - offset[:-1], tau)
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in PER_CALL},
-            **{name: getattr(self, name)[steps] for name in PER_STEP},
-            offset=offset,
-            info={key: value[steps] for key, value in self.info.items()},
-        )
+        The estimate follows logged calls: from where a call ended, the nearest calls of the next
+        skill count, by distance. So it knows that a skill ends elsewhere after another one, which
+        the product of rates does not.
 
-    def within(self, steps: int) -> CallLog:
-        """Return the first calls, as many as have at most ``steps`` steps in all."""
-        return self.take(np.flatnonzero(self.offset[1:] <= steps))
+        Args:
+            *skills: names, in their order.
+            done: as for ``hand_over``.
+            features: as for ``Planner``.
 
-    def latest(self, steps: int) -> CallLog:
-        """Return the last calls, as many as have at most ``steps`` steps in all."""
-        return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
+        Raises:
+            DeclarationError: no skill is named, or one that is unknown.
+            RunError: the log has no call of a skill, or none of the first at an episode's start.
+        """
+        return chain(self, *skills, done=done, features=features)
+
+    @checked_names
+    def call_ends(self, skill: str) -> CallEnds:
+        """Return where the calls of a skill end, and why.
+
+        Args:
+            skill: its name.
+
+        Raises:
+            DeclarationError: the log has no skill of this name.
+            RunError: the log has no call of it.
+        """
+        return call_ends(self, skill)
 
     def check_skills(self, skills: SkillSet) -> None:
         """Raise a RunError where the log is of other skills, spaces or limits of calls."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
 from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
-from skillweave.planning.calls import CallLog
+from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbours import feature_maps, nearest, weights_of
@@ -39,12 +39,15 @@ class HandOver:
         done: (S + 1, S) int64.
         cut: (S,) int64, calls of each skill that were left out, as the episode's time limit cut
             them.
+        by_itself: skills without a ``success`` and an event of ``done``: a call of theirs is done
+            if it ended by itself.
     """
 
     skills: tuple[str, ...]
     calls: Array
     done: Array
     cut: Array
+    by_itself: tuple[str, ...] = ()
 
     @property
     def before(self) -> tuple[str, ...]:
@@ -94,24 +97,36 @@ class HandOver:
                 elsewhere_low = wilson(done, calls)[0]
                 if high[i, j] < elsewhere_low:
                     where = "at the start of an episode" if i == 0 else f"after {before!r}"
+                    does = "ends by itself" if skill in self.by_itself else "succeeds"
                     sentences.append(
-                        f"{skill!r} succeeds in {self.rate[i, j]:.0%} of the calls {where}; "
+                        f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
                         f"{done / calls:.0%} elsewhere"
                     )
         return sentences
 
+    @property
+    def meaning(self) -> str:
+        """A sentence on what counts as done."""
+        if not self.by_itself:
+            return "A call is done if it succeeded."
+        names = ", ".join(self.by_itself)
+        if len(self.by_itself) == len(self.skills):
+            return "No skill defines success(): a call is done if it ended by itself."
+        return f"A call is done if it succeeded; without success() ({names}) if it ended by itself."
+
     def __str__(self) -> str:
-        """Return the matrix as a table of text: rates, and the number of calls."""
+        """Return the matrix as a table of text: rates, the number of calls, what is done."""
         width = max(map(len, self.before))
         cells = [["after", *self.skills], *self._rows()]
         widths = [max(width, 5), *(max(len(s), 12) for s in self.skills)]
-        return "\n".join(
+        lines = [
             "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
             for row in cells
-        )
+        ]
+        return "\n".join([*lines, self.meaning])
 
     def _repr_html_(self) -> str:
-        return table(["after", *self.skills], self._rows())
+        return table(["after", *self.skills], self._rows()) + f"<p>{escape(self.meaning)}</p>"
 
     def _rows(self) -> list[list[str]]:
         return [
@@ -141,25 +156,10 @@ class Chain:
     """The number of calls that each factor was counted from."""
 
 
-@checked_names
 def hand_over(
-    log: CallLog, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
+    log: CallColumns, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
 ) -> HandOver:
-    """Count how often each skill is done after each other one.
-
-    A row counts the calls that follow a call of its skill. Calls that the episode's time limit cut
-    before they were done are left out.
-
-    Args:
-        log: calls; of a random selector all pairs have some.
-        done: by skill, the event that its calls are for, in place of the skill's ``success``:
-            a predicate, a function of observations or of a ``Step``, or ``held(...)``; a call is
-            done if it happened within the call.
-        only_after_done: leave out calls that follow a call that was not done.
-
-    Raises:
-        DeclarationError: ``done`` names an unknown skill, or holds no event.
-    """
+    """See ``CallLog.hand_over``."""
     count = len(log.skills)
     won = calls_done(log, done)
     counts = ~log.was_cut | won
@@ -173,31 +173,20 @@ def hand_over(
     np.add.at(calls, (before[rows], log.skill[rows]), 1)
     np.add.at(did, (before[rows], log.skill[rows]), won[rows])
     cut = np.bincount(log.skill[~counts], minlength=count)
-    return HandOver(log.skills, calls, did, cut)
+    by_itself = tuple(
+        name
+        for name, judged in zip(log.skills, log.own_success, strict=True)
+        if not judged and name not in (done or {})
+    )
+    return HandOver(log.skills, calls, did, cut, by_itself)
 
 
-@checked_names
 def chain(
-    log: CallLog, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
+    log: CallColumns, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
 ) -> Chain:
-    """Estimate how often skills are done one after another, a call each, from an episode's start.
-
-    The estimate follows logged calls: from where a call ended, the nearest calls of the next skill
-    count, by distance. So it knows that a skill ends elsewhere after another one, which the product
-    of rates does not.
-
-    Args:
-        log: calls.
-        skills: names, in their order.
-        done: as for ``hand_over``.
-        features: as for ``Planner``.
-
-    Raises:
-        DeclarationError: no skill is named, or one that is unknown.
-        RunError: the log has no call of a skill, or none of the first at an episode's start.
-    """
+    """See ``CallLog.chain``."""
     if not skills:
-        raise DeclarationError("chain() needs the names of skills: chain(log, 'left', 'right')")
+        raise DeclarationError("chain() needs the names of skills: chain('left', 'right')")
     numbers = [log.number(name) for name in skills]
     won = calls_done(log, done)
     counts = ~log.was_cut | won
@@ -248,18 +237,8 @@ class CallEnds:
     """(3, F) numbers of the flat observation that 10, 50 and 90 % of the calls end below."""
 
 
-@checked_names
-def call_ends(log: CallLog, skill: str) -> CallEnds:
-    """Return where the calls of a skill end, and why.
-
-    Args:
-        log: calls.
-        skill: its name.
-
-    Raises:
-        DeclarationError: the log has no skill of this name.
-        RunError: the log has no call of it.
-    """
+def call_ends(log: CallColumns, skill: str) -> CallEnds:
+    """See ``CallLog.call_ends``."""
     some = log.of(skill)
     if not len(some):
         raise RunError(f"the log has no call of {skill!r}; record some")
@@ -276,7 +255,7 @@ def call_ends(log: CallLog, skill: str) -> CallEnds:
     )
 
 
-def calls_done(log: CallLog, done: Mapping[str, Any] | None) -> Array:
+def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
     """Return which calls were done, (C,) bool: by an event inside, or by the skill's success."""
     won = log.succeeded.copy()
     if done is None:
@@ -291,7 +270,7 @@ def calls_done(log: CallLog, done: Mapping[str, Any] | None) -> Array:
     return won
 
 
-def happened(log: CallLog, event: Any) -> Array:
+def happened(log: CallColumns, event: Any) -> Array:
     """Return the calls within which an event happened, (C,) bool."""
     task = Mission(event)
     readings = read_log(task, log)

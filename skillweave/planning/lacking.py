@@ -8,7 +8,7 @@ import numpy as np
 
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.messages import observed
-from skillweave.planning.calls import CallLog
+from skillweave.planning.columns import CallColumns
 from skillweave.planning.machine import Counter, Readings, RewardMachine
 from skillweave.planning.predicates import Predicate
 from skillweave.types import Array
@@ -17,7 +17,7 @@ TRIES = 20_000
 """Observations that are made up, to find one in which a predicate holds."""
 
 
-def read_log(task: RewardMachine, log: CallLog) -> Readings:
+def read_log(task: RewardMachine, log: CallColumns) -> Readings:
     """Evaluate a task's events and rewards on all steps of a log.
 
     Raises:
@@ -37,7 +37,7 @@ def read_log(task: RewardMachine, log: CallLog) -> Readings:
         ) from error
 
 
-def check_possible(task: RewardMachine, readings: Readings, log: CallLog) -> None:
+def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) -> None:
     """Raise a RunError where no logged step lets the task go on, though it is not over.
 
     The error names the predicates that never hold, and the skill that comes nearest to one.
@@ -74,7 +74,7 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallLog) -> Non
     raise RunError(_sentence(list(missing.values()), log))
 
 
-def _sentence(missing: Sequence[Predicate], log: CallLog) -> str:
+def _sentence(missing: Sequence[Predicate], log: CallColumns) -> str:
     names = " and ".join(repr(p.name) for p in missing[:3])
     verb = "holds" if len(missing) == 1 else "hold"
     text = f"{names} never {verb} in the {log.steps:,} steps of the log, so no plan leads there"
@@ -84,7 +84,7 @@ def _sentence(missing: Sequence[Predicate], log: CallLog) -> str:
     return f"{text}; check the predicate, record more steps, or add a skill that leads there"
 
 
-def _nearest(predicate: Predicate, log: CallLog) -> str:
+def _nearest(predicate: Predicate, log: CallColumns) -> str:
     """Return a clause on the skill that comes nearest to where a predicate holds; "": unknown."""
     obs = log.next_obs
     if predicate.reads != "obs" or obs.ndim != 2 or obs.dtype.kind != "f":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet, skills_below
-from skillweave.envs.engine import Engine
+from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError
@@ -116,8 +117,9 @@ def record_calls(
         rng = (seeds / "choices").numpy()
         sampled = isinstance(selector, RandomChoice)
         turn = Turn(not sampled, rng)
-        _play(recorder, engine, player, steps, turn, seeds.integer(), choose)
-        return recorder.log()
+        played = _play(recorder, engine, player, steps, turn, seeds.integer(), choose)
+        log = recorder.log()
+        return replace(log, seed=played[log.episode])
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
@@ -154,10 +156,28 @@ def _play(
     turn: Turn,
     seed: int,
     choose: Any,
-) -> None:
-    """Play until ``steps`` steps are recorded, then complete the open calls."""
+) -> Array:
+    """Play until ``steps`` steps are recorded, then complete the open calls.
+
+    Returns:
+        The seeds of the episodes, in the order of their starts; −1: unknown, of EnvPool.
+    """
     n, feed = engine.num_envs, TraceFeed([recorder])
-    memory, obs = player.start(n), np.array(engine.reset(seed))
+    seeds: list[int] = []
+    begun = np.zeros(n, np.int64)  # episodes of each environment
+
+    def begin(rows: Array) -> Array:
+        """Begin episodes in environments ``rows``; return observations."""
+        each = [episode_seed(seed, i, int(begun[i])) for i in rows.tolist()]
+        fresh = not begun.any()
+        begun[rows] += 1
+        if isinstance(engine, GymnasiumEngine):
+            seeds.extend(each)
+            return engine.reset_some(rows, each)
+        seeds.extend([-1] * len(rows))
+        return engine.reset(seed) if fresh else engine.reset_some(rows)
+
+    memory, obs = player.start(n), np.array(begin(np.arange(n)))
     turn.age = np.zeros(n, np.int64)
     rows, made, planned = np.arange(n), 0, 0
     while len(rows):
@@ -172,7 +192,7 @@ def _play(
         obs[rows] = raw.next_obs
         over = rows[raw.terminated | raw.truncated]
         if len(over):
-            obs[over] = engine.reset_some(over)
+            obs[over] = begin(over)
             player.restart(memory, over)
             turn.age[over] = 0
         if made >= steps:
@@ -183,3 +203,4 @@ def _play(
             if recorder.calls:
                 choose.learn(recorder.log())
     feed.flush()
+    return np.array(seeds)

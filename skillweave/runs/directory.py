@@ -6,6 +6,7 @@ lineage.jsonl                a line for every member of every generation, of pop
 evaluation.json              the latest evaluation (``training/evaluation_file.py``)
 evaluation-sampled.json      the latest evaluation that sampled actions on request
 checkpoint.safetensors       the latest checkpoint of the stage in training (and the one before)
+calls.safetensors            calls of the skills (``planning/run_log.py``)
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
 starts/<name>.safetensors    initial policies from another run, until their learner's stage is done
@@ -67,6 +68,8 @@ First = Callable[["RunDirectory"], None]
 """A function that writes the files of a new run before ``run.json``."""
 
 
+CALLS = "calls.safetensors"
+"""The file of logged calls."""
 FINAL = "final"
 """The folder of final states."""
 LINES = ("metrics_bytes", "lineage_bytes")

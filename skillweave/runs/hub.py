@@ -17,7 +17,7 @@ from typing import Any
 from skillweave.errors import DeclarationError, MissingExtra, RunError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import CALLS, RunDirectory
 from skillweave.runs.files import json_bytes
 from skillweave.runs.links import check_no_links_around
 
@@ -25,7 +25,7 @@ KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")
 """Suffixes of files that may be in a run on the hub: weights, settings, its card, its pictures."""
 MADE_BY_THE_HUB = ".gitattributes"
 LINES = ("run.json", "evaluation.json", "metrics.jsonl", "lineage.jsonl")
-WANTED = (*LINES, "policies/*.safetensors")
+WANTED = (*LINES, CALLS, "policies/*.safetensors")
 """The downloaded files, from which a run is read."""
 OF_A_POLICY = ("policy.json", "*.onnx")
 """The downloaded files, from which a policy is read."""
@@ -108,13 +108,18 @@ def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return content
 
 
-def run_files(run: RunDirectory) -> tuple[dict[str, Path | bytes], list[str]]:
+def run_files(run: RunDirectory, calls: bool = False) -> tuple[dict[str, Path | bytes], list[str]]:
     """Return a run's files to upload, by their names on the hub; and the files that stay.
 
     Copies of policies that are neither safetensors nor JSON stay.
+
+    Args:
+        calls: with the log of calls.
     """
     files: dict[str, Path | bytes] = {
-        name: run.path / name for name in LINES if (run.path / name).exists()
+        name: run.path / name
+        for name in (*LINES, *([CALLS] if calls else []))
+        if (run.path / name).exists()
     }
     files["run.json"] = json_bytes(run.path / "run.json", public(run.manifest))
     stays = []
@@ -186,7 +191,7 @@ def _of_a_run(path: str) -> bool:
     file = PurePosixPath(path)
     if str(file.parent) in ("policies", FIGURES):
         return True
-    return path in LINES or (path == file.name and file.suffix in FILMS)
+    return path in (*LINES, CALLS) or (path == file.name and file.suffix in FILMS)
 
 
 # Down

@@ -10,7 +10,7 @@ import pytest
 from planning.logs import log_of
 
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning import CallLog, call_ends, chain, hand_over, held
+from skillweave.planning import CallLog, held
 from skillweave.planning.hand_over import wilson
 
 A, B = 0, 1
@@ -30,7 +30,7 @@ def log() -> CallLog:
 
 
 def test_the_matrix_by_hand(log: CallLog) -> None:
-    matrix = hand_over(log)
+    matrix = log.hand_over()
     assert matrix.before == ("start", "go", "stay")
     # After "go": B won, B lost, A won (though the limit came then). After a lost call: nothing.
     assert matrix.calls.tolist() == [[3, 1], [1, 2], [1, 0]]
@@ -38,7 +38,7 @@ def test_the_matrix_by_hand(log: CallLog) -> None:
     assert matrix.cut.tolist() == [0, 1]
     assert matrix.of("stay", after="go") == (0.5, 2)
     assert np.isnan(matrix.rate[2, 1])
-    any_end = hand_over(log, only_after_done=False)
+    any_end = log.hand_over(only_after_done=False)
     assert any_end.calls.tolist() == [[3, 1], [2, 2], [2, 0]]
     assert any_end.done.tolist() == [[2, 1], [2, 1], [1, 0]]
 
@@ -48,7 +48,7 @@ def test_done_may_be_an_event_inside_the_call(log: CallLog) -> None:
         return obs[:, 0] == 2
 
     # "stay" is done where two steps in succession end at 2, "go" where one does.
-    matrix = hand_over(log, {"stay": held(at_two, 2), "go": at_two})
+    matrix = log.hand_over({"stay": held(at_two, 2), "go": at_two})
     assert matrix.calls.tolist() == [[3, 1], [0, 2], [1, 0]]
     assert matrix.done.tolist() == [[2, 0], [0, 1], [0, 0]]
     assert matrix.cut.tolist() == [1, 1]
@@ -62,11 +62,11 @@ def test_intervals() -> None:
 
 
 def test_it_is_shown_as_a_table(log: CallLog) -> None:
-    lines = str(hand_over(log)).splitlines()
+    lines = str(log.hand_over()).splitlines()
     assert lines[0].split() == ["after", "go", "stay"]
     assert lines[2].split() == ["go", "100%", "(1)", "50%", "(2)"]
     assert lines[3].split()[-1] == "–"
-    assert "<table>" in hand_over(log)._repr_html_()
+    assert "<table>" in log.hand_over()._repr_html_()
 
 
 def walks(episodes: int, seed: int) -> CallLog:
@@ -93,29 +93,41 @@ def walks(episodes: int, seed: int) -> CallLog:
 def test_a_chain_follows_where_calls_end() -> None:
     log = walks(600, 0)
     # "on" after "there": from 0 it ends at 1 and fails, from 1 at 2 and succeeds.
-    estimate = chain(log, "there", "on")
+    estimate = log.chain("there", "on")
     first = (log.order == 0) & (log.skill == 0)
     assert abs(estimate.estimate - (log.start[first] == 1).mean()) < 0.02
     # After "back" it is at 0: the second "there" ends at 1, where "on" never succeeds.
-    broken = chain(log, "back", "there", "on")
+    broken = log.chain("back", "there", "on")
     assert broken.estimate < 0.02
     assert broken.product > 0.2
     assert broken.rates[1:] == (
-        hand_over(log).of("there", "back")[0], hand_over(log).of("on", "there")[0],
+        log.hand_over().of("there", "back")[0], log.hand_over().of("on", "there")[0],
     )  # fmt: skip
-    assert broken.calls[2] == hand_over(log).of("on", "there")[1]
-    sure = chain(log, "back", "there", "there", "on")
+    assert broken.calls[2] == log.hand_over().of("on", "there")[1]
+    sure = log.chain("back", "there", "there", "on")
     assert sure.estimate > 0.98
 
 
 def test_the_broken_hand_over_is_named() -> None:
-    sentences = hand_over(walks(600, 1)).weakest()
+    sentences = walks(600, 1).hand_over().weakest()
     assert any(s.startswith("'on' succeeds in 0% of the calls after 'back'; ") for s in sentences)
     assert not any(s.startswith("'there'") for s in sentences)
 
 
+def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
+    matrix = log.hand_over()
+    assert matrix.by_itself == ()
+    assert str(matrix).endswith("A call is done if it succeeded.")
+    some = replace(log, own_success=(True, False))
+    assert str(some.hand_over()).endswith("without success() (stay) if it ended by itself.")
+    none = replace(log, own_success=(False, False)).hand_over()
+    assert "<p>No skill defines success(): a call" in none._repr_html_()
+    broken = replace(walks(600, 1), own_success=(False,) * 3).hand_over().weakest()
+    assert any("ends by itself in" in sentence for sentence in broken)
+
+
 def test_where_calls_end(log: CallLog) -> None:
-    ends = call_ends(log, "stay")
+    ends = log.call_ends("stay")
     assert ends.reasons == {"own": 0, "limit": 3, "interrupted": 0, "episode": 1}
     assert ends.calls == 4
     assert ends.steps == pytest.approx(9 / 4)
@@ -126,20 +138,20 @@ def test_where_calls_end(log: CallLog) -> None:
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
-        (lambda log: hand_over(log, {"sty": len}), DeclarationError, "Close matches: stay"),
-        (lambda log: hand_over(log, {"go": 3}), DeclarationError, "done of 'go': 3 is no pred"),
-        (lambda log: hand_over(log, 3), DeclarationError, "give events by skill"),
-        (lambda log: hand_over(log).of("go", "x"), DeclarationError, "no skill 'x'"),
-        (lambda log: chain(log), DeclarationError, "needs the names of skills"),
-        (lambda log: chain(log, "go", "gone"), DeclarationError, "no skill 'gone'"),
+        (lambda log: log.hand_over({"sty": len}), DeclarationError, "Close matches: stay"),
+        (lambda log: log.hand_over({"go": 3}), DeclarationError, "done of 'go': 3 is no pred"),
+        (lambda log: log.hand_over(3), DeclarationError, "give events by skill"),
+        (lambda log: log.hand_over().of("go", "x"), DeclarationError, "no skill 'x'"),
+        (lambda log: log.chain(), DeclarationError, "needs the names of skills"),
+        (lambda log: log.chain("go", "gone"), DeclarationError, "no skill 'gone'"),
         (
-            lambda log: chain(log.take(np.array([1, 2])), "go", "stay"),
+            lambda log: log.take(np.array([1, 2])).chain("go", "stay"),
             RunError,
             "no complete call of 'go' at the start of an episode",
         ),
-        (lambda log: call_ends(log.of("go"), "stay"), RunError, "no call of 'stay'"),
+        (lambda log: log.of("go").call_ends("stay"), RunError, "no call of 'stay'"),
         (
-            lambda log: chain(replace(log, start=log.start * 0, next_obs=log.next_obs * 0), "go"),
+            lambda log: replace(log, start=log.start * 0, next_obs=log.next_obs * 0).chain("go"),
             DeclarationError,
             "all features of skill 'go' are constant",
         ),

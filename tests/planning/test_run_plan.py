@@ -30,7 +30,6 @@ from skillweave.planning import (
     GoalTask,
     Mission,
     RewardMachine,
-    call_ends,
     held,
     join,
     reached,
@@ -200,8 +199,8 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
     log = run.log_calls(5_000, info=("success",))
     planned = run.plan(Mission(won, paid, won, paid), log)
     assert planned.evaluate(20, quiet=True).success_rate == 1.0
-    reasons = call_ends(log, "back").reasons
-    again = call_ends(planned.log_calls(3_000), "back").reasons
+    reasons = log.call_ends("back").reasons
+    again = planned.log_calls(3_000).call_ends("back").reasons
     assert again["own"] / sum(again.values()) == pytest.approx(
         reasons["own"] / sum(reasons.values()), abs=0.1
     )

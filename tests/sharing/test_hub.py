@@ -61,6 +61,21 @@ def test_all_goes_up_in_one_commit_and_nothing_but_data(
     assert told["missing"] == []
 
 
+def test_calls_go_up_if_asked(run: sw.Run, hub: Hub) -> None:
+    with pytest.raises(RunError, match="has no log of calls"):
+        run.push(NAME, calls=True)
+    log = run.log_calls(200)
+    assert "calls.safetensors" not in run.push(NAME)["files"]
+    assert "calls.safetensors" in run.push(NAME, calls=True)["files"]
+    loaded = sw.from_hub(NAME)
+    assert (loaded.calls.next_obs == log.next_obs).all()
+    loaded.log_calls(100)  # into memory: nothing is written into the hub's copy
+    assert loaded.calls.steps > log.steps
+    assert (sw.from_hub(NAME).calls.next_obs == log.next_obs).all()
+    run.push(NAME)
+    assert "calls.safetensors" not in hub.files(NAME)
+
+
 def test_what_a_run_has_not_is_said(run: sw.Run, hub: Hub) -> None:
     (run.path / "hierarchy.gif").unlink()
     (run.path / "evaluation.json").unlink()

@@ -1,0 +1,95 @@
+"""The recorded calls of a run: in its directory, or in memory.
+
+Stands alone because it joins run directories and policies, which know nothing of each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from skillweave.collecting.skill_set import skills_below
+from skillweave.errors import RunError
+from skillweave.messages import shown_path, whole_number
+from skillweave.planning import CallLog
+from skillweave.planning.run_log import (
+    RECORD,
+    joined,
+    load_calls,
+    log_so_far,
+    next_seed,
+    save_calls,
+)
+from skillweave.runs.directory import RunDirectory
+from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.types import Policy
+
+
+class RunCalls:
+    """The calls of one run.
+
+    Args:
+        path: the run's directory, or its weights file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._memory: CallLog | None = None
+
+    def begin(self, seed: int | None, info: Sequence[str]) -> tuple[int, Sequence[str]]:
+        """Return the seed and the keys of ``info`` of a new recording.
+
+        Args:
+            seed: None: one that was not used yet.
+            info: keys; those of earlier calls are added, so that all calls can be joined.
+
+        Raises:
+            RunError: what is recorded could not be kept.
+        """
+        if self._is_own():
+            must_be_own(self._path)  # an error comes before anything is played
+            so_far = log_so_far(RunDirectory.open(self._path))
+        else:
+            so_far = self._read()
+        seed = next_seed(so_far) if seed is None else whole_number(seed, "seed", 0)
+        if so_far is None or isinstance(info, str):  # which is refused later
+            return seed, info
+        return seed, (*so_far.info, *(key for key in info if key not in so_far.info))
+
+    def add(self, log: CallLog) -> None:
+        """Keep recorded calls.
+
+        Raises:
+            RunError: they cannot be written; they are kept in memory.
+        """
+        if self._is_own():
+            try:
+                save_calls(RunDirectory.open(self._path), log)
+            except RunError:
+                self._memory = log
+                raise
+            return
+        so_far = self._read()
+        self._memory = log if so_far is None else joined(so_far, log)
+
+    def read(self, policy: Policy) -> CallLog:
+        """Return all calls of a policy's skills.
+
+        Raises:
+            RunError: there are none, or they are of other skills.
+        """
+        log = self._read()
+        if log is None:
+            raise RunError(f"{shown_path(self._path)} has no log of calls; {RECORD}")
+        if (skills := skills_below(policy)) is not None:
+            log.check_skills(skills)
+        return log
+
+    def _read(self) -> CallLog | None:
+        if self._memory is None and self._path.is_dir():
+            return load_calls(RunDirectory.open(self._path))
+        return self._memory
+
+    def _is_own(self) -> bool:
+        """Return whether calls are kept in the run's directory."""
+        return self._path.is_dir() and not is_copy_of_hub(self._path)

@@ -1,0 +1,199 @@
+"""The columns of a log of calls, and what follows from them.
+
+Stands apart from ``CallLog``, so that what reads columns can be a method there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.collecting.call_end import CallEnd
+from skillweave.errors import DeclarationError
+from skillweave.messages import close_matches, shortened
+from skillweave.types import Array, Step
+
+PER_CALL = (
+    "start",
+    "choice",
+    "end_reason",
+    "succeeded",
+    "terminated",
+    "truncated",
+    "episode",
+    "seed",
+    "order",
+    "age",
+    "may_follow",
+)
+"""Columns with a row for each call."""
+PER_STEP = ("next_obs", "action", "reward")
+"""Columns with a row for each step."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CallColumns:
+    """C calls and the T steps inside them; ``CallLog`` describes the columns."""
+
+    skills: tuple[str, ...]
+    lengths: tuple[int, ...]
+    checksums: tuple[str, ...]
+    sees: tuple[tuple[int, ...] | None, ...]
+    recurrent: tuple[bool, ...]
+    own_success: tuple[bool, ...]
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    start: Array
+    choice: Array
+    end_reason: Array
+    succeeded: Array
+    terminated: Array
+    truncated: Array
+    episode: Array
+    seed: Array
+    order: Array
+    age: Array
+    may_follow: Array
+    offset: Array
+    next_obs: Array
+    action: Array
+    reward: Array
+    info: dict[str, Array] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.choice)
+
+    def __repr__(self) -> str:
+        counts = np.bincount(self.skill, minlength=len(self.skills)).tolist()
+        each = ", ".join(f"{n} {c}" for n, c in zip(self.skills, counts, strict=True))
+        return f"<CallLog: {len(self):,} calls ({shortened(each, 300)}), {self.steps:,} steps>"
+
+    @property
+    def steps(self) -> int:
+        """The steps of all calls together, T."""
+        return len(self.reward)
+
+    @property
+    def choices(self) -> int:
+        """The number of choices: each skill with each length."""
+        return len(self.skills) * max(1, len(self.lengths))
+
+    @property
+    def skill(self) -> Array:
+        """The skill of each call, (C,) int64."""
+        skill: Array = self.choice // max(1, len(self.lengths))
+        return skill
+
+    @property
+    def tau(self) -> Array:
+        """The steps of each call, (C,) int64."""
+        return np.diff(self.offset)
+
+    @property
+    def end(self) -> Array:
+        """The observation after each call, (C, *obs_shape), always the true successor."""
+        end: Array = self.next_obs[self.offset[1:] - 1]
+        return end
+
+    @property
+    def before(self) -> Array:
+        """The observation before each step, (T, *obs_shape)."""
+        before = np.roll(self.next_obs, 1, axis=0)
+        before[self.offset[:-1]] = self.start
+        return before
+
+    @property
+    def owner(self) -> Array:
+        """The call of each step, (T,) int64."""
+        return np.repeat(np.arange(len(self)), self.tau)
+
+    @property
+    def elapsed(self) -> Array:
+        """The steps of its call until each step, this one included, (T,) int64."""
+        elapsed: Array = np.arange(self.steps) - self.offset[self.owner] + 1
+        return elapsed
+
+    @property
+    def was_cut(self) -> Array:
+        """(C,) bool: the episode's time limit cut the call."""
+        cut: Array = self.truncated & ~self.terminated & (self.end_reason == CallEnd.EPISODE)
+        return cut
+
+    @cached_property
+    def followed_by(self) -> Array:
+        """The next call of the same episode, (C,) int64; −1: none was logged."""
+        following = np.full(len(self), -1)
+        rows = np.lexsort((self.order, self.episode))
+        a, b = rows[:-1], rows[1:]
+        joined = (self.episode[a] == self.episode[b]) & (self.order[a] + 1 == self.order[b])
+        following[a[joined]] = b[joined]
+        return following
+
+    def returns(self, gamma: float) -> Array:
+        """Return Σ γᵏ rₖ of each call, (C,) float64."""
+        weighted = self.reward.astype(np.float64) * gamma ** (self.elapsed - 1)
+        sums: Array = np.add.reduceat(weighted, self.offset[:-1]) if len(self) else np.zeros(0)
+        return sums
+
+    def as_steps(self) -> Step:
+        """Return all steps as one ``Step`` of T rows, to judge tasks by.
+
+        ``elapsed`` counts the steps of the episode, as it does where a task is followed.
+        """
+        last = np.zeros(self.steps, bool)
+        last[self.offset[1:] - 1] = True
+        return Step(
+            obs=self.before,
+            action=self.action,
+            next_obs=self.next_obs,
+            reward=self.reward,
+            terminated=last & self.terminated[self.owner],
+            truncated=last & self.truncated[self.owner],
+            timed_out=np.zeros(self.steps, bool),
+            elapsed=self.age[self.owner] + self.elapsed,
+            info=self.info,
+        )
+
+    def number(self, skill: str) -> int:
+        """Return the place of a skill in ``skills``.
+
+        Raises:
+            DeclarationError: the log has no skill of this name; similar names are given.
+        """
+        if skill not in self.skills:
+            raise DeclarationError(
+                f"the log has no skill {skill!r}; its skills are: {', '.join(self.skills)}."
+                f"{close_matches(str(skill), self.skills)}"
+            )
+        return self.skills.index(skill)
+
+    def of(self, skill: str) -> Self:
+        """Return the calls of one skill."""
+        return self.take(np.flatnonzero(self.skill == self.number(skill)))
+
+    def take(self, rows: Array) -> Self:
+        """Return some calls, in the order of ``rows`` (k,), with their steps."""
+        rows = np.asarray(rows, np.int64)
+        tau = self.tau[rows]
+        offset = np.concatenate([[0], np.cumsum(tau)]).astype(np.int64)
+        # The k-th step of a call is k behind its first.
+        steps = np.arange(offset[-1]) + np.repeat(self.offset[rows] - offset[:-1], tau)
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in PER_CALL},
+            **{name: getattr(self, name)[steps] for name in PER_STEP},
+            offset=offset,
+            info={key: value[steps] for key, value in self.info.items()},
+        )
+
+    def within(self, steps: int) -> Self:
+        """Return the first calls, as many as have at most ``steps`` steps in all."""
+        return self.take(np.flatnonzero(self.offset[1:] <= steps))
+
+    def latest(self, steps: int) -> Self:
+        """Return the last calls, as many as have at most ``steps`` steps in all."""
+        return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))

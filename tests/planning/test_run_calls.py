@@ -1,0 +1,196 @@
+"""A run keeps the calls that were recorded in it, while they are of its skills."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from shared_runs import SMALL, Left, Right, declare
+
+import skillweave as sw
+from skillweave.api import Run
+from skillweave.envs.engine import GymnasiumEngine
+from skillweave.errors import DeclarationError, RunError
+from skillweave.planning import CallLog, run_log
+from skillweave.runs.directory import CALLS, RunDirectory
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return declare(Left(), Right()).train(tmp_path_factory.mktemp("calls") / "run", quiet=True)
+
+
+@pytest.fixture
+def run(trained: Run, tmp_path: Path) -> Run:
+    return sw.load(shutil.copytree(trained.path, tmp_path / "run"), declare(Left(), Right()))
+
+
+def same(a: CallLog, b: CallLog) -> bool:
+    return len(a) == len(b) and all((a.choice == b.choice, a.next_obs == b.next_obs)[0])
+
+
+def tilted(obs: Any) -> Any:
+    return obs[:, 2] > 0.05
+
+
+def test_calls_are_kept_and_joined(run: Run) -> None:
+    with pytest.raises(RunError, match=r"has no log of calls; record a new log: run.log_calls"):
+        run.calls  # noqa: B018
+    first = run.log_calls(300)
+    assert same(run.calls, first)
+    second = run.log_calls(200)
+    assert not same(first.within(100), second.within(100)), "more calls, not the same ones again"
+    again = sw.load(run.path, declare(Left(), Right())).calls
+    assert len(again) == len(first) + len(second)
+    assert again.steps == first.steps + second.steps
+    assert np.unique(again.episode).tolist() == list(range(again.episode.max() + 1))
+
+
+def test_the_same_recording_is_kept_once(run: Run) -> None:
+    first = run.log_calls(200, seed=3)
+    longer = run.log_calls(400, seed=3)
+    assert same(longer.take(np.arange(10)), first.take(np.arange(10)))
+    assert same(run.calls, longer)
+    run.log_calls(400, seed=3)
+    assert same(run.calls, longer)
+    assert not same(run.log_calls(400, seed=4), longer)
+    assert run.calls.steps > longer.steps + 400 - 1
+
+
+def test_episodes_are_played_again_from_their_seeds(run: Run) -> None:
+    log = run.log_calls(300, num_envs=3)
+    engine = GymnasiumEngine(run.declaration.spec.make, 1, "CartPole")
+    row = np.arange(1)
+    for episode in np.unique(log.episode)[:5]:
+        calls = np.flatnonzero(log.episode == episode)
+        assert len(set(log.seed[calls])) == 1
+        obs = engine.reset_some(row, [int(log.seed[calls[0]])])
+        for c in calls:
+            assert (obs[0] == log.start[c]).all()
+            for t in range(log.offset[c], log.offset[c + 1]):
+                obs = engine.step(log.action[t][None], row).next_obs
+                assert (obs[0] == log.next_obs[t]).all()
+    engine.close()
+
+
+def test_a_plan_uses_the_runs_own_calls(run: Run) -> None:
+    with pytest.raises(RunError, match="has no log of calls"):
+        run.plan(tilted)
+    log = run.log_calls(1_000)
+    assert run.plan(tilted).evaluate(3, quiet=True).returns == (
+        run.plan(tilted, log).evaluate(3, quiet=True).returns
+    )
+
+
+def test_keys_of_info_of_earlier_calls_are_recorded_again(tmp_path: Path) -> None:
+    hierarchy = declare(Left())
+    hierarchy.env = sw.EnvSpec(Informed, engine="sync", workers=1)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    first = run.log_calls(100, info=("half",))
+    assert tuple(run.log_calls(100).info) == ("half",)
+    with pytest.warns(UserWarning, match=r"replaced by the new one.*info keys half"):
+        both = run.log_calls(100, info=("third",))
+    assert tuple(both.info) == ("half", "third")
+    assert run.calls.steps == both.steps > 0
+    assert first.steps > 0
+
+
+class Informed(sw.EnvSpec("CartPole-v1").make().unwrapped.__class__):  # type: ignore[misc]
+    def step(self, action: Any) -> Any:
+        obs, reward, over, cut, _ = super().step(action)
+        return obs, reward, over, cut, {"half": obs[0] / 2, "third": obs[0] / 3}
+
+
+def test_calls_of_skills_that_learnt_on_are_not_used(run: Run, tmp_path: Path) -> None:
+    old = run.log_calls(300)
+    more = declare(Left(), Right())
+    more.apart = sw.Apart(skill_steps=200, selector_steps=100)
+    run = more.train(run.path, resume=True, quiet=True)
+    with pytest.raises(RunError, match="is of the skills before they learnt on; record a new log"):
+        run.calls  # noqa: B018
+    with pytest.warns(UserWarning, match="before they learnt on. The new log replaces it"):
+        new = run.log_calls(100)
+    assert same(run.calls, new)
+    other = declare(Left(), Right()).train(tmp_path / "other", quiet=True, seed=1)
+    shutil.copy(run.path / CALLS, other.path)
+    with pytest.raises(RunError, match="belongs to another run"):
+        other.calls  # noqa: B018
+    old.save(run.path / CALLS)
+    with pytest.raises(RunError, match="was not written by this run"):
+        run.calls  # noqa: B018
+
+
+def test_the_selector_may_learn_on(run: Run) -> None:
+    log = run.log_calls(100)
+    more = declare(Left(), Right())
+    more.apart = sw.Apart(skill_steps=100, selector_steps=200)
+    assert same(more.train(run.path, resume=True, quiet=True).calls, log)
+
+
+def test_a_run_keeps_its_latest_calls(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_log, "MOST_STEPS", 250)
+    run.log_calls(200)
+    with pytest.warns(UserWarning, match="keeps its latest 250 logged steps"):
+        second = run.log_calls(200)
+    kept = run.calls
+    assert kept.steps <= 250
+    assert (kept.next_obs[-100:] == second.next_obs[-100:]).all()
+
+
+def test_a_damaged_file_is_neither_used_nor_replaced(run: Run) -> None:
+    path = run.path / CALLS
+    path.write_bytes(b"no log")
+    for use in (lambda: run.calls, lambda: run.log_calls(10)):
+        with pytest.raises(RunError, match="is damaged"):
+            use()
+    assert path.read_bytes() == b"no log"
+    path.unlink()
+    os.mkfifo(path)
+    for use in (lambda: run.calls, lambda: run.log_calls(10)):
+        with pytest.raises(RunError, match="is a pipe or a device"):
+            use()
+    path.unlink()
+    path.symlink_to(run.path.parent / "elsewhere")
+    with pytest.raises(RunError, match="is a link"):
+        run.log_calls(10)
+
+
+def test_without_a_directory_calls_stay_in_memory(run: Run, tmp_path: Path) -> None:
+    weights = run.save_weights(tmp_path / "weights.safetensors")
+    loaded = declare(Left(), Right()).load_weights(weights)
+    log = loaded.log_calls(200)
+    assert same(loaded.calls, log)
+    loaded.log_calls(200)
+    assert loaded.calls.steps > log.steps
+    assert not (tmp_path / CALLS).exists()
+    loaded.plan(tilted)
+
+
+def test_calls_that_cannot_be_written_stay_in_memory(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> Any:
+        raise RunError("disk full")
+
+    monkeypatch.setattr("skillweave.planning.run_log.write_calls", full)
+    with pytest.raises(RunError, match="disk full"):
+        run.log_calls(100)
+    assert run.calls.steps >= 100
+
+
+def test_a_plain_agent_has_no_calls(tmp_path: Path) -> None:
+    env = sw.EnvSpec("CartPole-v1", engine="sync", workers=1)
+    agent = sw.train_agent(env, SMALL, 100, tmp_path / "agent", quiet=True)
+    with pytest.raises(DeclarationError, match="plain agent"):
+        agent.calls  # noqa: B018
+
+
+def test_the_file_is_of_the_directory(run: Run) -> None:
+    run.log_calls(100)
+    log = run_log.load_calls(RunDirectory.open(run.path))
+    assert log is not None
+    assert same(log, run.calls)
