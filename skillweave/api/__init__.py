@@ -249,6 +249,8 @@ class Hierarchy(Declaration):
         callback: Callback | None = None,
         keep: Literal["last", "best"] | None = None,
         log_info: Sequence[str] | None = None,
+        log_calls: int | None = None,
+        log_calls_info: Sequence[str] | None = None,
     ) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
 
@@ -294,6 +296,14 @@ class Hierarchy(Declaration):
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
                 last step counts (in a skill's own stage: of its call). None, NaN and infinity are
                 left out.
+            log_calls: steps: the calls in the latest so many steps in which the selector acted,
+                alone or together with skills, are the run's log of calls afterwards, as if
+                ``Run.log_calls`` had recorded them; so ``Run.plan`` needs no further steps. Calls
+                that are open at the end are left out. Skills that learnt in these steps have
+                changed since: ``hand_over`` may count their calls, but ``plan`` refuses them. A run
+                that was interrupted logs the calls after it was continued. Nothing else changes.
+                None: that of ``train_defaults``, by default no log.
+            log_calls_info: keys of ``info`` to record with the calls.
 
         Returns:
             The finished run.
@@ -308,12 +318,18 @@ class Hierarchy(Declaration):
         """
         self.validate()
         seed = whole_number(seed, "seed", 0)
+        if log_calls is not None and flat is not False:
+            raise DeclarationError(
+                "flat trains one plain agent, which has no skills to call: leave out log_calls"
+            )
         how = self.train_defaults.given(
             eval_every=eval_every,
             eval_episodes=eval_episodes,
             checkpoint_every=checkpoint_every,
             keep=keep,
             log_info=log_info,
+            log_calls=log_calls,
+            log_calls_info=log_calls_info,
         )
         declared, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(declared, seed=seed, flat=flat, how=how)

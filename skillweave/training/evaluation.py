@@ -310,6 +310,8 @@ def _evaluate(
         )
         calls = None if info is None else PlayedCalls(policy, spaces, info=info)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
+        if calls is not None:
+            vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)
         if not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
         return evaluation
@@ -410,8 +412,6 @@ def _scored(
         alone,
     )
     vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
-    if calls is not None:
-        vars(evaluation)["_logs"] = calls.logs()
     return evaluation
 
 

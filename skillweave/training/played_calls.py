@@ -74,9 +74,15 @@ class PlayedCalls:
         self._feed.flush()
         return {recorder.path: recorder for recorder in self._feed.recorders}
 
-    def logs(self) -> dict[str, CallLog]:
-        """Return the log of each level, by its path; \"\": the outermost."""
-        return {path: recorder.log() for path, recorder in self.recorders().items()}
+    def logs(self, seeds: Sequence[int]) -> dict[str, CallLog]:
+        """Return the log of each level, by its path; \"\": the outermost.
+
+        Args:
+            seeds: of the episodes, in order.
+        """
+        logs = {path: recorder.log() for path, recorder in self.recorders().items()}
+        by_episode = np.array(seeds, np.int64)
+        return {path: replace(log, seed=by_episode[log.episode]) for path, log in logs.items()}
 
     def _recorders(self, num_envs: int) -> dict[str, Recorder]:
         return {
