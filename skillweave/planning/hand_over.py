@@ -87,22 +87,30 @@ class HandOver:
             least: the fewest calls after a skill that count.
         """
         sentences = []
+        for i, j in self.weak(least):
+            skill, others = self.skills[j], np.delete(np.arange(len(self.before)), i)
+            elsewhere = self.done[others, j].sum() / self.calls[others, j].sum()
+            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
+            does = "ends by itself" if skill in self.by_itself else "succeeds"
+            sentences.append(
+                f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
+                f"{elsewhere:.0%} elsewhere"
+            )
+        return sentences
+
+    def weak(self, least: int = 20) -> list[tuple[int, int]]:
+        """Return the places (row, column) that ``weakest`` is about."""
+        places = []
         high = self.interval[1]
-        for j, skill in enumerate(self.skills):
-            for i, before in enumerate(self.before):
+        for j in range(len(self.skills)):
+            for i in range(len(self.before)):
                 others = np.delete(np.arange(len(self.before)), i)
                 calls, done = self.calls[others, j].sum(), self.done[others, j].sum()
                 if self.calls[i, j] < least or calls < least:
                     continue
-                elsewhere_low = wilson(done, calls)[0]
-                if high[i, j] < elsewhere_low:
-                    where = "at the start of an episode" if i == 0 else f"after {before!r}"
-                    does = "ends by itself" if skill in self.by_itself else "succeeds"
-                    sentences.append(
-                        f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
-                        f"{done / calls:.0%} elsewhere"
-                    )
-        return sentences
+                if high[i, j] < wilson(done, calls)[0]:
+                    places.append((i, j))
+        return places
 
     @property
     def meaning(self) -> str:
@@ -162,23 +170,34 @@ def hand_over(
     """See ``CallLog.hand_over``."""
     count = len(log.skills)
     won = calls_done(log, done)
-    counts = ~log.was_cut | won
-    before = np.full(len(log), -1)  # the skill before; −1: none counts
-    following = log.followed_by
-    first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
-    before[following[first]] = log.skill[first] + 1
-    before[log.order == 0] = 0
+    before = before_each(log, won, only_after_done)
     calls, did = np.zeros((count + 1, count), np.int64), np.zeros((count + 1, count), np.int64)
-    rows = np.flatnonzero(counts & (before >= 0))
+    rows = np.flatnonzero(before >= 0)
     np.add.at(calls, (before[rows], log.skill[rows]), 1)
     np.add.at(did, (before[rows], log.skill[rows]), won[rows])
-    cut = np.bincount(log.skill[~counts], minlength=count)
+    cut = np.bincount(log.skill[log.was_cut & ~won], minlength=count)
     by_itself = tuple(
         name
         for name, judged in zip(log.skills, log.own_success, strict=True)
         if not judged and name not in (done or {})
     )
     return HandOver(log.skills, calls, did, cut, by_itself)
+
+
+def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> Array:
+    """Return the row of the matrix in which each call counts, (C,) int64; −1: in none.
+
+    Args:
+        won: (C,) bool, the calls that were done.
+        only_after_done: as for ``CallLog.hand_over``.
+    """
+    before = np.full(len(log), -1)
+    following = log.followed_by
+    first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
+    before[following[first]] = log.skill[first] + 1
+    before[log.order == 0] = 0
+    before[log.was_cut & ~won] = -1
+    return before
 
 
 def chain(
