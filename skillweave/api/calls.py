@@ -72,6 +72,14 @@ class RunCalls:
         so_far = self._read()
         self._memory = log if so_far is None else joined(so_far, log)
 
+    def has_any(self) -> bool:
+        """Return whether there are calls.
+
+        Raises:
+            RunError: their file cannot be used.
+        """
+        return self._read() is not None
+
     def read(self, policy: Policy) -> CallLog:
         """Return all calls of a policy's skills.
 

@@ -119,13 +119,38 @@ class HandOver:
             return "A call is done if it succeeded."
         names = ", ".join(self.by_itself)
         if len(self.by_itself) == len(self.skills):
-            return "No skill defines success(): a call is done if it ended by itself."
+            return "No success() is known: a call is done if it ended by itself."
         return f"A call is done if it succeeded; without success() ({names}) if it ended by itself."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the counts, and the sentences of ``weakest``, as plain JSON."""
+        return {
+            "skills": list(self.skills),
+            "before": list(self.before),
+            "calls": self.calls.tolist(),
+            "done": self.done.tolist(),
+            "cut": self.cut.tolist(),
+            "by_itself": list(self.by_itself),
+            "weakest": self.weakest(),
+        }
+
+    def rows(self) -> list[list[str]]:
+        """Return the rows of a table: the skill before, then rates and numbers of calls."""
+        return [
+            [
+                name,
+                *(
+                    f"{rate:.0%} ({calls:,})" if calls else "–"
+                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
+                ),
+            ]
+            for i, name in enumerate(self.before)
+        ]
 
     def __str__(self) -> str:
         """Return the matrix as a table of text: rates, the number of calls, what is done."""
         width = max(map(len, self.before))
-        cells = [["after", *self.skills], *self._rows()]
+        cells = [["after", *self.skills], *self.rows()]
         widths = [max(width, 5), *(max(len(s), 12) for s in self.skills)]
         lines = [
             "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
@@ -134,19 +159,7 @@ class HandOver:
         return "\n".join([*lines, self.meaning])
 
     def _repr_html_(self) -> str:
-        return table(["after", *self.skills], self._rows()) + f"<p>{escape(self.meaning)}</p>"
-
-    def _rows(self) -> list[list[str]]:
-        return [
-            [
-                name,
-                *(
-                    f"{rate:.0%} ({calls})" if calls else "–"
-                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
-                ),
-            ]
-            for i, name in enumerate(self.before)
-        ]
+        return table(["after", *self.skills], self.rows()) + f"<p>{escape(self.meaning)}</p>"
 
 
 @dataclass(frozen=True)
