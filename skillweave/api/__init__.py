@@ -786,7 +786,7 @@ class Run:
             RunError: the run's file of calls is damaged, or cannot be written.
         """
         spec = self._own_spec()
-        seed, info = self._calls.begin(seed, info)
+        seed, info = self._calls.begin(self.policy, seed, info)
         log = record_calls(
             spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
         )

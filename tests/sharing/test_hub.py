@@ -74,6 +74,9 @@ def test_calls_go_up_if_asked(run: sw.Run, hub: Hub) -> None:
     loaded = sw.from_hub(NAME)
     assert loaded.info()["hand_over"] == run.info()["hand_over"] == log.hand_over().to_json()
     assert (loaded.calls.next_obs == log.next_obs).all()
+    with pytest.raises(RunError, match=r"success\(\) of 'left' is not known: load the run with"):
+        loaded.log_calls(100)
+    loaded = sw.from_hub(NAME, declare(Left(), Right()))
     loaded.log_calls(100)  # into memory: nothing is written into the hub's copy
     assert loaded.calls.steps > log.steps
     assert (sw.from_hub(NAME).calls.next_obs == log.next_obs).all()
