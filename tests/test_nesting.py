@@ -41,9 +41,10 @@ from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
-from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
+from skillweave.training.played_calls import PlayedCalls
+from skillweave.training.played_episodes import PlayedEpisodes
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -299,8 +300,11 @@ def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
 
 def test_calls_are_logged_by_the_paths_of_who_acts(whole):
     run, _ = whole("together")
-    log = CallLog(run.policy, episode_seeds(0, 4))
-    score = evaluate(run.policy, CARTPOLE, episodes=4, watch=log.add)
+    played = PlayedCalls(
+        run.policy, (run.policy.observation_space, run.policy.action_space), own_rewards=True
+    )
+    score = evaluate(run.policy, CARTPOLE, episodes=4, watch=played.add)
+    log = PlayedEpisodes(played, episode_seeds(0, 4))
     assert log.labels == ("left", "inner/balance", "inner/right", "push")
     for i, name in enumerate(log.labels):
         own = [c for e in log.episodes for c in e.calls if c.skill == i]
@@ -308,7 +312,13 @@ def test_calls_are_logged_by_the_paths_of_who_acts(whole):
         assert (len(own), sum(c.steps for c in own)) == (told.calls, told.steps)
         ends = {end: sum(c.why == end for c in own) for end in told.ended}
         assert ends == told.ended
+        own_sum = sum(c.own for c in own)
+        assert own_sum == pytest.approx(told.return_sum, rel=1e-5, abs=1e-5)
     assert [len(e.rewards) for e in log.episodes] == list(score.lengths)
+    for i, calls in enumerate(e.calls for e in log.episodes):
+        ends = np.cumsum([c.steps for c in calls])
+        assert [c.start for c in calls] == [0, *ends[:-1]]
+        assert ends[-1] == score.lengths[i]
 
 
 def test_a_run_has_everyones_file_with_a_checksum(whole):

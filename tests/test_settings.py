@@ -192,6 +192,8 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "eval_every": or_none(AT_LEAST_ONE), "eval_episodes": AT_LEAST_ONE,
         "checkpoint_every": AT_LEAST_ONE, "keep": word("last", "best"),
         "log_info": Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], ("x", "y"), [])),
+        "log_calls": or_none(AT_LEAST_ONE),
+        "log_calls_info": Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], [])),
         "flat": or_none(ALGORITHM),
     },
     sw.Range: {"low": ANY, "high": ANY, "scale": word("linear", "log")},

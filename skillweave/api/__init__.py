@@ -250,6 +250,8 @@ class Hierarchy(Declaration):
         callback: Callback | None = None,
         keep: Literal["last", "best"] | None = None,
         log_info: Sequence[str] | None = None,
+        log_calls: int | None = None,
+        log_calls_info: Sequence[str] | None = None,
     ) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
 
@@ -295,6 +297,14 @@ class Hierarchy(Declaration):
                 ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
                 last step counts (in a skill's own stage: of its call). None, NaN and infinity are
                 left out.
+            log_calls: steps: the calls in the latest so many steps in which the selector acted,
+                alone or together with skills, are the run's log of calls afterwards, as if
+                ``Run.log_calls`` had recorded them; so ``Run.plan`` needs no further steps. Calls
+                that are open at the end are left out. Skills that learnt in these steps have
+                changed since: ``hand_over`` may count their calls, but ``plan`` refuses them. A run
+                that was interrupted logs the calls after it was continued. Nothing else changes.
+                None: that of ``train_defaults``, by default no log.
+            log_calls_info: keys of ``info`` to record with the calls.
 
         Returns:
             The finished run.
@@ -309,12 +319,18 @@ class Hierarchy(Declaration):
         """
         self.validate()
         seed = whole_number(seed, "seed", 0)
+        if log_calls is not None and flat is not False:
+            raise DeclarationError(
+                "flat trains one plain agent, which has no skills to call: leave out log_calls"
+            )
         how = self.train_defaults.given(
             eval_every=eval_every,
             eval_episodes=eval_episodes,
             checkpoint_every=checkpoint_every,
             keep=keep,
             log_info=log_info,
+            log_calls=log_calls,
+            log_calls_info=log_calls_info,
         )
         declared, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(declared, seed=seed, flat=flat, how=how)
@@ -469,6 +485,8 @@ class Run:
         max_steps: int | None = None,
         save: bool = False,
         engine: EngineName = "sync",
+        log_calls: bool = False,
+        info: Sequence[str] = (),
         quiet: bool = False,
     ) -> Evaluation:
         """Score it in whole episodes.
@@ -489,13 +507,17 @@ class Run:
                 one before. A sampled one is kept beside the score, and does not replace it. Not
                 with ``skill`` or another engine.
             engine: sync: Gymnasium's environment; envpool, auto: see ``evaluate``.
+            log_calls: record the calls of the skills: ``Evaluation.calls`` is a log as of
+                ``Run.log_calls``. The selector made them, so it may hold few calls of some skills.
+            info: keys of the environment's ``info`` to record with the calls.
             quiet: no progress; else it is shown where an evaluation takes longer than a second.
 
         Returns:
             Returns, lengths, and what each skill did.
 
         Raises:
-            DeclarationError: no such skill or engine; or ``save`` where it cannot be.
+            DeclarationError: no such skill or engine; or ``save`` or ``log_calls`` where it cannot
+                be.
         """
         if save and (skill is not None or engine != "sync"):
             raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
@@ -503,6 +525,8 @@ class Run:
             self._check_written()
             must_be_own(self.path)  # an error comes before anything is played
         policy = self._policy(skill)
+        if log_calls:
+            self._check_logged()
         with EpisodeProgress(episodes, quiet=quiet) as progress:
             score = evaluate(
                 policy,
@@ -514,6 +538,8 @@ class Run:
                 max_steps=max_steps,
                 watch=progress.watch,
                 engine=engine,
+                log_calls=log_calls,
+                info=info,
             )
         if save:
             save_evaluation(RunDirectory.open(self.path), score, seed, deterministic)
@@ -851,6 +877,9 @@ class Run:
     def _check_written(self) -> None:
         """Raise a RunError where this is not what is written under ``path``."""
 
+    def _check_logged(self) -> None:
+        """Raise a DeclarationError where evaluations do not show whole calls."""
+
     def _training_envs(self) -> int | None:
         """Return the number of environments in training; None: nothing was trained."""
         if self.path.is_dir():
@@ -876,6 +905,13 @@ class PlannedRun(Run):
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)
+
+    def _check_logged(self) -> None:
+        raise DeclarationError(
+            "episodes of a planned run end with its task, so the calls in them are cut there: "
+            "leave out log_calls, and record whole calls with "
+            "run.log_calls(choose=run.policy.selector)"
+        )
 
     def _check_written(self) -> None:
         raise RunError(

@@ -96,7 +96,7 @@ class RunCalls:
         if log is None:
             raise RunError(f"{shown_path(self._path)} has no log of calls; {RECORD}")
         if (skills := skills_below(policy)) is not None:
-            log.check_skills(skills)
+            log.check_skills(skills, learning=True)  # how often they succeeded may be counted
         return log
 
     def _read(self) -> CallLog | None:

@@ -27,6 +27,7 @@ from skillweave.messages import absolute, as_path, short, shown_path
 from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
 from skillweave.paths import AGENT
+from skillweave.planning.recorder import check_size
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
@@ -174,7 +175,15 @@ def _plan(
     plan(content["stages"], evolve)
     check_several(content["stages"], declared.spec)
     check_stages(content["stages"], content["eval_every"], content["keep"])
+    if content.get("log_calls") and any(s.get("evolution") for s in content["stages"]):
+        raise DeclarationError(
+            "log_calls is set, but members of a population have policies of their own, so no log "
+            "of calls is kept while they evolve: leave out log_calls or evolve, and record calls "
+            "afterwards with run.log_calls()"
+        )
     spec = declared.spec
+    if steps := content.get("log_calls"):
+        check_size(steps, (spec.spaces.observation, spec.spaces.action))
     _check(cluster)
     if cluster is not None and cluster.collectors is not None:
         spec = replace(spec, workers=cluster.collectors)

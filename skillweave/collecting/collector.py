@@ -42,6 +42,8 @@ class Collected:
     """(k,) environments whose first row here does not follow from their last row before."""
     info_keys: frozenset[str] = frozenset()
     """Keys of ``info`` where episodes ended without a key that is logged."""
+    calls: Batch | None = None
+    """The steps with what calls did in them, for a log of calls; None: none is kept."""
     longest: int = 0
     """Steps of the longest open episode, where no time limit is known."""
 
@@ -75,6 +77,8 @@ class Collector:
         self._all = np.arange(n)
         self.log_info: tuple[str, ...] = ()
         """I keys of ``info`` whose values at the ends of episodes are logged."""
+        self.log_calls: tuple[str, ...] | None = None
+        """Keys of ``info`` in the log of calls; None: none is kept."""
         self._info_keys: set[str] = set()
         self._ended: list[tuple[int, Array, Array]] = []
         """Of episodes that ended in a request: row, environments, and numbers without sums."""
@@ -104,7 +108,8 @@ class Collector:
         limited = self.engine.time_limit is not None
         longest = 0 if limited else int(self.kept["age"].max())
         keys = frozenset(self._info_keys)
-        return Collected(batches, steps, episodes, info_keys=keys, longest=longest)
+        calls = None if self.log_calls is None else self._calls(trace, self.log_calls)
+        return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
         """Play one episode in each environment, from its start.
@@ -209,6 +214,10 @@ class Collector:
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
         """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
+        raise NotImplementedError
+
+    def _calls(self, trace: Trace, info: Sequence[str]) -> Batch:
+        """Return the steps with what calls did in them; ``info`` are keys that are logged."""
         raise NotImplementedError
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
@@ -326,5 +335,9 @@ def joined_collected(parts: Sequence[Collected], members: int) -> Collected:
     batches = {path: side_by_side([p.batches[path] for p in parts], members) for path in paths}
     keys = frozenset[str]().union(*(p.info_keys for p in parts))
     longest = max(p.longest for p in parts)
+    logged = [p.calls for p in parts if p.calls is not None]
+    calls = None
+    if logged:
+        calls = Batch(**{k: np.concatenate([c[k] for c in logged], axis=1) for k in logged[0]})
     episodes = np.concatenate([p.episodes for p in parts])
-    return Collected(batches, steps, episodes, info_keys=keys, longest=longest)
+    return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)

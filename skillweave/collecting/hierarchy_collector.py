@@ -6,7 +6,7 @@ calls go on. A call that is open when the rows are full goes on in the next batc
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -20,7 +20,14 @@ from skillweave.collecting.levels import Level, with_learners
 from skillweave.collecting.player import LearnerActor, Player, Turn
 from skillweave.collecting.restored import ranges_of
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.collecting.views import rewards_of, rows_of, steps_of, timed_out
+from skillweave.collecting.views import (
+    call_successes,
+    info_numbers_of,
+    rewards_of,
+    rows_of,
+    steps_of,
+    timed_out,
+)
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
@@ -30,6 +37,21 @@ from skillweave.paths import CRITIC, SELECTOR
 from skillweave.skills import Skill, path_of
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step, prefixed, unprefixed
+
+CALLS = (
+    "obs",
+    "env_action",
+    "next_obs",
+    "env_reward",
+    "env_terminated",
+    "env_truncated",
+    "elapsed",
+    "skill",
+    "call_elapsed",
+    "call_end",
+    "call_limit",
+)
+"""The columns of a trace from which calls are logged."""
 
 
 class HierarchyCollector(Collector):
@@ -90,7 +112,7 @@ class HierarchyCollector(Collector):
         """The levels in which something learns, each with its own memory."""
         self._together = learners is not None
         self._whole = self._together or as_skill is not None
-        """Steps are recorded as a whole; else only where the selector decides and calls end."""
+        """All learn from the steps, or what they are judged by needs them as a whole."""
         self._open: dict[str, OpenCalls] = {}  # by the paths of levels whose selectors learn
         ready = guide is not None and guide.decides and acting is None
         for level in self.levels:
@@ -142,8 +164,11 @@ class HierarchyCollector(Collector):
 
     def _writer(self, rows: int) -> TraceWriter:
         judges = [level.skills[i] for level in self.levels for i in (*level.learning, *level.below)]
+        root = self.skills.skills
+        logs = self.log_calls is not None
         reads = self.as_skill is not None or any(name.startswith(INFO) for name in self._record)
         reads |= any(s.defines(method) for s in judges for method in ("reward", "termination"))
+        reads |= logs and (bool(self.log_calls) or any(s.defines("success") for s in root))
         self._turn.trace = TraceWriter(rows, self.num_envs, keep_infos=reads)
         return self._turn.trace
 
@@ -153,7 +178,7 @@ class HierarchyCollector(Collector):
         if self.overridden is not None:
             self.overridden[:] = False
         action = self.player.act(self.memory, self._all, obs, mask, self._turn)
-        if self._whole:
+        if self._records:
             out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
             for level, memory in self.levels.items():
                 out.write(**{level.path + "skill": memory["skill"]})
@@ -193,7 +218,7 @@ class HierarchyCollector(Collector):
         """Write what a step has led to, and why calls ended, (N,)."""
         for level, memory in self.levels.items():
             path, player = level.path, level.player
-            if self._whole:
+            if self._records:
                 ends = {"call_elapsed": memory["elapsed"], "call_end": memory["end"]}
                 out.write(**{path + name: value for name, value in ends.items()})
             if player.guide is not None and level.selector is not None:
@@ -203,7 +228,9 @@ class HierarchyCollector(Collector):
                 if player.guide.tells:
                     out.write(**{path + "chances": memory["chances"]})
         out.write(env_reward=step.reward, call_end=end)
-        if not self._whole:
+        if self.log_calls is not None and "limit" in self.memory:
+            out.write(call_limit=self.memory["limit"])
+        if not self._records:
             over = np.flatnonzero(end)
             out.write(over, next_obs=step.next_obs[over])
             return
@@ -214,6 +241,11 @@ class HierarchyCollector(Collector):
             env_truncated=step.truncated,
             elapsed=step.elapsed,
         )
+
+    @property
+    def _records(self) -> bool:
+        """Steps are recorded as a whole; else only where the selector decides and calls end."""
+        return self._whole or self.log_calls is not None
 
     # They are judged ----------------------------------------------------------------------------
 
@@ -232,6 +264,12 @@ class HierarchyCollector(Collector):
         self._turn.trace = None  # only learners hold it from here on
         end = trace["call_end"]
         return dict(self._of_level(trace, self.root, steps, end, end != RUNNING))
+
+    def _calls(self, trace: Trace, info: Sequence[str]) -> Batch:
+        over = trace["call_end"] != RUNNING
+        columns = {name: trace[name] for name in CALLS if name in trace}
+        columns["call_succeeded"] = call_successes(trace, self.skills.skills, "", over)
+        return Batch(**columns, **{INFO + key: info_numbers_of(trace, key) for key in info})
 
     def _of_level(
         self, trace: Trace, level: Level, steps: Batch, end: Array, closes: Array

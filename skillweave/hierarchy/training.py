@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import calls_to_json
-from skillweave.errors import RunError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.checks import check_nested
 from skillweave.hierarchy.declaration import Declaration
@@ -25,7 +26,7 @@ from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.joint import agents_of
 from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import Policies
+from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
 from skillweave.training.trainer import train_stages
@@ -63,12 +64,34 @@ def manifest(
         "eval_episodes": how.eval_episodes,
         "keep": how.keep,
         "log_info": how.log_info,
+        **_calls_entry(stages, how),
         "skills": [_skill_entry(roles, path) for path in roles.skills],
         **_level_entry(roles, roles.outermost),
         "resume_needs_recipe": learns or not roles.trains_from_data,
         "needs_recipe": code or not roles.is_data,
         "stages": [stage.entry() for stage in stages],
     }
+
+
+def _calls_entry(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
+    """Return the settings of the log of calls, if there is to be one.
+
+    Raises:
+        DeclarationError: no stage has calls to log.
+    """
+    if how.log_calls is None:
+        if how.log_calls_info:
+            raise DeclarationError(
+                "log_calls_info names keys for the log of calls: set log_calls, too"
+            )
+        return {}
+    if not any(s.level == "" and s.kind in ("selector", "together") for s in stages):
+        raise DeclarationError(
+            "log_calls is set, but no selector acts while this hierarchy trains, as each skill "
+            "learns apart and the selector is ready: leave out log_calls, and record calls "
+            "afterwards with run.log_calls()"
+        )
+    return {"log_calls": how.log_calls, "log_calls_info": how.log_calls_info}
 
 
 @torch_threads(1)  # a loop sets its own; the rest must not depend on the number of threads

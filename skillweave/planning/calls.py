@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,9 @@ from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, 
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.spaces import same_space
 from skillweave.types import Array
+
+LEARNING = "learning"
+"""In place of a checksum: the skill learnt while its calls were recorded."""
 
 
 class CallLog(CallColumns):
@@ -108,8 +111,12 @@ class CallLog(CallColumns):
         """
         return call_ends(self, skill)
 
-    def check_skills(self, skills: SkillSet) -> None:
-        """Raise a RunError where the log is of other skills, spaces or limits of calls."""
+    def check_skills(self, skills: SkillSet, *, learning: bool = False) -> None:
+        """Raise a RunError where the log is of other skills, spaces or limits of calls.
+
+        Args:
+            learning: allow a log in which skills learnt while their calls were recorded.
+        """
         names, lengths = tuple(s.name for s in skills.skills), skills.lengths
         if names != self.skills:
             raise RunError(
@@ -123,6 +130,8 @@ class CallLog(CallColumns):
             )
         for policy in skills.policies:
             self.check_spaces(policy.observation_space, policy.action_space)
+        if learning and LEARNING in self.checksums:
+            return
         for name, now, then in zip(names, skill_checksums(skills), self.checksums, strict=True):
             if now != then:
                 raise RunError(
@@ -218,13 +227,19 @@ def join(logs: Iterable[CallLog]) -> CallLog:
     )
 
 
-def skill_checksums(skills: SkillSet) -> tuple[str, ...]:
+def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[str, ...]:
     """Return a checksum of each skill: its policy, the limit of its calls, and the reflexes.
 
     Functions of the user enter by their names.
+
+    Args:
+        learning: names of the skills that learn while their calls are recorded.
     """
     checksums = []
     for i, policy in enumerate(skills.policies):
+        if skills.skills[i].name in learning:
+            checksums.append(LEARNING)
+            continue
         source = source_of(policy)
         # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
         acts = source.get("sha256") or str(source.get("name")).partition(".")[2]

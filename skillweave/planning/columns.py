@@ -130,6 +130,8 @@ class CallColumns:
         rows = np.lexsort((self.order, self.episode))
         a, b = rows[:-1], rows[1:]
         joined = (self.episode[a] == self.episode[b]) & (self.order[a] + 1 == self.order[b])
+        # In a nested hierarchy other skills may act between two of its calls.
+        joined &= self.age[a] + self.tau[a] == self.age[b]
         following[a[joined]] = b[joined]
         return following
 

@@ -7,7 +7,7 @@ Every way of acting feeds it: ``record_calls`` and evaluations a step at a time,
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -174,8 +174,12 @@ class Recorder:
             self._last = Trace(infos, {k: v[-1:] for k, v in trace.items()}), ids
         self._forget(part)
 
-    def log(self) -> CallLog:
-        """Return the calls that are kept and have ended, in the order of their starts."""
+    def log(self, learning: Collection[str] = ()) -> CallLog:
+        """Return the calls that are kept and have ended, in the order of their starts.
+
+        Args:
+            learning: names of the skills that learnt meanwhile.
+        """
         starts, steps, ends = self._joined()
         known, start, choice, episode, order, age = starts
         _, end_reason, succeeded, terminated, truncated, may = ends
@@ -185,9 +189,10 @@ class Recorder:
         log = CallLog(
             tuple(s.name for s in skills.skills),
             skills.lengths,
-            skill_checksums(skills),
+            skill_checksums(skills, learning),
             seen_places(skills),
-            tuple(bool(policy.start(1)) for policy in skills.policies),
+            # A hierarchy that learns has no policy yet; it remembers its call.
+            tuple(not hasattr(p, "start") or bool(p.start(1)) for p in skills.policies),
             tuple(skill.defines("success") for skill in skills.skills),
             *self.spaces,
             start=start,

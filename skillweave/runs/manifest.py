@@ -201,6 +201,10 @@ class Manifest(TypedDict):
     """The weights that stages end with."""
     log_info: NotRequired[list[str]]
     """Logged keys of ``info``."""
+    log_calls: NotRequired[AtLeastOne]
+    """Steps of the log of calls."""
+    log_calls_info: NotRequired[list[str]]
+    """Keys of ``info`` in it."""
     resume_needs_recipe: bool
     recipe: NotRequired[str | None]
     track: NotRequired[list[str]]
@@ -327,12 +331,16 @@ def read_manifest(run: Path) -> dict[str, Any]:
     return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
+OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info")
+"""Entries that do not change what is learnt."""
+
+
 def identity(manifest: Mapping[str, Any]) -> str:
     """Return 16 letters that identify a new run.
 
     Runs that must end with the same weights have the same.
     """
-    settings = {k: v for k, v in manifest.items() if k not in ("recipe", "track", "log_info")}
+    settings = {k: v for k, v in manifest.items() if k not in OF_NO_WEIGHT}
     return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[
         :16
     ]

@@ -38,11 +38,17 @@ class TrainDefaults:
     """What each stage ends with: its last weights, or those with the best periodic evaluation."""
     log_info: InfoKeys = ()
     """Keys of ``info`` whose values at the ends of episodes are logged."""
+    log_calls: AtLeastOne | None = None
+    """Steps of the log of calls, the latest ones of a stage in which a selector acts; None: no
+    log."""
+    log_calls_info: InfoKeys = ()
+    """Keys of ``info`` in the log of calls."""
     flat: AlgorithmSettings | None = None
     """Settings of the flat baseline; None: the hierarchy's ``algorithm``."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "log_info", tuple(dict.fromkeys(self.log_info)))
+        for name in ("log_info", "log_calls_info"):
+            object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
 
     def given(self, **arguments: Any) -> TrainDefaults:
         """Return these values, replaced by the ``arguments`` that are not None.

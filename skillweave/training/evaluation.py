@@ -5,7 +5,7 @@ A pool of environments is faster; all its episodes start from one seed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from typing import Any
@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.collecting.skill_set import skills_below
 from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import reported_success
@@ -22,12 +23,15 @@ from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
+from skillweave.planning.calls import CallLog
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Count
+from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.spaces import same_space
 from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
+from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.reflex_tally import ReflexTally
 from skillweave.training.skill_report import SkillReport, all_steps, tally_of
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
@@ -69,6 +73,32 @@ class Evaluation:
             )
         if self.alone is not None and self.alone not in self.skills:
             raise DeclarationError(f"no report of the skill that acted alone, {short(self.alone)}")
+
+    @property
+    def calls(self) -> CallLog:
+        """The log of all calls, as of ``record_calls``; it is not saved.
+
+        Raises:
+            DeclarationError: no calls were logged.
+        """
+        return self._logged()[""]
+
+    @property
+    def inner_calls(self) -> dict[str, CallLog]:
+        """The logs of the calls within skills that are hierarchies, by the path of these.
+
+        Raises:
+            DeclarationError: no calls were logged.
+        """
+        return {path: log for path, log in self._logged().items() if path}
+
+    def _logged(self) -> dict[str, CallLog]:
+        logs: dict[str, CallLog] | None = vars(self).get("_logs")
+        if logs is None:
+            raise DeclarationError(
+                "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
+            )
+        return logs
 
     @property
     def mean(self) -> float:
@@ -133,7 +163,11 @@ class Evaluation:
         """Return ``str()``, and for a hierarchy a table of its skills and hints of mistakes."""
         skills = [skill_table(self.skills)] if self.skills else []
         reflexes = reflex_lines(self.reflexes, sum(self.lengths))
-        return printable("\n".join([str(self), *skills, *reflexes, *hints(self.skills)]))
+        return printable("\n".join([str(self), *skills, *reflexes, *self._hints()]))
+
+    def _hints(self) -> list[str]:
+        """Return hints of mistakes, and skills that seldom succeed after one other skill."""
+        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_hand_over", ()))]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -142,7 +176,7 @@ class Evaluation:
         """Return the same as ``for_people``, for notebooks."""
         head, *rows = skill_rows(self.skills)
         tables = [table(head, rows)] if rows else []
-        lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *hints(self.skills)]
+        lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *self._hints()]
         return joined([paragraph(self), *tables, *map(paragraph, lines)])
 
     def __str__(self) -> str:
@@ -197,6 +231,8 @@ def evaluate(
     max_steps: int | None = None,
     watch: Callable[[Played], None] | None = None,
     engine: EngineName = "sync",
+    log_calls: bool = False,
+    info: Sequence[str] = (),
 ) -> Evaluation:
     """Play ``episodes`` whole episodes and score them by the environment's own reward.
 
@@ -215,22 +251,30 @@ def evaluate(
         watch: called with every step that is played.
         engine: "sync": Gymnasium's own environments; "envpool": a pool of EnvPool's; "auto": a
             pool where possible. A pool is faster, and plays other episodes.
+        log_calls: record the calls of its skills, for ``Evaluation.calls``.
+        info: keys of the environment's ``info`` to record with the calls.
 
     Returns:
         Returns, lengths, and a report of each skill.
 
     Raises:
         PolicyError: the policy was made for other spaces.
-        DeclarationError: the engine does not exist.
-        EnvError: the environment cannot be made, or not in a pool.
+        DeclarationError: the engine does not exist; or calls are to be logged, of a policy without
+            skills, of a skill that acts alone, or more than 4 GiB of them.
+        EnvError: the environment cannot be made, or not in a pool, or sets no such key of ``info``.
     """
     episodes = whole_number(episodes, "episodes", 1)
     seed = whole_number(seed, "seed", 0)
     limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
+    if log_calls:
+        check_logged(policy, info)
+    elif len(info):
+        raise DeclarationError("info names keys to record with calls: set log_calls=True, too")
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     with global_generators(Seeds(seed) / "evaluation"):
-        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch)
+        keys = tuple(info) if log_calls else None
+        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch, keys)
 
 
 def _evaluate(
@@ -242,6 +286,7 @@ def _evaluate(
     n: int,
     limit: int | None,
     watch: Callable[[Played], None] | None,
+    info: tuple[str, ...] | None,
 ) -> Evaluation:
     default_limit, threshold, pooled = _describe(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
@@ -263,7 +308,10 @@ def _evaluate(
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
         )
-        evaluation = replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
+        calls = None if info is None else PlayedCalls(policy, spaces, info=info)
+        evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
+        if calls is not None:
+            vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)
         if not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
         return evaluation
@@ -301,6 +349,21 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
         )
 
 
+def check_logged(policy: Policy, info: Sequence[str]) -> None:
+    """Raise a DeclarationError where the calls of a policy cannot be logged."""
+    if isinstance(info, str):
+        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    if isinstance(getattr(policy, "skill", None), Skill):
+        raise DeclarationError(
+            "a skill that acts alone is not called, so there are no calls to log: leave out skill, "
+            "or leave out log_calls"
+        )
+    if skills_below(policy) is None:
+        raise DeclarationError(
+            "this policy has no skills, so there are no calls to log: leave out log_calls"
+        )
+
+
 def episode_seeds(seed: int, episodes: int) -> list[int]:
     """Return the seeds of an evaluation's episodes; training uses none of them."""
     return [FIRST_SEED * (seed + 1) + i for i in range(episodes)]
@@ -311,8 +374,14 @@ def _scored(
     episodes: int,
     moments: Iterator[Played],
     watch: Callable[[Played], None] | None,
+    threshold: float | None,
+    calls: PlayedCalls | None,
 ) -> Evaluation:
-    """Play all episodes and return their scores."""
+    """Play all episodes and return their scores.
+
+    Args:
+        calls: records what is played; None: nothing is recorded.
+    """
     returns = np.zeros(episodes)
     lengths = np.zeros(episodes, np.int64)
     cut = 0
@@ -328,18 +397,22 @@ def _scored(
         succeeded = reported_success(played.step.info, len(played.rows))
         if succeeded is not None:
             success[played.episode[played.over]] = succeeded[played.over]
+        if calls is not None:
+            calls.add(played)
         if watch is not None:
             watch(played)
-    return Evaluation(
+    evaluation = Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
-        None,
+        threshold,
         tally.reports(),
         cut,
         None if np.isnan(success).any() else int(success.sum()),
         reflexes.steps(),
         alone,
     )
+    vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
+    return evaluation
 
 
 def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:

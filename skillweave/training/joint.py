@@ -328,9 +328,7 @@ def _collector(
     first: int,
 ) -> Collector:
     engine = make_engine(learning_task.spec, num_envs, first=first)
-    collector = _joint_collector(learning_task, algorithms, margins, engine)
-    collector.log_info = learning_task.log_info
-    return collector
+    return learning_task.logged(_joint_collector(learning_task, algorithms, margins, engine))
 
 
 def _joint_collector(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import gymnasium as gym
 
@@ -18,6 +18,8 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
 from skillweave.training.role import Role, agent_role
+
+C = TypeVar("C", bound=Collector)
 
 
 class MakeCollector(Protocol):
@@ -37,6 +39,14 @@ class MakeCollector(Protocol):
 
 
 @dataclass(frozen=True)
+class Called:
+    """Skills that a selector calls, and the environment in which it does."""
+
+    spec: EnvSpec
+    skills: SkillSet
+
+
+@dataclass(frozen=True)
 class LearningTask:
     """Environments, with the learner's spaces and collectors."""
 
@@ -50,13 +60,21 @@ class LearningTask:
     """Approximate environment steps of a row of experience."""
     log_info: tuple[str, ...] = ()
     """Keys of ``info`` that collectors of learners log."""
+    called: Called | None = None
+    """What is called in the outermost hierarchy; None: it is another learner's task."""
+    log_calls: tuple[str, ...] | None = None
+    """Keys of ``info`` in the log of their calls; None: none is kept."""
 
     def learners_collector(
         self, num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         """Return a collector whose episodes are reported; see ``MakeCollector``."""
         collector = self.collector(num_envs, acting, first, shared)
-        collector.log_info = self.log_info
+        return self.logged(collector)
+
+    def logged(self, collector: C) -> C:
+        """Return a collector that logs what is to be logged."""
+        collector.log_info, collector.log_calls = self.log_info, self.log_calls
         return collector
 
 
@@ -107,7 +125,12 @@ def selector_task(
         return HierarchyCollector(engine, acting, skills, shared, guide, as_skill)
 
     return LearningTask(
-        spec.name, role.observation_space, role.action_space, collector, role.row_steps
+        spec.name,
+        role.observation_space,
+        role.action_space,
+        collector,
+        role.row_steps,
+        called=Called(spec, skills) if as_skill is None else None,
     )
 
 
@@ -176,6 +199,7 @@ def joint_task(
         role.action_space,
         skill_task(agent_role(role.spec)).collector,
         role.row_steps,
+        called=Called(role.spec, skills) if as_skill is None else None,
         selector=selector,
         roles=roles,
         skills=skills,

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from skillweave.collecting.source import Source
+from skillweave.experience import Batch
 from skillweave.ops.device import INT
 from skillweave.ops.threads import WorkThread, torch_threads
 from skillweave.seeding import Seeds
@@ -110,6 +111,7 @@ class Saved:
 
 OnTick = Callable[[Tick], None]
 OnCheckpoint = Callable[[Saved], None]
+OnCalls = Callable[[Batch], None]
 
 
 def train(
@@ -126,6 +128,7 @@ def train(
     checkpoint_every: int = 250_000,
     on_tick: OnTick | None = None,
     on_checkpoint: OnCheckpoint | None = None,
+    on_calls: OnCalls | None = None,
 ) -> Progress:
     """Train until the ``budget`` is spent; states of the learner change.
 
@@ -140,6 +143,7 @@ def train(
             (``CHECKPOINT_SECONDS``), and on an interrupt.
         on_tick: called with each report; may raise to stop.
         on_checkpoint: writes a checkpoint; None: the loop writes none, and ignores interrupts.
+        on_calls: records the calls in new steps, where collectors return them.
 
     Returns:
         Counts at the end of training.
@@ -152,7 +156,7 @@ def train(
     loop.schedule_steps, loop.counts = schedule_steps or budget, counts
     loop.skip_diverged = skip_diverged
     loop.checkpoint_every = checkpoint_every
-    loop.on_checkpoint = on_checkpoint
+    loop.on_checkpoint, loop.on_calls = on_checkpoint, on_calls
     with torch_threads(1 if learner.overlap else learner.threads):
         try:
             collectors.start(seeds / "start")
@@ -173,6 +177,7 @@ class _Loop:
     skip_diverged: bool
     checkpoint_every: int
     on_checkpoint: OnCheckpoint | None
+    on_calls: OnCalls | None
 
     def __init__(
         self,
@@ -199,6 +204,8 @@ class _Loop:
         """Collect once, and learn from the result, or start to."""
         at, learner = self.at, self.learner
         collected = self.collectors.collect(self._request)
+        if self.on_calls is not None and collected.calls is not None:
+            self.on_calls(collected.calls)
         self.report()
         before, steps, update = self.spent, at.steps, at.update
         at.steps += collected.steps

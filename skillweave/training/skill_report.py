@@ -12,6 +12,7 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import level_of
+from skillweave.planning.hand_over import HandOver
 from skillweave.settings import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
@@ -157,10 +158,16 @@ class SkillTally:
         )
         declared = () if self.skills is None else self.skills.skills
         self._pays = np.array([skill.defines("reward") for skill in declared], bool)
+        self._judged = np.array([skill.defines("success") for skill in declared], bool)
         self._has_succeeded = np.zeros(episodes, bool)  # by episode, the call at its last step
         # By skill before (the first row: none) and skill after.
         self._next = np.zeros((1 + count, count), np.int64)
         self._before = np.zeros(episodes, np.int64)
+        # Calls and successes by what was done before; by episode, that of the running call: the row
+        # of ``_next``, or −1 where the call before was not done.
+        self._handed = np.zeros((2, 1 + count, count), np.int64)
+        self._after = np.zeros(episodes, np.int64)
+        self._won = np.ones(episodes, bool)
         # One sum for each episode, so the result does not depend on which are played together.
         self._returns = np.zeros((episodes, count))
         policies = () if self.skills is None else self.skills.policies
@@ -183,6 +190,7 @@ class SkillTally:
         episode = played.episode[played.call_start]
         self._calls += np.bincount(called, minlength=count)
         np.add.at(self._next, (self._before[episode], called), 1)
+        self._after[episode] = np.where(self._won[episode], self._before[episode], -1)
         self._before[episode] = 1 + called
         reward = played.reward
         if self.skills is not None:
@@ -192,6 +200,7 @@ class SkillTally:
             reward = outcome.reward
             ended = np.flatnonzero(outcome.why != CallEnd.RUNNING)
             np.add.at(self._ended, (acting[ended], outcome.why[ended]), 1)
+            self._hand_over(played, outcome, ended)
             done = outcome.why == CallEnd.OWN
             again = self._done[played.episode] == acting
             self._idle += np.bincount(acting[done & again], minlength=count)
@@ -212,6 +221,32 @@ class SkillTally:
             rows = np.flatnonzero(acting == i)
             if len(rows):
                 tally.add(played_below(played, i, rows))
+
+    def _hand_over(self, played: Played, outcome: StepOutcome, ended: Array) -> None:
+        """Count the calls that have ``ended`` (m,), by what was done before."""
+        assert played.acting is not None
+        acting, episode = played.acting[ended], played.episode[ended]
+        won = np.where(
+            self._judged[acting], outcome.succeeded[ended], outcome.why[ended] == CallEnd.OWN
+        )
+        cut = (outcome.why[ended] == CallEnd.EPISODE) & ~played.step.terminated[ended] & ~won
+        counts = self._judged[acting] & ~cut & (self._after[episode] >= 0)
+        place = self._after[episode[counts]], acting[counts]
+        np.add.at(self._handed[0], place, 1)
+        np.add.at(self._handed[1], place, won[counts])
+        self._won[episode] = won
+
+    def hand_over(self) -> list[str]:
+        """Return sentences on skills that succeed much less often after one skill than elsewhere.
+
+        Skills without ``success`` are left out.
+        """
+        names = tuple(self._path + name for name in self.labels)
+        nothing = np.zeros(len(names), np.int64)
+        sentences = (
+            HandOver(names, self._handed[0], self._handed[1], nothing).weakest() if names else []
+        )
+        return [*sentences, *(s for below in self._below.values() for s in below.hand_over())]
 
     def cut(self, episodes: Array) -> None:
         """End calls that might have gone on in ``episodes`` (k,), as another skill acts there."""
@@ -339,6 +374,10 @@ class CallTally:
         )
         below = {} if self._below is None else self._below.reports()
         return {self._path: report} | below
+
+    def hand_over(self) -> list[str]:
+        """Return the sentences of a hierarchy's own skills."""
+        return [] if self._below is None else self._below.hand_over()
 
 
 def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | CallTally]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.planning.recorder import Recorder
 from skillweave.runs.directory import RunDirectory
 from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
@@ -31,6 +32,8 @@ class StageRun:
     learning_task: LearningTask
     policies: Policies
     """Policies by path: ready skills, and those that earlier stages trained."""
+    recorder: Recorder | None = None
+    """Records the calls of the skills; None: no calls are logged."""
 
     @property
     def name(self) -> str:

@@ -29,6 +29,7 @@ from skillweave.training.interrupts import deferred
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
+from skillweave.training.logged_calls import begin_calls, save_logged
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import ReplayLearner, learner_of
@@ -219,6 +220,7 @@ class OneAgent:
                 checkpoint_every=int(self.stage.run.manifest["checkpoint_every"]),
                 on_tick=on_tick,
                 on_checkpoint=on_checkpoint,
+                on_calls=None if self.stage.recorder is None else self.stage.recorder.add,
             )
         except (_TargetReached, _Stopped) as end:
             # Count the steps collected since the update, too.
@@ -307,7 +309,8 @@ def train_stage(
     learning_task = stage.learning_task(earlier)
     if keys := run.manifest.get("log_info"):
         learning_task = replace(learning_task, log_info=tuple(keys))
-    learner = make_learner(StageRun(entry, run, seeds, learning_task, earlier))
+    learning_task, recorder = begin_calls(run, entry, learning_task)
+    learner = make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
     evolves = entry.get("evolution") is not None
     with (
         global_generators(seeds / "global"),
@@ -324,6 +327,8 @@ def train_stage(
         finally:
             learner.close()
         log.done(policies, learner.states())
+    if recorder is not None:
+        save_logged(run, entry, recorder, policies)
     return policies
 
 

@@ -24,8 +24,9 @@ from skillweave.reporting.report.groups import grouped
 from skillweave.reporting.report.seeds import on_one_grid, over_seeds
 from skillweave.reporting.report.skills_table import transition_rows, transitions
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.call_log import CallLog, EpisodeLog
 from skillweave.training.evaluation import episode_seeds, evaluate
+from skillweave.training.played_calls import PlayedCalls
+from skillweave.training.played_episodes import Episode, PlayedEpisodes
 
 
 def test_transitions_by_hand(tmp_path: Path) -> None:
@@ -40,11 +41,12 @@ def test_transitions_by_hand(tmp_path: Path) -> None:
     assert (stay["name"], stay["total"]) == ("stay", 2)
 
 
-def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> CallLog:
+def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> PlayedEpisodes:
     run = declare(env).train(tmp_path / "run", quiet=True)
-    log = CallLog(run.policy, episode_seeds(0, episodes))
-    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=log.add)
-    return log
+    spaces = run.policy.observation_space, run.policy.action_space
+    played = PlayedCalls(run.policy, spaces, own_rewards=True, inside=False)
+    evaluate(run.policy, run.declaration.spec, episodes=episodes, watch=played.add)
+    return PlayedEpisodes(played, episode_seeds(0, episodes))
 
 
 def test_calls_by_hand(tmp_path: Path) -> None:
@@ -56,7 +58,7 @@ def test_calls_by_hand(tmp_path: Path) -> None:
         ]
         assert told == CALLS
         assert [c.obs.tolist() for c in episode.calls] == [[0, 0], [2, 2], [2, 5], [4, 7]]
-        assert episode.rewards == [1, 2, 2, 2, 2, 3, 4, 5, 6]
+        assert episode.rewards.tolist() == [1, 2, 2, 2, 2, 3, 4, 5, 6]
         assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
 
 
@@ -93,7 +95,9 @@ def test_coordinates_of_unlike_observations() -> None:
 
 
 def test_filmed_are_the_worst_the_median_and_the_best() -> None:
-    episodes = [EpisodeLog(i, rewards=[r]) for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])]
+    episodes = [
+        Episode(i, np.zeros(1), np.array([r])) for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])
+    ]
     assert calls.chosen_episodes(episodes, 3) == [1, 0, 2]
     assert calls.chosen_episodes(episodes, 1) == [1]
     assert sorted(calls.chosen_episodes(episodes, 9)) == [0, 1, 2, 3, 4]

@@ -20,9 +20,10 @@ from skillweave.reporting.report.single import score_words
 from skillweave.reporting.report.skills_table import about, reflex_rows
 from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
-from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import save_evaluation
+from skillweave.training.played_calls import PlayedCalls
+from skillweave.training.played_episodes import PlayedEpisodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.types import Array
 
@@ -230,11 +231,13 @@ def test_docstrings_are_those_of_the_user() -> None:
 # Names of observations
 
 
-def log_of(tmp_path: Path, env: Any = Walkway) -> CallLog:
+def log_of(tmp_path: Path, env: Any = Walkway) -> PlayedEpisodes:
     run = declare(env).train(tmp_path / "run", quiet=True)
-    log = CallLog(run.policy, episode_seeds(0, 1))
-    evaluate(run.policy, run.declaration.spec, episodes=1, watch=log.add)
-    return log
+    played = PlayedCalls(
+        run.policy, (run.policy.observation_space, run.policy.action_space), own_rewards=True
+    )
+    evaluate(run.policy, run.declaration.spec, episodes=1, watch=played.add)
+    return PlayedEpisodes(played, episode_seeds(0, 1))
 
 
 def test_named_observations_name_axes_and_what_each_call_saw(tmp_path: Path) -> None:

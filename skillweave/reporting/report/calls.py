@@ -12,7 +12,7 @@ import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
 from skillweave.reporting.report.film import Film
-from skillweave.training.call_log import Call, CallLog, EpisodeLog
+from skillweave.training.played_episodes import Call, Episode, PlayedEpisodes
 from skillweave.types import Array
 
 MOST_COORDINATES = 16
@@ -24,7 +24,7 @@ MOST_CALLS_OF_ONE = 1_500
 """The most calls on the page, of one episode."""
 
 
-def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
+def chosen_episodes(episodes: Sequence[Episode], count: int) -> list[int]:
     """Return the numbers of ``count`` episodes, from the one with the least return to the best."""
     order = np.argsort([e.total for e in episodes], kind="stable")
     places = np.linspace(0, len(order) - 1, min(count, len(order))).round().astype(int)
@@ -32,7 +32,7 @@ def chosen_episodes(episodes: Sequence[EpisodeLog], count: int) -> list[int]:
 
 
 def episode_data(
-    log: CallLog, film: Film | None, named: ObsNames | None = None
+    log: PlayedEpisodes, film: Film | None, named: ObsNames | None = None
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Return each episode with its calls, and sentences about parts that are left out.
 
@@ -63,7 +63,7 @@ def episode_data(
 
 
 def _episode(
-    episode: EpisodeLog, number: int, first: int | None, named: ObsNames | None
+    episode: Episode, number: int, first: int | None, named: ObsNames | None
 ) -> dict[str, Any]:
     sums = np.cumsum(episode.rewards, dtype=np.float64) if first is not None else ()
     totals = [rounded(total) for total in sums]
@@ -113,7 +113,7 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
     return None
 
 
-def decision_data(log: CallLog, named: ObsNames | None = None) -> dict[str, Any]:
+def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[str, Any]:
     """Return the decisions by observation: names of coordinates, and a row for each decision.
 
     A row is the coordinates, then the skill, then whether its call succeeded (None: not known).

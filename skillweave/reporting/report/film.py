@@ -17,7 +17,7 @@ from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
-from skillweave.training.call_log import EpisodeLog
+from skillweave.training.played_episodes import Episode
 
 MOST_FRAMES = 1_500
 MOST_BYTES = 2_800_000  # as text in the page a third more
@@ -40,7 +40,7 @@ class Film:
 
 @without_screen()
 def make_film(
-    spec: EnvSpec, episodes: Sequence[EpisodeLog], chosen: Sequence[int], *, quiet: bool = True
+    spec: EnvSpec, episodes: Sequence[Episode], chosen: Sequence[int], *, quiet: bool = True
 ) -> Film:
     """Play the chosen episodes again from their seeds, with the same actions, and film them.
 
@@ -75,7 +75,7 @@ def make_film(
 def _replay(
     env: Any,
     engine: GymnasiumEngine,
-    episode: EpisodeLog,
+    episode: Episode,
     video: VideoWriter,
     every: int,
     progress: EpisodeProgress,

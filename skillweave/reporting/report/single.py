@@ -49,10 +49,11 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills.base import RecordedSkill
-from skillweave.training.call_log import CallLog
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.play import Played as PlayedStep
+from skillweave.training.played_calls import PlayedCalls
+from skillweave.training.played_episodes import PlayedEpisodes
 from skillweave.training.skill_report import levels_of
 from skillweave.types import Policy
 
@@ -67,7 +68,7 @@ class Played:
     """Episodes that were played for a report."""
 
     score: Evaluation
-    log: CallLog
+    log: PlayedEpisodes
     film: Film | None
     shown: list[dict[str, Any]]
     """The episodes as plain JSON."""
@@ -93,16 +94,18 @@ def play_episodes(
     quiet: bool = True,
 ) -> Played:
     """Play episodes with seeds that training never used, and film some of them."""
-    log = CallLog(policy, episode_seeds(seed, episodes))
+    spaces = policy.observation_space, policy.action_space
+    calls = PlayedCalls(policy, spaces, own_rewards=True, inside=False)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "num_envs": num_envs}
     how["deterministic"] = deterministic
     with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
 
         def watch(played: PlayedStep) -> None:
-            log.add(played)
+            calls.add(played)
             progress.watch(played)
 
         score = evaluate(policy, spec, watch=watch, **how)
+    log = PlayedEpisodes(calls, episode_seeds(seed, episodes))
     film = None
     missing = []
     if filmed:
