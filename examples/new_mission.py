@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import skillweave as sw
-from skillweave.planning import CallLog, successes
+from skillweave.planning import CallLog
 
 
 def main() -> None:
@@ -31,10 +31,8 @@ def main() -> None:
     log = CallLog.load(given.log)
     print(log)
 
-    done = successes(run.hierarchy.skills)
-    words = {name.removeprefix("go_"): predicate for name, predicate in done.items()}
     try:
-        planned = run.plan(given.mission, log, predicates=words)
+        planned = run.plan(given.mission, log)
     except sw.SkillweaveError as error:  # it points at the word
         raise SystemExit(str(error)) from None
     print(planned.evaluate(given.episodes, quiet=True))

@@ -73,7 +73,7 @@ ROOMS: dict[str, set[str]] = {
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
     "export": LEARNING | {"training", "hierarchy"},
-    "reporting": BASE | {"skills", "envs", "runs", "training", "hierarchy"},
+    "reporting": BASE | {"skills", "envs", "runs", "planning", "training", "hierarchy"},
     "shipped": {"errors"},
     "api": EVERYTHING,
     "recipes": {"shipped", "skillweave", "api"},

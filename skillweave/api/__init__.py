@@ -34,7 +34,7 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
-from skillweave.api.planning import planned, untasked
+from skillweave.api.planning import mission_words, planned, untasked
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, evolving, go_on
@@ -61,6 +61,7 @@ from skillweave.hierarchy.weights import (
 from skillweave.messages import as_path, shown_path, whole_number
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner, record_calls
+from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -763,7 +764,8 @@ class Run:
     def info(self) -> dict[str, Any]:
         """Return its manifest, with the latest saved evaluation under ``evaluation``.
 
-        One that sampled actions on request is under ``evaluation_sampled``.
+        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
+        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
         """
         self._check_written()
         run = RunDirectory.open(self.path)
@@ -771,7 +773,8 @@ class Run:
             "evaluation": load_evaluation(run),
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
-        return run.manifest | {k: v.to_json() for k, v in scores.items() if v is not None}
+        known = {k: v.to_json() for k, v in scores.items() if v is not None}
+        return run.manifest | known | hand_over_json(hand_over_of(run))
 
     @checked_names
     def log_calls(
@@ -809,7 +812,7 @@ class Run:
             RunError: the run's file of calls is damaged, or cannot be written.
         """
         spec = self._own_spec()
-        seed, info = self._calls.begin(seed, info)
+        seed, info = self._calls.begin(self.policy, seed, info)
         log = record_calls(
             spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
         )
@@ -827,6 +830,15 @@ class Run:
         _ = self.hierarchy
         return self._calls.read(self.policy)
 
+    @property
+    def has_calls(self) -> bool:
+        """Whether ``log_calls`` recorded calls in this run.
+
+        Raises:
+            RunError: their file is damaged or of other skills.
+        """
+        return self._calls.has_any()
+
     @checked_names
     def plan(self, task: Any, log: CallLog | None = None, **settings: Any) -> Run:
         """Return the skills with a selector that plans a new task on logged calls; no training.
@@ -838,7 +850,8 @@ class Run:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
                 predicate, or a function of a ``Step`` that returns the reward.
             log: calls of these skills; None: all that ``log_calls`` recorded in this run.
-            **settings: of ``planning.Planner``: ``predicates`` for a text, ``features``, ``gamma``.
+            **settings: of ``planning.Planner``: ``features``, ``gamma``; ``predicates`` for a text,
+                beside the hierarchy's own and the names of its skills, which mean their success.
 
         Raises:
             DeclarationError: this is a plain agent, or a setting is wrong.
@@ -849,6 +862,10 @@ class Run:
             raise DeclarationError("plan() takes no skills: they are the run's own")
         declared = self.hierarchy
         log = self.calls if log is None else log
+        if isinstance(task, str):
+            words = settings.get("predicates") or {}
+            if isinstance(words, Mapping):  # else the planner says what it is
+                settings["predicates"] = mission_words(declared, words)
         planner = Planner(log, task, skills=self.policy, **settings)
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)

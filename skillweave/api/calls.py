@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from skillweave.collecting.skill_set import skills_below
+from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.errors import RunError
 from skillweave.messages import shown_path, whole_number
 from skillweave.planning import CallLog
@@ -22,6 +22,7 @@ from skillweave.planning.run_log import (
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.skills.base import RecordedSkill
 from skillweave.types import Policy
 
 
@@ -36,7 +37,9 @@ class RunCalls:
         self._path = path
         self._memory: CallLog | None = None
 
-    def begin(self, seed: int | None, info: Sequence[str]) -> tuple[int, Sequence[str]]:
+    def begin(
+        self, policy: Policy, seed: int | None, info: Sequence[str]
+    ) -> tuple[int, Sequence[str]]:
         """Return the seed and the keys of ``info`` of a new recording.
 
         Args:
@@ -44,13 +47,16 @@ class RunCalls:
             info: keys; those of earlier calls are added, so that all calls can be joined.
 
         Raises:
-            RunError: what is recorded could not be kept.
+            RunError: what is recorded could not be kept, or the skills' code is missing, which the
+                calls so far were recorded with.
         """
         if self._is_own():
             must_be_own(self._path)  # an error comes before anything is played
             so_far = log_so_far(RunDirectory.open(self._path))
         else:
             so_far = self._read()
+        if so_far is not None and (skills := skills_below(policy)) is not None:
+            _check_code(so_far, skills)
         seed = next_seed(so_far) if seed is None else whole_number(seed, "seed", 0)
         if so_far is None or isinstance(info, str):  # which is refused later
             return seed, info
@@ -71,6 +77,14 @@ class RunCalls:
             return
         so_far = self._read()
         self._memory = log if so_far is None else joined(so_far, log)
+
+    def has_any(self) -> bool:
+        """Return whether there are calls.
+
+        Raises:
+            RunError: their file cannot be used.
+        """
+        return self._read() is not None
 
     def read(self, policy: Policy) -> CallLog:
         """Return all calls of a policy's skills.
@@ -93,3 +107,14 @@ class RunCalls:
     def _is_own(self) -> bool:
         """Return whether calls are kept in the run's directory."""
         return self._path.is_dir() and not is_copy_of_hub(self._path)
+
+
+def _check_code(log: CallLog, skills: SkillSet) -> None:
+    """Raise a RunError where success() of a skill is not known, though it was in the log."""
+    for name, known, skill in zip(log.skills, log.own_success, skills.skills, strict=False):
+        if known and name == skill.name and isinstance(skill, RecordedSkill):
+            raise RunError(
+                f"the run's calls were recorded with the code of its skills, but now success() of "
+                f"{name!r} is not known: load the run with its hierarchy (on the command line "
+                "--recipe FILE.py)"
+            )

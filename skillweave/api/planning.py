@@ -6,6 +6,8 @@ Stands alone because nothing of it is trained or written, unlike all else that m
 from __future__ import annotations
 
 import copy
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -15,7 +17,9 @@ from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.paths import SELECTOR
-from skillweave.planning import Planner
+from skillweave.planning import Planner, successes
+from skillweave.planning.mission_text import RESERVED
+from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import Tasked, own_step
 from skillweave.types import Memory, Policy, Step
 
@@ -49,6 +53,20 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     hierarchy.together = replace(declared.together, interrupt=False)
     hierarchy.selection = replace(declared.selection, target_return=None)
     return hierarchy, PlannedPolicy(selector, skills)
+
+
+def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the predicates that a mission's text may name.
+
+    They are the skills' successes by their names, the declaration's own, and those given, of which
+    a later one replaces an earlier one of its name.
+    """
+    own = {
+        name: success
+        for name, success in successes(declared.skills).items()
+        if name not in RESERVED and re.fullmatch(WORD, name)
+    }
+    return {**own, **declared.predicates, **given}
 
 
 def untasked(spec: EnvSpec) -> EnvSpec:

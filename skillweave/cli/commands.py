@@ -167,6 +167,47 @@ class Render(Watched):
 
 
 @dataclass(frozen=True)
+class Log(Output):
+    """Let a run's skills act, and record their calls in the run: for info, report and plan."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+    steps: int = 20_000
+    """Environment steps to record; they are joined with those that the run has."""
+    choose: Literal["random", "explore"] = "random"
+    """Choose skills at random, or where they were not tried yet."""
+    info: UseAppendAction[tuple[str, ...]] = ()
+    """Record this key of the environment's info, too, for tasks that read it."""
+    seed: int | None = None
+    """Of the environments and the choices; default: one that the run's log does not have."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+@dataclass(frozen=True)
+class Plan(Output):
+    """Plan a new mission on a run's recorded calls, and score it; nothing is trained."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, or with --pretrained a recipe's name."""
+    mission: Positional[str] = tyro.MISSING
+    """Such as "left then hover for 100 steps, avoid crash". A skill's name means its success; a
+    recipe may declare more words: Hierarchy(predicates=...)."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+    steps: int = 20_000
+    """Environment steps to record first, if there is no log of calls."""
+    episodes: int = 20
+    """Whole episodes to score it in."""
+    film: Annotated[Path | None, arg(aliases=["-o"])] = None
+    """A .gif or .mp4 file to write."""
+    seed: int = 0
+    """Picks the episodes."""
+
+
+@dataclass(frozen=True)
 class Plot(Output):
     """Draw learning curves as PNG and SVG: of one run, or of many seeds with bands, for a paper.
 
@@ -310,6 +351,8 @@ COMMANDS = (
     Sweep,
     Evaluate,
     Render,
+    Log,
+    Plan,
     Plot,
     Report,
     Compare,
@@ -328,6 +371,8 @@ Command = (
     | Sweep
     | Evaluate
     | Render
+    | Log
+    | Plan
     | Plot
     | Report
     | Compare

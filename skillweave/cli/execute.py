@@ -15,6 +15,7 @@ from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import ASK, declared_in, load_from
+from skillweave.api.planning import mission_words
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.output import print_result, run_words, save_score
@@ -25,6 +26,8 @@ from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.weights import open_weights
+from skillweave.planning import Explorer, HandOver, as_task
+from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -33,7 +36,7 @@ from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
 from skillweave.runs.several import open_runs
-from skillweave.terminal import one_line
+from skillweave.terminal import one_line, say
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
@@ -52,6 +55,10 @@ def run(command: commands.Command) -> int:
             _evaluate(command)
         case commands.Render():
             _render(command)
+        case commands.Log():
+            _log(command)
+        case commands.Plan():
+            _plan(command)
         case commands.Plot():
             _plot(command)
         case commands.Report():
@@ -111,6 +118,45 @@ def _render(command: commands.Render) -> None:
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])
     print_result(command, result, f"{result['path']}: {result['frames']} frames, return {returns}")
+
+
+def _log(command: commands.Log) -> None:
+    run = _load_with_code(command.run, command.recipe)
+    log = run.log_calls(
+        command.steps,
+        choose=Explorer() if command.choose == "explore" else "random",
+        seed=command.seed,
+        info=command.info,
+    )
+    calls = run.calls
+    matrix = calls.hand_over()
+    result = {"run": str(command.run), "recorded": {"calls": len(log), "steps": log.steps}}
+    result |= {"calls": len(calls), "steps": calls.steps} | hand_over_json(matrix)
+    text = f"recorded {len(log):,} calls, {log.steps:,} steps; the run has {calls.steps:,} steps"
+    print_result(command, result, "\n".join([text, *_hand_over_lines(matrix)]))
+
+
+def _plan(command: commands.Plan) -> None:
+    path = Path(command.target)
+    if path.is_dir() and not command.pretrained:
+        run = _load_with_code(path, command.recipe)
+    else:
+        run = _load_target(command)
+    as_task(command.mission, mission_words(run.hierarchy, {}))  # errors come before the recording
+    if not run.has_calls:
+        if not command.quiet:
+            say(f"there is no log of calls: recording {command.steps:,} steps")
+        run.log_calls(command.steps)
+    planned = run.plan(command.mission)
+    score = planned.evaluate(command.episodes, seed=command.seed, quiet=command.quiet)
+    result = {"target": command.target, "mission": command.mission, "seed": command.seed}
+    result |= score.to_json()
+    text = score.for_people()
+    if command.film is not None:
+        film = planned.render(command.film, seed=command.seed, quiet=command.quiet)
+        result["film"] = film["path"]
+        text += f"\n{film['path']}: {film['frames']} frames"
+    print_result(command, result, text)
 
 
 def _plot(command: commands.Plot) -> None:
@@ -218,9 +264,20 @@ def _info(command: commands.Info) -> None:
     sampled = load_evaluation(run, deterministic=False)
     scores = {} if saved is None else {"evaluation": saved.to_json()}
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    print_result(
-        command, manifest | scores, "\n".join(run_lines(manifest, [saved, sampled], command.target))
-    )
+    matrix = hand_over_of(run)
+    lines = [*run_lines(manifest, [saved, sampled], command.target), *_hand_over_lines(matrix)]
+    print_result(command, manifest | scores | hand_over_json(matrix), "\n".join(lines))
+
+
+def _hand_over_lines(matrix: HandOver | str | None) -> list[str]:
+    """Return the matrix of a run's log of calls, as lines."""
+    if matrix is None:
+        return []
+    if isinstance(matrix, str):
+        return [f"  log of calls: {one_line(matrix)}"]
+    lines = [*str(matrix).splitlines(), *matrix.weakest()]
+    title = "  share of calls that are done, by the skill before (calls):"
+    return [title, *(f"    {line}" for line in lines)]
 
 
 def run_lines(
@@ -344,7 +401,7 @@ def _import_agilerl(command: commands.ImportAgilerl) -> None:
 # Policies that commands name
 
 
-def _load_target(command: commands.Watched | commands.Export) -> Run:
+def _load_target(command: commands.Watched | commands.Export | commands.Plan) -> Run:
     """Return the trained policy that a command names.
 
     Raises:
@@ -365,6 +422,21 @@ def _load_target(command: commands.Watched | commands.Export) -> Run:
         " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
     )
     raise RunError(f"{command.target} is neither a run nor a weights file{hint}")
+
+
+def _load_with_code(path: Path, recipe: str | None) -> Run:
+    """Load the finished run at ``path`` with the code of its shipped recipe, or of ``recipe``.
+
+    Without it, what it means that a call succeeded is unknown, which a notice says.
+    """
+    named = RunDirectory.open(path).manifest.get("recipe")
+    run = _load_run(path, recipe or (named if named in recipes.names() else None))
+    if isinstance(run.declaration, Hierarchy) and run.declaration.recorded:
+        say(
+            "the run is loaded without the code of its skills, so their success() is not known; "
+            "give it: --recipe FILE.py"
+        )
+    return run
 
 
 def _load_run(path: Path, recipe: str | None) -> Run:

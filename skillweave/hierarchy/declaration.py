@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
@@ -25,6 +25,7 @@ from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
+from skillweave.planning.predicates import named_predicates
 from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
@@ -93,6 +94,9 @@ class Declaration(Nestable):
     """A ready selector that guides one that learns."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
+    predicates: Mapping[str, Any] = field(default_factory=dict)
+    """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
+    name. The name of each skill is such a word already: its ``success``."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
     _caller: ClassVar[Caller] = "hierarchy"
@@ -113,6 +117,7 @@ class Declaration(Nestable):
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
         check_fields(self)
+        named_predicates(self.predicates, "predicates")
         check_level(self._level("", None))
         hierarchies_of(self)  # raises where one contains itself
         for skill in self.skills:

@@ -195,6 +195,11 @@ def join(logs: Iterable[CallLog]) -> CallLog:
                     f"the skill {name!r} differs between the logs: it has learnt in between, or "
                     "its limits are others; join logs of the same skills"
                 )
+        if log.own_success != first.own_success:
+            raise RunError(
+                "of one log the skills' success() was known, of another not (its run was loaded "
+                "without their code); record both with it"
+            )
         if log.info.keys() != first.info.keys():
             raise RunError(
                 f"one log has the info keys {', '.join(first.info) or 'none'}, another "
@@ -236,7 +241,8 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
             checksums.append(LEARNING)
             continue
         source = source_of(policy)
-        acts = source.get("sha256") or source.get("name")
+        # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
+        acts = source.get("sha256") or str(source.get("name")).partition(".")[2]
         reflexes = [reflex.name for reflex in skills.reflexes]
         whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
         checksums.append(checksum(whole.encode()))

@@ -87,22 +87,30 @@ class HandOver:
             least: the fewest calls after a skill that count.
         """
         sentences = []
+        for i, j in self.weak(least):
+            skill, others = self.skills[j], np.delete(np.arange(len(self.before)), i)
+            elsewhere = self.done[others, j].sum() / self.calls[others, j].sum()
+            where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
+            does = "ends by itself" if skill in self.by_itself else "succeeds"
+            sentences.append(
+                f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
+                f"{elsewhere:.0%} elsewhere"
+            )
+        return sentences
+
+    def weak(self, least: int = 20) -> list[tuple[int, int]]:
+        """Return the places (row, column) that ``weakest`` is about."""
+        places = []
         high = self.interval[1]
-        for j, skill in enumerate(self.skills):
-            for i, before in enumerate(self.before):
+        for j in range(len(self.skills)):
+            for i in range(len(self.before)):
                 others = np.delete(np.arange(len(self.before)), i)
                 calls, done = self.calls[others, j].sum(), self.done[others, j].sum()
                 if self.calls[i, j] < least or calls < least:
                     continue
-                elsewhere_low = wilson(done, calls)[0]
-                if high[i, j] < elsewhere_low:
-                    where = "at the start of an episode" if i == 0 else f"after {before!r}"
-                    does = "ends by itself" if skill in self.by_itself else "succeeds"
-                    sentences.append(
-                        f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
-                        f"{done / calls:.0%} elsewhere"
-                    )
-        return sentences
+                if high[i, j] < wilson(done, calls)[0]:
+                    places.append((i, j))
+        return places
 
     @property
     def meaning(self) -> str:
@@ -111,13 +119,38 @@ class HandOver:
             return "A call is done if it succeeded."
         names = ", ".join(self.by_itself)
         if len(self.by_itself) == len(self.skills):
-            return "No skill defines success(): a call is done if it ended by itself."
+            return "No success() is known: a call is done if it ended by itself."
         return f"A call is done if it succeeded; without success() ({names}) if it ended by itself."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the counts, and the sentences of ``weakest``, as plain JSON."""
+        return {
+            "skills": list(self.skills),
+            "before": list(self.before),
+            "calls": self.calls.tolist(),
+            "done": self.done.tolist(),
+            "cut": self.cut.tolist(),
+            "by_itself": list(self.by_itself),
+            "weakest": self.weakest(),
+        }
+
+    def rows(self) -> list[list[str]]:
+        """Return the rows of a table: the skill before, then rates and numbers of calls."""
+        return [
+            [
+                name,
+                *(
+                    f"{rate:.0%} ({calls:,})" if calls else "–"
+                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
+                ),
+            ]
+            for i, name in enumerate(self.before)
+        ]
 
     def __str__(self) -> str:
         """Return the matrix as a table of text: rates, the number of calls, what is done."""
         width = max(map(len, self.before))
-        cells = [["after", *self.skills], *self._rows()]
+        cells = [["after", *self.skills], *self.rows()]
         widths = [max(width, 5), *(max(len(s), 12) for s in self.skills)]
         lines = [
             "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
@@ -126,19 +159,7 @@ class HandOver:
         return "\n".join([*lines, self.meaning])
 
     def _repr_html_(self) -> str:
-        return table(["after", *self.skills], self._rows()) + f"<p>{escape(self.meaning)}</p>"
-
-    def _rows(self) -> list[list[str]]:
-        return [
-            [
-                name,
-                *(
-                    f"{rate:.0%} ({calls})" if calls else "–"
-                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
-                ),
-            ]
-            for i, name in enumerate(self.before)
-        ]
+        return table(["after", *self.skills], self.rows()) + f"<p>{escape(self.meaning)}</p>"
 
 
 @dataclass(frozen=True)
@@ -162,23 +183,34 @@ def hand_over(
     """See ``CallLog.hand_over``."""
     count = len(log.skills)
     won = calls_done(log, done)
-    counts = ~log.was_cut | won
-    before = np.full(len(log), -1)  # the skill before; −1: none counts
-    following = log.followed_by
-    first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
-    before[following[first]] = log.skill[first] + 1
-    before[log.order == 0] = 0
+    before = before_each(log, won, only_after_done)
     calls, did = np.zeros((count + 1, count), np.int64), np.zeros((count + 1, count), np.int64)
-    rows = np.flatnonzero(counts & (before >= 0))
+    rows = np.flatnonzero(before >= 0)
     np.add.at(calls, (before[rows], log.skill[rows]), 1)
     np.add.at(did, (before[rows], log.skill[rows]), won[rows])
-    cut = np.bincount(log.skill[~counts], minlength=count)
+    cut = np.bincount(log.skill[log.was_cut & ~won], minlength=count)
     by_itself = tuple(
         name
         for name, judged in zip(log.skills, log.own_success, strict=True)
         if not judged and name not in (done or {})
     )
     return HandOver(log.skills, calls, did, cut, by_itself)
+
+
+def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> Array:
+    """Return the row of the matrix in which each call counts, (C,) int64; −1: in none.
+
+    Args:
+        won: (C,) bool, the calls that were done.
+        only_after_done: as for ``CallLog.hand_over``.
+    """
+    before = np.full(len(log), -1)
+    following = log.followed_by
+    first = np.flatnonzero((following >= 0) & (won | (not only_after_done)))
+    before[following[first]] = log.skill[first] + 1
+    before[log.order == 0] = 0
+    before[log.was_cut & ~won] = -1
+    return before
 
 
 def chain(

@@ -1,6 +1,6 @@
 """Missions as text: "left then (hover or right) then land, avoid crash, repeat 2".
 
-Stands alone because it is a grammar, with errors that point at a word.
+A grammar, with errors that point at a word.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from skillweave.planning.parts import (
 from skillweave.planning.predicates import LONGEST_HOLD, Event, Held, Predicate
 
 KEYWORDS = ("then", "or", "and", "not", "for", "avoid", "repeat")
+RESERVED = (*KEYWORDS, "forever", "steps", "step")
+"""Words that are no predicates."""
 LONGEST = 10_000
 """The most characters of a text."""
 MOST_REPEATS = 1_000
@@ -47,7 +49,7 @@ def parse(
     if len(text) > LONGEST:
         raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
     for name in predicates:
-        if name in (*KEYWORDS, "forever", "steps", "step"):
+        if name in RESERVED:
             raise DeclarationError(
                 f"a predicate is named {name!r}, which is a word of missions; choose another name"
             )

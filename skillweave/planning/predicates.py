@@ -19,6 +19,8 @@ from skillweave.skills.answers import answer
 from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]
+WORD = r"[^\W\d][\w-]*"
+"""The pattern of a predicate's name in a text."""
 LONGEST_HOLD = 100_000
 """The most steps of ``held``: no episode is longer."""
 
@@ -174,7 +176,7 @@ def named_predicates(values: Mapping[str, Any], where: str) -> dict[str, Event]:
     named: dict[str, Event] = {}
     for name, value in values.items():
         event = as_event(value, f"{where}: {short(name)}")
-        if not isinstance(name, str) or not re.fullmatch(r"[^\W\d][\w-]*", name):
+        if not isinstance(name, str) or not re.fullmatch(WORD, name):
             raise DeclarationError(
                 f"{where}: a predicate is named {short(name)}; a name is one word that begins with "
                 "a letter"

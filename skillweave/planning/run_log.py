@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from skillweave.notices import notice
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.planning.call_file import LoggedRun, write_calls
 from skillweave.planning.calls import CallLog, columns_of, join
+from skillweave.planning.hand_over import HandOver
 from skillweave.planning.recorder import MOST_BYTES
 from skillweave.reading import check_file, fit
 from skillweave.runs.directory import CALLS, RunDirectory
@@ -38,6 +40,25 @@ def load_calls(run: RunDirectory) -> CallLog | None:
     if (reason := _misfit(run)) is not None:
         raise RunError(f"{path} {reason}; {RECORD}")
     return CallLog.load(path)
+
+
+def hand_over_of(run: RunDirectory) -> HandOver | str | None:
+    """Return the matrix of a run's log; a sentence where the log cannot be used; None without one.
+
+    Reports about runs use it: a log that cannot be used is no reason to show nothing.
+    """
+    try:
+        log = load_calls(run)
+    except RunError as error:
+        return str(error)
+    return None if log is None else log.hand_over()
+
+
+def hand_over_json(matrix: HandOver | str | None) -> dict[str, Any]:
+    """Return an entry of a run's description for what ``hand_over_of`` returned."""
+    if matrix is None:
+        return {}
+    return {"hand_over": {"error": matrix} if isinstance(matrix, str) else matrix.to_json()}
 
 
 def needed_calls(run: RunDirectory) -> CallLog:

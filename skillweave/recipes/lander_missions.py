@@ -232,6 +232,7 @@ def declare(mission: str = "any", gusts: bool = False, **how: Any) -> Hierarchy:
         "algorithm": PILOT,
         "selector": SELECTOR,
         "train_defaults": TrainDefaults(flat=FLAT),
+        "predicates": {"left": GoLeft().success, "right": GoRight().success},
     } | how
     hierarchy = Hierarchy(environment(mission, gusts), [s() for s in SKILLS], **settings)
     hierarchy.skill("hover").steps = 300_000

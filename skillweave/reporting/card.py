@@ -13,6 +13,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
+from skillweave.planning.run_log import hand_over_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
 from skillweave.reporting.report.numbers import percent
@@ -42,6 +43,7 @@ def write_card(
         *(_shown(path) for path in films),
         _use(run, name),
         _measured(saved),
+        *_handed_over(run),
         _training(run),
         *(_shown(path) for path in figures),
         _folded("All settings", ("setting", "value"), settings(run.manifest)),
@@ -136,6 +138,23 @@ def _measured(saved: SavedEvaluation | None) -> str:
             cells = [row["name"], percent(row["share"]), row["calls"], row["length"], *row["ends"]]
             lines.append(_row([*cells, row["success"], row["return"]]))
     return "\n".join(lines)
+
+
+def _handed_over(run: RunDirectory) -> list[str]:
+    """Return the section on the run's log of calls, if it has one that is of its skills."""
+    matrix = hand_over_of(run)
+    if matrix is None or isinstance(matrix, str):
+        return []
+    head = ("after", *matrix.skills)
+    lines = [
+        "## Hand-over",
+        "",
+        "The share of each skill's calls that are done, by the skill before.",
+    ]
+    lines += [text(matrix.meaning), "", _row(head), _row(["---"] * len(head))]
+    lines += [_row(row) for row in matrix.rows()]
+    lines += [f"\n{text(sentence)}" for sentence in matrix.weakest()]
+    return ["\n".join(lines)]
 
 
 def _training(run: RunDirectory) -> str:

@@ -20,7 +20,7 @@ from skillweave.errors import DeclarationError
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
 
 COMMANDS = ("train", "resume", "evaluate", "render", "plot", "report", "compare", "list", "info")
-COMMANDS += ("sweep", "weights", "export", "import-agilerl")
+COMMANDS += ("sweep", "weights", "export", "import-agilerl", "log", "plan")
 
 # The same hierarchy twice: as plain data, and with a reflex, which only code can say.
 PLAIN = '''
@@ -410,6 +410,56 @@ def test_info_of_a_run_shows_its_stages_and_what_made_it(call: Call, trained: Tr
     found = call("info", trained.coded_run, "--json").json
     found.pop("evaluation", None)
     assert found == read_json(trained.coded_run / "run.json")
+
+
+def test_calls_are_logged_shown_and_planned_on(
+    call: Call, trained: Trained, tmp_path: Path
+) -> None:
+    run = shutil.copytree(trained.coded_run, tmp_path / "run")
+    recipe = tmp_path / "words.py"
+    tilted = "    predicates={'tilted': lambda obs: abs(obs[:, 2]) > 0.1},\n    algorithm=small"
+    recipe.write_text(CODED.replace("    algorithm=small", tilted))
+    assert "after" not in call("info", run).out
+    unknown = call("plan", run, "tilt", "--recipe", recipe)
+    assert (unknown.code, "Close matches: tilted" in unknown.err) == (1, True)
+    assert not (run / "calls.safetensors").exists(), "an unknown word is named before recording"
+    answer = call("log", run, "--recipe", recipe, "--steps", 300)
+    assert answer.code == 0, answer.err
+    assert "recorded " in answer.out
+    assert "A call is done if it ended" in answer.out or "No success() is known" in answer.out
+    more = call("log", run, "--recipe", recipe, "--steps", 300, "--choose", "explore", "--json")
+    assert more.code == 0, more.err
+    assert more.json["steps"] >= 600 > more.json["recorded"]["steps"]
+    assert more.json["hand_over"]["skills"] == ["left", "balance"]
+    shown = call("info", run)
+    assert shown.out.splitlines()[-1].strip().startswith("No success()") or "elsewhere" in shown.out
+    assert call("info", run, "--json").json["hand_over"] == more.json["hand_over"]
+    planned = call("plan", run, "tilted", "--recipe", recipe, "--episodes", 3, "--json")
+    assert planned.code == 0, planned.err
+    assert (planned.json["mission"], planned.json["episodes"]) == ("tilted", 3)
+    assert planned.json["success_rate"] == 1.0
+    film = call(
+        "plan", run, "tilted", "--recipe", recipe, "--episodes", 1, "-o", tmp_path / "f.gif"
+    )
+    assert film.code == 0, film.err
+    assert "f.gif: " in film.out
+    (run / "calls.safetensors").write_bytes(b"damaged")
+    assert "log of calls: " in call("info", run).out
+    assert "error" in call("info", run, "--json").json["hand_over"]
+
+
+def test_a_plan_without_a_log_records_one(call: Call, trained: Trained, tmp_path: Path) -> None:
+    run = shutil.copytree(trained.plain_run, tmp_path / "run")
+    recipe = tmp_path / "words.py"
+    far = "    predicates={'far': lambda obs: abs(obs[:, 0]) > 0.05},\n    algorithm=small"
+    recipe.write_text(PLAIN.replace("    algorithm=small", far))
+    arguments = ("--recipe", recipe, "--episodes", 2, "--steps", 400)
+    answer = call("plan", run, "far", *arguments)
+    assert answer.code == 0, answer.err
+    assert "recording 400 steps" in answer.err
+    assert "recording" not in call("plan", run, "far", *arguments).err
+    assert "without the code of its skills" in call("log", run, "--steps", 50).err
+    assert call("log", trained.flat_run, "--recipe", trained.coded).code == 1
 
 
 def test_info_tells_the_latest_evaluation_as_evaluate_did(

@@ -121,7 +121,7 @@ def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
     some = replace(log, own_success=(True, False))
     assert str(some.hand_over()).endswith("without success() (stay) if it ended by itself.")
     none = replace(log, own_success=(False, False)).hand_over()
-    assert "<p>No skill defines success(): a call" in none._repr_html_()
+    assert "<p>No success() is known: a call is" in none._repr_html_()
     broken = replace(walks(600, 1), own_success=(False,) * 3).hand_over().weakest()
     assert any("ends by itself in" in sentence for sentence in broken)
 

@@ -194,3 +194,14 @@ def test_the_file_is_of_the_directory(run: Run) -> None:
     log = run_log.load_calls(RunDirectory.open(run.path))
     assert log is not None
     assert same(log, run.calls)
+
+
+def test_calls_without_the_skills_code_are_replaced_by_calls_with_it(run: Run) -> None:
+    sw.load(run.path).log_calls(100)
+    assert run.calls.own_success == (False, False)
+    with pytest.warns(UserWarning, match=r"is replaced by the new one: .*success\(\) was known"):
+        log = run.log_calls(100)
+    assert run.calls.own_success == (True, False)
+    with pytest.raises(RunError, match="but now success\\(\\) of 'left' is not known"):
+        sw.load(run.path).log_calls(100)
+    assert same(run.calls, log)

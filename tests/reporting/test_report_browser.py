@@ -39,6 +39,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     run = declare().train(folder / "walk", quiet=True)
     found = {k: folder / f"{k}.html" for k in ("walk", "evolved", "unfinished", "comparison")}
+    run.log_calls(200, num_envs=2)
     how: dict[str, Any] = {"episodes": 5, "filmed": 2}
     opened = RunDirectory.open(folder / "walk")
     write_report(opened, found["walk"], run.policy, run.declaration.spec, **how)
@@ -133,6 +134,27 @@ def test_it_opens_without_errors_and_network_at_any_width(
             assert serious == []
     assert (opened.said, opened.foreign()) == ([], [])
     opened.page.close()
+
+
+def test_a_cell_of_the_matrix_shows_its_calls(film: Any) -> None:
+    film.wait_for_function("document.getElementById('pair-video').readyState >= 2")
+    cells = json.loads(film.locator("#data").text_content())["hand_over"]
+    buttons = film.locator("#pairs button")
+    assert buttons.count() == len(cells["cells"])
+    for i in range(buttons.count()):
+        button = buttons.nth(i)
+        button.click()
+        cell = cells["cells"][button.get_attribute("data-cell")]
+        assert button.get_attribute("aria-pressed") == "true"
+        title = f"{cell['skill']} after {cell['before']}" if cell["before"] else cell["skill"]
+        assert title in film.locator("#pair-title").text_content()
+        assert cell["done"] in film.locator("#pair").text_content()
+        assert film.locator("#pair-clips button").count() == len(cell["clips"])
+        for k, clip in enumerate(cell["clips"]):
+            film.locator("#pair-clips button").nth(k).click()
+            film.evaluate("document.getElementById('pair-video').pause()")
+            at = film.evaluate("document.getElementById('pair-video').currentTime")
+            assert clip["from"] <= at * cells["film"]["fps"] <= clip["to"] + 1
 
 
 def test_the_film_jumps_to_the_call_that_is_clicked(film: Any) -> None:

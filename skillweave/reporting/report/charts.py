@@ -97,6 +97,18 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
     return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
 
+def hand_over(names: tuple[str, str]) -> Spec:
+    """Return a chart of calls over two coordinates, by what became of them.
+
+    Args:
+        names: of calls that were done, and of others.
+    """
+    spec = choices(names, ["#009e73", "#d55e00"])
+    spec["encoding"]["shape"]["scale"]["range"] = ["circle", "cross"]
+    spec["encoding"]["tooltip"][0]["title"] = "call"
+    return spec | {"description": "The chosen calls over two coordinates", "height": 300}
+
+
 def family_tree(lineage: Lineage, color: str) -> Spec:
     """Return a chart of fitness by generation, each member joined to its parent."""
     path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}

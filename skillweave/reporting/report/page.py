@@ -17,7 +17,12 @@ LOCAL = Path(__file__).parent / "templates"
 
 
 def write_page(
-    path: Path, template: str, context: dict[str, Any], data: dict[str, Any], film: Film | None
+    path: Path,
+    template: str,
+    context: dict[str, Any],
+    data: dict[str, Any],
+    film: Film | None,
+    hand_film: Film | None = None,
 ) -> dict[str, Any]:
     """Fill a template and write the page, whole or not at all.
 
@@ -25,6 +30,8 @@ def write_page(
         template: a file in ``templates``.
         context: what its words are made of.
         data: what its charts and timelines are made of, as plain JSON without NaN.
+        film: of episodes.
+        hand_film: of calls of one skill after another.
 
     Returns:
         ``path`` and ``bytes``.
@@ -47,12 +54,17 @@ def write_page(
         "script": (LOCAL / "page.js").read_text("utf-8"),
         "library": library(),
         "data": data,
-        "film": None if film is None else base64.b64encode(film.data).decode(),
+        "film": _encoded(film),
+        "hand_film": _encoded(hand_film),
         "made": time.strftime("%Y-%m-%d %H:%M"),
     }
     text = environment.get_template(template).render(parts | context).encode()
     write_bytes(path, text)
     return {"path": str(path), "bytes": len(text)}
+
+
+def _encoded(film: Film | None) -> str | None:
+    return None if film is None else base64.b64encode(film.data).decode()
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
 from skillweave.paths import AGENT
+from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -32,6 +33,7 @@ from skillweave.reporting.report.curves import (
     thinned,
 )
 from skillweave.reporting.report.film import Film, make_film
+from skillweave.reporting.report.hand_over import Section, hand_over_section
 from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.skills_table import (
@@ -182,19 +184,45 @@ def write_report(
     if not all_curves and run.manifest["stages"]:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
+    section = _hand_over(run, spec, colors, filmed > 0, missing)
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
-    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False}
+    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False, "hand_over": None}
+    hand_film = None
+    if section is not None:
+        context |= section.context
+        data |= section.data
+        hand_film = section.film
     if played is not None:
         context |= _skills(played)
         data |= _episodes(played)
     film = None if played is None else played.film
     data |= {"why": WHY, "binary": context["binary"]}
-    page = write_page(path, "report.html", context, data, film)
+    page = write_page(path, "report.html", context, data, film, hand_film)
     page |= {"seconds": round(time.perf_counter() - began, 2)}
     return page | {"verdict": context["verdict"], "missing": missing}
+
+
+def _hand_over(
+    run: RunDirectory,
+    spec: EnvSpec | None,
+    colors: Mapping[str, str],
+    filmed: bool,
+    missing: list[str],
+) -> Section | None:
+    """Return the section about the run's log of calls, or None; add what is missing."""
+    try:
+        log = load_calls(run)
+    except SkillweaveError as error:
+        missing.append(f"There is no hand-over: {_sentence(error)}")
+        return None
+    if log is None or not len(log):
+        return None
+    section = hand_over_section(log, spec, colors, filmed=filmed)
+    missing += section.missing
+    return section
 
 
 def _sentence(error: SkillweaveError) -> str:

@@ -116,6 +116,109 @@
     }
   }
 
+  // Films: one file each, with the skills' names as captions
+
+  const load = (video, id, fps, cues) => {
+    const bytes = Uint8Array.from(atob($(id).textContent.trim()), (c) => c.charCodeAt(0));
+    video.src = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
+    const stamp = (frame) => new Date((1000 * frame) / fps).toISOString().slice(11, 23);
+    const lines = cues.filter(([from, to]) => to > from)
+      .map(([from, to, text]) => `${stamp(from)} --> ${stamp(to)}\n${text}\n`);
+    const captions = new Blob([`WEBVTT\n\n${lines.join("\n")}`], { type: "text/vtt" });
+    video.append(make("track", { kind: "captions", label: "Skills", srclang: "en", src: URL.createObjectURL(captions) }));
+  };
+
+  // Hand-over: the chosen cell, its films and its calls
+
+  const handOver = () => {
+    const { cells, colors, words, names, points, spec, film } = data.hand_over;
+    const video = $("pair-video");
+    const buttons = [...document.querySelectorAll("#pairs button")];
+    let cell, clip;
+
+    const drawCalls = () => {
+      const [across, up] = ["pair-across", "pair-up"].map((id) => Number($(id).value));
+      const first = Number($("pair-when").value) * names.length;
+      const shown = structuredClone(spec);
+      shown.data = { values: points[cell].map((row) => ({
+        x: row[first + across], y: row[first + up], what: words[row[2 * names.length] ? 0 : 1] })) };
+      for (const [axis, i] of [["x", across], ["y", up]]) shown.encoding[axis].title = names[i];
+      [across, up].forEach((i, k) => { shown.encoding.tooltip[k + 1].title = names[i]; });
+      // One scale for all cells, so that they can be compared.
+      for (const [axis, i] of [["x", across], ["y", up]]) {
+        const all = Object.values(points).flat().flatMap((row) => [row[i], row[names.length + i]]);
+        shown.encoding[axis].scale.domain = [Math.min(...all), Math.max(...all)];
+      }
+      draw($("pair-chart"), shown);
+    };
+
+    const show = (i) => {
+      clip = cells[cell].clips[i];
+      [...$("pair-clips").children].forEach((b, k) => b.setAttribute("aria-pressed", String(k === i)));
+      if (clip) video.currentTime = (clip.from + 0.5) / film.fps;
+    };
+
+    const select = (id) => {
+      cell = id;
+      buttons.forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.cell === id)));
+      const { skill, before, done, interval, ends, clips } = cells[id];
+      const chip = make("span", { class: "chip", style: `background:${colors[skill] ?? "#8d8d97"}` });
+      $("pair-title").replaceChildren(chip, before ? `${skill} after ${before}` : `${skill} at the start of an episode`);
+      const rows = [["Done", done], ["95 % interval", interval], ["Calls ended", ends]];
+      $("pair").replaceChildren(...rows.map(([k, v]) => make("div", {}, make("dt", {}, k), make("dd", {}, v))));
+      if (names.length) drawCalls();
+      if (!video) return;
+      $("pair-clips").replaceChildren(...clips.map((c, i) => {
+        const button = make("button", { type: "button" }, `${c.done ? "done" : "not done"}, ${c.steps} steps`);
+        button.addEventListener("click", () => { show(i); video.play(); });
+        return button;
+      }));
+      video.pause();
+      video.hidden = !clips.length;
+      $("pair-now").textContent = clips.length ? "" : "None of these calls is in the film.";
+      show(0);
+    };
+
+    buttons.forEach((b) => b.addEventListener("click", () => select(b.dataset.cell)));
+    if (names.length) {
+      $("pair-some").hidden = false;
+      for (const id of ["pair-across", "pair-up"]) {
+        $(id).append(...names.map((name, i) => make("option", { value: i }, name)));
+        $(id).addEventListener("change", drawCalls);
+      }
+      $("pair-up").value = Math.min(1, names.length - 1);
+      $("pair-when").addEventListener("change", drawCalls);
+    }
+    if (video) {
+      load(video, "hand-film", film.fps, Object.values(cells).flatMap(({ skill, before, clips }) =>
+        clips.flatMap((c) => [[c.from, c.call, `${before} ends`], [c.call, c.to, skill]])));
+      const follow = () => {
+        if (!clip) return;
+        const frame = Math.floor(video.currentTime * film.fps + 1e-3);
+        if (frame >= clip.to || frame < clip.from) {
+          video.pause();
+          if (frame > clip.to || frame < clip.from) video.currentTime = (clip.from + 0.5) / film.fps;
+        }
+        const { skill, before } = cells[cell];
+        $("pair-now").textContent = frame < clip.call ? `${before} ends` :
+          `${skill}: ${clip.done ? "done" : "not done"} after ${clip.steps} steps`;
+      };
+      video.addEventListener("timeupdate", follow);
+      video.addEventListener("seeked", follow);
+      const everyFrame = () => {
+        follow();
+        if (!video.paused) requestAnimationFrame(everyFrame);
+      };
+      video.addEventListener("play", () => {
+        if (clip && video.currentTime * film.fps >= clip.to - 1) video.currentTime = (clip.from + 0.5) / film.fps;
+        everyFrame();
+      });
+      video.addEventListener("loadedmetadata", () => show(0), { once: true });
+    }
+    select((document.querySelector("#pairs .weak button") ?? buttons[0]).dataset.cell);
+  };
+  if (data.hand_over && document.querySelector("#pairs button")) handOver();
+
   // Episodes: timelines, the chosen call, the film
 
   if (!data.episodes) return;
@@ -240,19 +343,14 @@
   $("more").querySelector("summary").textContent = `${more} more ${more === 1 ? "episode" : "episodes"}${without}`;
 
   if (!video) return choose(0, 0, false);
-  const bytes = Uint8Array.from(atob($("film").textContent.trim()), (c) => c.charCodeAt(0));
-  video.src = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
   const filmed = data.episodes.map((e, place) => ({ e, place })).filter(({ e }) => e.frame !== null);
   const lastFrame = ({ e }) => e.frame + Math.ceil(e.steps / data.film.every);
 
   // Captions say who acts, in full screen too.
-  const stamp = (frame) => new Date((1000 * frame) / data.film.fps).toISOString().slice(11, 23);
-  const cues = filmed.flatMap((f) => f.e.calls.map(([skill, start, steps]) => {
+  load(video, "film", data.film.fps, filmed.flatMap((f) => f.e.calls.map(([skill, start, steps]) => {
     const [from, to] = [start, start + steps].map((s) => f.e.frame + Math.ceil(s / data.film.every));
-    return to > from ? `${stamp(from)} --> ${stamp(to)}\n${data.labels[skill]}\n` : "";
-  }));
-  const captions = new Blob([`WEBVTT\n\n${cues.filter(Boolean).join("\n")}`], { type: "text/vtt" });
-  video.append(make("track", { kind: "captions", label: "Skills", srclang: "en", src: URL.createObjectURL(captions) }));
+    return [from, to, data.labels[skill]];
+  })));
 
   const head = make("div", { class: "head" });
   const follow = () => {

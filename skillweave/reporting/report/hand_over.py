@@ -1,0 +1,372 @@
+"""The hand-over section of a report, from the log of calls in the run: a matrix, films, ends.
+
+Stands alone because all of it is about the run's log of calls; ``single`` writes the page.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skillweave.envs.engine import GymnasiumEngine
+from skillweave.envs.make import EnvSpec
+from skillweave.envs.obs_names import ObsNames
+from skillweave.errors import EnvError, SkillweaveError
+from skillweave.planning import CallLog, HandOver
+from skillweave.planning.hand_over import before_each
+from skillweave.reporting.report import charts
+from skillweave.reporting.report.calls import (
+    MOST_COORDINATES,
+    coordinates,
+    names_misfit,
+    rounded,
+)
+from skillweave.reporting.report.film import HOLD, USUAL_FPS, Film
+from skillweave.reporting.report.numbers import number, percent, scale_of
+from skillweave.reporting.report.skills_table import WHY
+from skillweave.reporting.screen import without_screen
+from skillweave.reporting.video import enlarged, frame_of
+from skillweave.reporting.video_file import VideoWriter
+from skillweave.seeding import Seeds, global_generators
+from skillweave.types import Array
+
+MOST_FRAMES = 1_200
+MOST_FILMED = 4 * MOST_FRAMES
+"""The most steps in the film."""
+MOST_REPLAYED = 100_000
+"""The most steps that are played again, to come to the calls in the film."""
+MOST_BYTES = 1_800_000
+LEAD = 40
+"""The most steps that a clip shows of the call before."""
+LONGEST = 300
+"""The most steps that a clip shows of the call."""
+MOST_POINTS = 2_000
+"""The most calls in the chart, of all cells."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """The hand-over section of a page."""
+
+    context: dict[str, Any]
+    """What its words are made of."""
+    data: dict[str, Any]
+    """What its chart and film need, as plain JSON."""
+    film: Film | None
+    missing: list[str]
+
+
+@dataclass
+class _Clip:
+    """A call, with the end of the call before."""
+
+    row: int
+    """Of the log."""
+    lead: int
+    """Steps that are shown of the call before."""
+    steps: int
+    """Steps that are shown of the call."""
+    frame: int = 0
+    """The first one in the film."""
+
+
+@dataclass
+class _Cell:
+    """The calls of one skill after another one."""
+
+    rows: Array
+    """Of the log."""
+    clips: list[_Clip] = field(default_factory=list)
+
+
+def hand_over_section(
+    log: CallLog, spec: EnvSpec | None, colors: Mapping[str, str], *, filmed: bool
+) -> Section:
+    """Return the section for a log.
+
+    Args:
+        spec: of the environment; None: unknown, so nothing can be filmed.
+        colors: of the skills.
+        filmed: play calls again, and film them.
+    """
+    matrix, missing = log.hand_over(), []
+    before = before_each(log, log.succeeded)
+    cells = {
+        (i, j): _Cell(np.flatnonzero((before == i) & (log.skill == j)))
+        for i, j in np.argwhere(matrix.calls > 0).tolist()
+    }
+    film = None
+    if spec is not None and filmed:
+        try:
+            film = _film(log, spec, cells, matrix)
+        except SkillweaveError as error:
+            missing.append(f"There is no film of hand-overs: {str(error).rstrip('.')}.")
+    named = None if spec is None else spec.observation_names()
+    named = None if names_misfit(log.start[:1], named) else named
+    if film is None:
+        for cell in cells.values():
+            cell.clips = []
+    points = _points(log, cells, named)
+    done = ("done", "not done")
+    data = {
+        "cells": {
+            f"{i}-{j}": _cell(matrix, i, j, log, cell, film) for (i, j), cell in cells.items()
+        },
+        "colors": dict(colors),
+        "words": list(done),
+        "spec": charts.hand_over(done),
+        **points,
+    }
+    if film is not None:
+        data["film"] = {"fps": film.fps}
+    return Section({"hand_over": _words(log, matrix, named)}, {"hand_over": data}, film, missing)
+
+
+def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, Any]:
+    weak = set(matrix.weak())
+    rows = []
+    for i, name in enumerate(matrix.before):
+        cells: list[dict[str, Any] | None] = []
+        for j in range(len(matrix.skills)):
+            calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
+            cell = {"id": f"{i}-{j}", "share": done / calls if calls else 0.0}
+            cell |= {"percent": percent(cell["share"]), "count": f"{done:,} of {calls:,}"}
+            cell |= {"words": _interval(matrix, i, j), "weak": (i, j) in weak}
+            cells.append(cell if calls else None)
+        rows.append({"name": name if i else "start of an episode", "cells": cells})
+    return {
+        "columns": list(matrix.skills),
+        "rows": rows,
+        "weakest": [_as_prose(sentence) for sentence in matrix.weakest()],
+        "weak": bool(weak),
+        "meaning": matrix.meaning,
+        "calls": f"{len(log):,}",
+        "steps": f"{log.steps:,}",
+        "cut": f"{int(matrix.cut.sum()):,}" if matrix.cut.any() else "",
+        "ends": _end_rows(log),
+        "where": _where_rows(log, named),
+    }
+
+
+def _as_prose(sentence: str) -> str:
+    """Return a sentence with names between backticks, and percents as the page writes them."""
+    named = re.sub(r"'([^']+)'", r"`\1`", sentence)
+    return re.sub(r"(\d)%", r"\1 %", named) + "."
+
+
+def _interval(matrix: HandOver, i: int, j: int) -> str:
+    low, high = (percent(float(bound[i, j])) for bound in matrix.interval)
+    return f"{low} to {high}"
+
+
+def _end_rows(log: CallLog) -> list[dict[str, Any]]:
+    """Return a row for each skill: how its calls end."""
+    rows = []
+    for name in log.skills:
+        if not (log.skill == log.number(name)).any():
+            continue
+        ends = log.call_ends(name)
+        rows.append(
+            {
+                "name": name,
+                "calls": f"{ends.calls:,}",
+                "length": number(ends.steps, max(ends.steps, 10)),
+                "ends": [percent(ends.reasons[why] / ends.calls) for why in WHY],
+                "done": percent(ends.succeeded),
+            }
+        )
+    return rows
+
+
+def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
+    """Return the middle 80 % of each coordinate where calls end, by skill."""
+    columns = _varying(coordinates(log.end, named))
+    skills = [name for i, name in enumerate(log.skills) if (log.skill == i).any()]
+    rows = []
+    for name, values in columns.items():
+        scale, cells = scale_of(np.quantile(values, (0.05, 0.95)).tolist()), []
+        for skill in skills:
+            some = values[log.skill == log.number(skill)]
+            low, middle, high = (
+                number(float(q), scale) for q in np.quantile(some, (0.1, 0.5, 0.9))
+            )
+            cells.append({"middle": middle, "range": f"{low} to {high}"})
+        rows.append({"name": name, "cells": cells})
+    return {"skills": skills, "rows": rows}
+
+
+def _varying(columns: Mapping[str, Array]) -> dict[str, Array]:
+    return dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
+
+
+def _points(
+    log: CallLog, cells: Mapping[tuple[int, int], _Cell], named: ObsNames | None
+) -> dict[str, Any]:
+    """Return names of coordinates, and rows of each cell: at start and end of a call, if done."""
+    both = {when: coordinates(obs, named) for when, obs in (("start", log.start), ("end", log.end))}
+    names = list(_varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
+    if not names:
+        return {"names": [], "points": {}}
+    most = max(10, MOST_POINTS // max(1, len(cells)))
+    points = {}
+    for (i, j), cell in cells.items():
+        rows = cell.rows[np.linspace(0, len(cell.rows) - 1, min(most, len(cell.rows))).astype(int)]
+        points[f"{i}-{j}"] = [
+            [*(rounded(both[when][k][c]) for when in both for k in names), int(log.succeeded[c])]
+            for c in rows
+        ]
+    return {"names": names, "points": points}
+
+
+def _cell(
+    matrix: HandOver, i: int, j: int, log: CallLog, cell: _Cell, film: Film | None
+) -> dict[str, Any]:
+    """Return a cell for the page's script."""
+    calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
+    reasons = dict.fromkeys(WHY, 0) | log.take(cell.rows).call_ends(matrix.skills[j]).reasons
+    return {
+        "skill": matrix.skills[j],
+        "before": matrix.before[i] if i else "",
+        "done": f"{done:,} of {calls:,} calls ({percent(done / calls)})",
+        "interval": _interval(matrix, i, j),
+        "ends": ", ".join(f"{WHY[why]} {n:,}" for why, n in reasons.items() if n),
+        "clips": [
+            {
+                "from": clip.frame,
+                "call": clip.frame + -(-clip.lead // film.every),
+                "to": clip.frame + -(-(clip.lead + clip.steps) // film.every) + HOLD,
+                "done": bool(log.succeeded[clip.row]),
+                "steps": int(log.tau[clip.row]),
+            }
+            for clip in cell.clips
+            if film is not None
+        ],
+    }
+
+
+# The film
+
+
+@without_screen()
+@global_generators(Seeds(0) / "hand-over film")
+def _film(
+    log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
+) -> Film | None:
+    """Play calls of each cell again, and film them; None: none can be played again.
+
+    Raises:
+        EnvError: the environment gives no frames, or does not repeat itself.
+        MissingExtra: the extra 'video' is not installed.
+    """
+    clips = _choose_clips(log, cells, matrix)
+    if not clips:
+        return None
+    every = max(2, -(-sum(clip.lead + clip.steps for clip in clips) // MOST_FRAMES))
+    frames = sum((clip.lead + clip.steps) // every + HOLD + 1 for clip in clips)
+    env = spec.make(render_mode="rgb_array")
+    engine = GymnasiumEngine(lambda number: env, 1, spec.name)
+    fps = (env.metadata.get("render_fps") or USUAL_FPS) / 2
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "film.mp4"
+            with VideoWriter(path, fps, int(8 * MOST_BYTES * fps / frames)) as video:
+                for clip in clips:
+                    clip.frame = video.frames
+                    _replay(log, env, engine, clip, video, every)
+            return Film(path.read_bytes(), fps, every, {})
+    finally:
+        engine.close()
+
+
+def _choose_clips(
+    log: CallLog, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
+) -> list[_Clip]:
+    """Choose calls of each cell, one that was not done and one that was, as many as fit.
+
+    Cells that are worse than others come first, and two of their calls that were not done.
+    """
+    playable, weak = _playable(log), set(matrix.weak())
+    age = np.array(log.age)
+    order = sorted(cells, key=lambda place: (place not in weak, matrix.rate[place]))
+    chosen: list[_Clip] = []
+    filmed = replayed = 0
+    for many in (False, True):  # a second one of the weak cells if there is room
+        for place in order:
+            rows = cells[place].rows[playable[cells[place].rows]]
+            for done in (False,) if many else (False, True):
+                some = rows[log.succeeded[rows] == done]
+                if (many and place not in weak) or len(some) <= many:
+                    continue
+                # In the middle of all ages: neither the first calls of an episode nor the last.
+                row = int(
+                    some[np.argsort(age[some], kind="stable")][len(some) // (3 if many else 2)]
+                )
+                tau = int(log.tau[row])
+                lead = min(LEAD, int(log.tau[_before(log, row)])) if place[0] else 0
+                clip = _Clip(row, lead, min(tau, LONGEST))
+                shown, steps = clip.lead + clip.steps, int(age[row]) + tau
+                if filmed + shown > MOST_FILMED or replayed + steps > MOST_REPLAYED:
+                    continue
+                if any(clip.row == other.row for other in cells[place].clips):
+                    continue
+                filmed, replayed = filmed + shown, replayed + steps
+                cells[place].clips.append(clip)
+                chosen.append(clip)
+    return chosen
+
+
+def _before(log: CallLog, row: int) -> int:
+    """Return the call before a call."""
+    return int(np.flatnonzero(log.followed_by == row)[0])
+
+
+def _playable(log: CallLog) -> Array:
+    """Return the calls that can be played again, (C,) bool: the log has all before them."""
+    playable = np.zeros(len(log), bool)
+    first = np.flatnonzero((log.order == 0) & (log.seed >= 0))
+    while len(first):
+        playable[first] = True
+        first = log.followed_by[first]
+        first = first[first >= 0]
+    return playable
+
+
+def _until(log: CallLog, row: int) -> Iterator[int]:
+    """Yield the calls of an episode up to ``row``, in their order."""
+    calls = np.flatnonzero((log.episode == log.episode[row]) & (log.order <= log.order[row]))
+    yield from calls[np.argsort(log.order[calls])].tolist()
+
+
+def _replay(
+    log: CallLog, env: Any, engine: GymnasiumEngine, clip: _Clip, video: VideoWriter, every: int
+) -> None:
+    row = np.arange(1)
+    obs = engine.reset_some(row, [int(log.seed[clip.row])])
+    first = int(log.age[clip.row]) - clip.lead
+    t = 0
+    for call in _until(log, clip.row):
+        _check_same(obs[0], log.start[call], t)
+        for step in range(int(log.offset[call]), int(log.offset[call + 1])):
+            if t >= first + clip.lead + clip.steps:
+                break
+            if t >= first and (t - first) % every == 0:
+                video.add(enlarged(frame_of(env)))
+            obs = engine.step(np.asarray(log.action[step])[None], row).next_obs
+            t += 1
+            _check_same(obs[0], log.next_obs[step], t)
+    for _ in range(HOLD):
+        video.add(enlarged(frame_of(env)))
+
+
+def _check_same(here: Array, logged: Array, t: int) -> None:
+    if not np.array_equal(here, logged):
+        raise EnvError(
+            f"from the same seed and with the same actions, the environment did another thing in "
+            f"step {t}: it does not repeat itself"
+        )

@@ -1,0 +1,71 @@
+"""The words of a mission's text: names of skills, the hierarchy's own words, and given ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ready_selectors.chain import PLACE, SPEC, GetKey, OpenDoor, Wait, hierarchy
+
+import skillweave as sw
+from skillweave.api import Run
+from skillweave.errors import DeclarationError
+
+
+class Then(Wait):
+    name = "then"  # a word of missions
+
+    def success(self, step: Any) -> Any:
+        return np.ones(len(step.reward), bool)
+
+
+class ToKey(GetKey):
+    def success(self, step: Any) -> Any:
+        return step.next_obs[:, 1] == 1
+
+
+def at_four(obs: Any) -> Any:
+    return obs[:, PLACE] == 4
+
+
+def at_five(obs: Any) -> Any:
+    return obs[:, PLACE] == 5
+
+
+def run_of(**how: Any) -> Run:
+    skills = (ToKey(), OpenDoor(), Then())
+    declared = sw.Hierarchy(
+        SPEC, skills, call_steps=None, selector=lambda obs: ["to_key"] * len(obs), **how
+    )
+    return Run(declared, Path("runs/words"), hierarchy(declared.selector, skills=skills))
+
+
+def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
+    run = run_of(predicates={"four": at_four})
+    log = run.log_calls(2_000, info=("door",))
+    planned = run.plan("to_key then four")
+    assert planned.evaluate(10, quiet=True).success_rate == 1.0
+    given = run.plan("to_key then five", log, predicates={"five": at_five})
+    assert given.evaluate(10, quiet=True).success_rate == 1.0
+    with pytest.raises(DeclarationError, match="'fiv' is no known predicate; known are: to_key, o"):
+        run.plan("to_key then fiv")
+    # A word that is given replaces one of its name.
+    other = run.plan("four", log, predicates={"four": lambda obs: obs[:, PLACE] == 3})
+    assert other.evaluate(10, quiet=True).lengths != run.plan("four", log).evaluate(10).lengths
+    again = planned.plan("four", log)
+    assert again.evaluate(5, quiet=True).success_rate == 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ({"four": 4}, "predicates: 'four': 4 is no predicate"),
+        ({"4": at_four}, "a name is one word that begins with a letter"),
+        (at_four, "predicates is "),
+    ],
+)
+def test_wrong_words_are_refused_where_they_are_declared(words: Any, says: str) -> None:
+    with pytest.raises(DeclarationError, match=says):
+        run_of(predicates=words)

@@ -1,0 +1,146 @@
+"""The hand-over section of a report: its matrix, the calls that it films, and what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from reporting.walkway import Walkway, declare
+
+from skillweave import EnvSpec, Run
+from skillweave.planning import CallLog
+from skillweave.reporting.report import hand_over
+from skillweave.reporting.report.film import HOLD
+from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.runs.directory import CALLS
+
+pytest.importorskip("imageio_ffmpeg")
+
+
+class Ragged(Walkway):
+    """A walk that begins at a place drawn by its seed, and may become moody."""
+
+    mood = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.at = int(np.random.default_rng(seed).integers(0, 3)) + self.mood
+        return self._seen(), {}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return declare(Ragged).train(tmp_path / "run", quiet=True)
+
+
+@pytest.fixture
+def log(run: Run) -> CallLog:
+    return run.log_calls(400, num_envs=4)
+
+
+def section(log: CallLog, spec: Any = None, filmed: bool = True) -> hand_over.Section:
+    spec = EnvSpec(Ragged) if spec is None else spec
+    return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, filmed=filmed)
+
+
+def test_the_matrix_and_the_ends(log: CallLog) -> None:
+    words = section(log, filmed=False).context["hand_over"]
+    matrix = log.hand_over()
+    assert words["columns"] == ["go", "stay"]
+    assert [row["name"] for row in words["rows"]] == ["start of an episode", "go", "stay"]
+    for i, row in enumerate(words["rows"]):
+        for j, cell in enumerate(row["cells"]):
+            assert (cell is None) == (matrix.calls[i, j] == 0)
+            if cell is not None:
+                assert cell["count"] == f"{matrix.done[i, j]} of {matrix.calls[i, j]}"
+                assert cell["share"] == pytest.approx(matrix.rate[i, j])
+    assert words["meaning"] == matrix.meaning
+    assert "without success() (stay)" in words["meaning"]
+    go, stay = words["ends"]
+    assert (go["name"], stay["name"]) == ("go", "stay")
+    assert stay["ends"][1] == "100 %"
+    assert words["where"]["skills"] == ["go", "stay"]
+
+
+def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> None:
+    reached: list[tuple[int, list[Any]]] = []
+    replay = hand_over._replay
+
+    def watch(log: CallLog, env: Any, engine: Any, clip: Any, video: Any, every: int) -> None:
+        before = video.frames
+        replay(log, env, engine, clip, video, every)
+        assert video.frames - before == -(-(clip.lead + clip.steps) // every) + HOLD
+        reached.append((clip.row, env.unwrapped._seen().tolist()))
+
+    monkeypatch.setattr(hand_over, "_replay", watch)
+    log = replace(log, succeeded=np.random.default_rng(0).random(len(log)) < 0.7)
+    made = section(log)
+    assert made.missing == []
+    assert made.film is not None
+    assert len(reached) > 4
+    for row, seen in reached:
+        assert seen == log.end[row].tolist()
+    cells = made.data["hand_over"]["cells"]
+    assert {clip["done"] for cell in cells.values() for clip in cell["clips"]} == {True, False}
+    for cell in cells.values():
+        for clip in cell["clips"]:
+            assert clip["from"] <= clip["call"] < clip["to"]
+            assert (clip["from"] < clip["call"]) == bool(cell["before"])
+
+
+def test_only_calls_whose_episodes_are_whole_are_played_again(log: CallLog) -> None:
+    assert hand_over._playable(log).all()
+    without_first = log.take(np.flatnonzero((log.order > 0) | (log.episode > 0)))
+    playable = hand_over._playable(without_first)
+    assert (playable == (without_first.episode > 0)).all()
+    unknown = replace(log, seed=np.full(len(log), -1))
+    made = section(unknown)
+    assert (made.film, made.missing) == (None, [])
+    assert all(cell["clips"] == [] for cell in made.data["hand_over"]["cells"].values())
+
+
+def test_an_environment_that_does_another_thing_is_not_filmed(
+    log: CallLog, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(Ragged, "mood", 1)
+    made = section(log)
+    assert made.film is None
+    assert "it does not repeat itself" in made.missing[0]
+    assert made.missing[0].startswith("There is no film of hand-overs: ")
+
+
+def test_few_points_and_a_short_film_of_many_calls(log: CallLog, monkeypatch: Any) -> None:
+    monkeypatch.setattr(hand_over, "MOST_POINTS", 60)
+    monkeypatch.setattr(hand_over, "MOST_FILMED", 6)
+    monkeypatch.setattr(hand_over, "MOST_FRAMES", 4)
+    data = section(log).data["hand_over"]
+    assert max(map(len, data["points"].values())) <= 60 // len(data["points"]) + 1
+    assert sum(len(cell["clips"]) for cell in data["cells"].values()) in (1, 2, 3)
+    assert data["names"] == ["obs[0]", "obs[1]"]
+
+
+def test_a_log_of_images_has_no_chart(log: CallLog) -> None:
+    flat = {name: np.zeros((*getattr(log, name).shape[:1], 70), np.float32)
+            for name in ("start", "next_obs")}  # fmt: skip
+    space = gym.spaces.Box(-1, 1, (70,), np.float32)
+    data = section(replace(log, observation_space=space, **flat), filmed=False)
+    assert data.data["hand_over"]["names"] == []
+    assert data.context["hand_over"]["where"]["rows"] == []
+
+
+@pytest.mark.slow
+def test_the_page_has_it_where_the_run_has_a_log(run: Run, log: CallLog) -> None:
+    pytest.importorskip("vl_convert")
+    page = run.report(episodes=1, films=1, quiet=True)
+    text = Path(page["path"]).read_text()
+    assert page["missing"] == []
+    assert 'id="hand-film"' in text
+    assert "Hand-over: does the next skill work?" in text
+    (run.path / CALLS).write_bytes(b"damaged")
+    page = run.report(episodes=1, films=0, quiet=True)
+    assert "There is no hand-over: " in page["missing"][0]
+    assert 'id="hand-over"' not in Path(page["path"]).read_text()
