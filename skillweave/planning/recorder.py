@@ -310,7 +310,10 @@ class Recorder:
             self.steps -= oldest.size
             self._bytes -= oldest.nbytes
         if self.latest is None and self._bytes > MOST_BYTES:
-            _refuse(self.steps, self._bytes // self.steps)
+            raise DeclarationError(
+                f"the log of calls has {self.steps:,} steps and more than {MOST_BYTES // 2**30} "
+                "GiB, the most that is recorded: play fewer episodes, or log no calls"
+            )
 
     def _joined(self) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:
         """Return starts, steps and ends of the calls that are whole, in the order of starts."""

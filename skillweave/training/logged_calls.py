@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from skillweave.notices import notice
 from skillweave.paths import names_in
 from skillweave.planning.recorder import Recorder
 from skillweave.planning.run_log import save_calls
@@ -50,3 +51,8 @@ def save_logged(
     log = recorder.log(learning)
     if len(log):
         save_calls(run, log)
+    else:
+        notice(
+            f"stage {entry['name']!r}: no whole call was recorded in the latest "
+            f"{recorder.latest:,} steps (log_calls), so the run has no log of them"
+        )

@@ -178,6 +178,25 @@ class Balanced(Balance):
 
 
 @pytest.mark.slow
+def test_a_run_that_continues_keeps_its_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    declare().train(tmp_path / "run", quiet=True)
+    capsys.readouterr()
+    declare(steps=1_200).train(tmp_path / "run", resume=True, log_calls=200)
+    assert "continues as it began, with no log of calls" in capsys.readouterr().err
+
+
+def test_a_log_without_a_call_says_so(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="no whole call was recorded in the latest 1 steps"):
+        declare(skills=[Nod(), Nodding()]).train(tmp_path / "run", quiet=True, log_calls=1)
+
+
+class Nodding(Nod):
+    """The same again."""
+
+
+@pytest.mark.slow
 def test_a_resumed_run_ends_with_the_same_weights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
