@@ -136,7 +136,7 @@ def main() -> None:
         engine, make = hierarchies()[case]
         run = make()
         ways = {
-            "evaluating": evaluating(run, engine, 16 if case == "lander" else 128),
+            "evaluating": evaluating(run, engine, 8 if case == "lander" else 128),
             "collecting": collecting(run, engine, given.rows),
         }
         for way, timed in ways.items():
@@ -145,6 +145,7 @@ def main() -> None:
             more = median(log / plain for plain, log in pairs) - 1
             step = median(plain for plain, _ in pairs)
             rows.append((case, way, f"{1e6 * step:.1f}", f"{more:+.1%}"))
+            print(*rows[-1], flush=True)
             result[f"{case}/{way}"] = {"step_seconds": step, "more": more}
     print(table(("case", "while", "µs a step", "with a log"), rows))
     report("logging", {"ratios": result, "at_most": LIMIT})

@@ -99,5 +99,7 @@ class PlayedCalls:
         assert played.after is not None
         prefix, after = self._prefix[path], played.after
         calls = {key: after[prefix + key] for key in CALL if prefix + key in after}
-        cut = over & (calls["end"] == RUNNING)
-        return calls | {"end": np.where(cut, np.int8(EPISODE), calls["end"])}
+        if played.cut.any():  # the player sees the environment's own ends
+            cut = played.cut & (calls["end"] == RUNNING)
+            calls["end"] = np.where(cut, np.int8(EPISODE), calls["end"])
+        return calls
