@@ -832,7 +832,7 @@ class Run:
 
     @property
     def has_calls(self) -> bool:
-        """Whether ``log_calls`` recorded calls in this run.
+        """True if ``log_calls`` recorded calls in this run.
 
         Raises:
             RunError: their file is damaged or of other skills.
