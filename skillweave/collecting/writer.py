@@ -53,7 +53,7 @@ class TraceWriter:
     def next(self, info: Mapping[str, Any]) -> None:
         """Start the next row; ``info`` is that of the row's step."""
         if self._infos is not None:
-            self._infos.append(_kept(info))
+            self._infos.append(kept_info(info))
         self.row += 1
 
     def trace(self) -> Trace:
@@ -63,7 +63,7 @@ class TraceWriter:
         return Trace(self._infos or (), columns)
 
 
-def _kept(info: Mapping[str, Any]) -> Mapping[str, Any]:
+def kept_info(info: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return an info that stays as it is: objects are copied, as environments may change them."""
     if all(isinstance(v, np.ndarray) and v.dtype != object for v in info.values()):
         return info
@@ -74,7 +74,7 @@ def _copied(value: Any, key: str) -> Any:
     if isinstance(value, np.ndarray) and value.dtype != object:
         return value
     if isinstance(value, dict):
-        return _kept(value)
+        return kept_info(value)
     try:
         return copy.deepcopy(value)
     except Exception:

@@ -17,7 +17,7 @@ import numpy as np
 from skillweave.collecting.call_end import LIMIT, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.collecting.views import call_successes, info_numbers_of, judged
-from skillweave.collecting.writer import TraceWriter
+from skillweave.collecting.writer import kept_info
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import join
@@ -225,7 +225,9 @@ class Recorder:
 
     def _acts(self, trace: Batch) -> Array:
         """Return the steps in which the level's skills act, (T, k) bool."""
-        acts = np.ones(trace["elapsed"].shape, bool)
+        acts: Array = np.ones(trace["elapsed"].shape, bool)
+        if "valid" in trace:
+            acts &= trace["valid"]
         for level, place in self._above.items():
             acts &= trace[join(level, "skill")] == place
         return acts
@@ -359,55 +361,70 @@ class TraceFeed:
         self.recorders = tuple(recorders)
         self._infos = any(recorder.reads_infos for recorder in recorders)
         self._each = _bytes_of(recorders[0].spaces[0])
-        self._writer: TraceWriter | None = None
-        self._ids = np.zeros(0, np.int64)
+        # Each engine and player gives arrays of its own in each step, so these are not copied.
+        self._steps: list[tuple[Array, Step, Mapping[str, Memory], Mapping[str, Any]]] = []
         self._rows = 0
 
     def add(self, ids: Array, step: Step, levels: Mapping[str, Memory]) -> None:
-        """Add a step of environments ``ids`` (k,).
+        """Add a step of environments ``ids`` (k,), ascending.
 
         Args:
             step: of these environments; ``elapsed`` counts the steps of the episode.
             levels: by path, ``skill``, ``elapsed``, ``end`` and perhaps ``limit`` of each level's
                 calls after the step, (k,) each.
         """
-        if not np.array_equal(ids, self._ids):
+        # Environments stop one after another; when half have stopped, a new trace begins.
+        if self._steps and 2 * len(ids) < len(self._steps[0][0]):
             self.flush()
-        writer = self._writer
-        if writer is None:
+        if not self._steps:
             self._rows = max(1, min(FED_ROWS, FED_BYTES // max(1, self._each * len(ids))))
-            writer = self._writer = TraceWriter(self._rows, len(ids), keep_infos=self._infos)
-            self._ids = ids.copy()
-        columns = {
-            "obs": step.obs,
-            "env_action": step.action,
-            "next_obs": step.next_obs,
-            "env_reward": step.reward,
-            "env_terminated": step.terminated,
-            "env_truncated": step.truncated,
-            "elapsed": step.elapsed,
-        }
-        for path, calls in levels.items():
-            for key, value in calls.items():
-                columns[join(path, key if key == "skill" else f"call_{key}")] = value
-        writer.write(**columns)
-        writer.next(step.info)
-        if writer.row == self._rows:
+        info = kept_info(step.info) if self._infos else {}
+        self._steps.append((ids, step, levels, info))
+        if len(self._steps) == self._rows:
             self.flush()
 
     def flush(self) -> None:
         """Let the recorders read the steps so far."""
-        if self._writer is not None:
-            trace, self._writer = self._writer.trace(), None
+        if self._steps:
+            trace, ids = self._trace(), self._steps[0][0]
+            self._steps = []
             for recorder in self.recorders:
-                recorder.add(trace, self._ids)
+                recorder.add(trace, ids)
+
+    def _trace(self) -> Trace:
+        """Return the steps as a trace of the environments of the first one."""
+        every, steps, levels, infos = zip(*self._steps, strict=True)
+        columns = {name: [getattr(step, field) for step in steps] for name, field in FED.items()}
+        for path, calls in levels[0].items():
+            for key in calls:
+                name = join(path, key if key == "skill" else f"call_{key}")
+                columns[name] = [level[path][key] for level in levels]
+        joined = {name: np.concatenate(parts) for name, parts in columns.items()}
+        lead = len(steps), len(every[0])
+        if len(joined["elapsed"]) == lead[0] * lead[1]:
+            whole = {name: x.reshape(*lead, *x.shape[1:]) for name, x in joined.items()}
+            return Trace(infos, whole)
+        places = [np.searchsorted(every[0], ids) for ids in every]
+        at = np.repeat(np.arange(lead[0]), [len(ids) for ids in every]), np.concatenate(places)
+        whole = {"valid": np.zeros(lead, bool)}
+        whole["valid"][at] = True
+        for name, x in joined.items():
+            whole[name] = np.zeros((*lead, *x.shape[1:]), x.dtype)
+            whole[name][at] = x
+        pairs = zip(infos, places, strict=True)
+        return Trace([_spread(info, place, lead[1]) for info, place in pairs], whole)
 
 
-def check_size(steps: int, spaces: tuple[gym.Space[Any], gym.Space[Any]]) -> None:
-    """Raise a DeclarationError where a log of ``steps`` steps would be too large."""
-    each = sum(map(_bytes_of, spaces)) + 4  # and the reward
-    if steps * each > MOST_BYTES:
-        _refuse(steps, each)
+FED = {
+    "obs": "obs",
+    "env_action": "action",
+    "next_obs": "next_obs",
+    "env_reward": "reward",
+    "env_terminated": "terminated",
+    "env_truncated": "truncated",
+    "elapsed": "elapsed",
+}
+"""By a column of a trace, the field of a ``Step``."""
 
 
 def levels_below(skills: SkillSet) -> dict[str, tuple[SkillSet, dict[str, int]]]:
@@ -426,6 +443,25 @@ def levels_below(skills: SkillSet) -> dict[str, tuple[SkillSet, dict[str, int]]]
                 found[inner] = below, above | {path: i}
                 waiting.append(inner)
     return found
+
+
+def check_size(steps: int, spaces: tuple[gym.Space[Any], gym.Space[Any]]) -> None:
+    """Raise a DeclarationError where a log of ``steps`` steps would be too large."""
+    each = sum(map(_bytes_of, spaces)) + 4  # and the reward
+    if steps * each > MOST_BYTES:
+        _refuse(steps, each)
+
+
+def _spread(info: Mapping[str, Any], place: Array, n: int) -> dict[str, Any]:
+    """Return an ``info`` of environments ``place`` (k,) as one of n; the others have zeros."""
+    whole: dict[str, Any] = {}
+    for key, value in info.items():
+        if isinstance(value, np.ndarray) and value.shape[:1] == place.shape:
+            whole[key] = np.zeros((n, *value.shape[1:]), value.dtype)
+            whole[key][place] = value
+        else:
+            whole[key] = _spread(value, place, n) if isinstance(value, dict) else value
+    return whole
 
 
 def _numbered(starts: Array, latest: Array, count: int) -> Array:
