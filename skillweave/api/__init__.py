@@ -789,9 +789,9 @@ class Run:
         """Let the skills act without the selector, record their calls, and keep them in the run.
 
         The run's directory keeps all recorded calls, the latest million steps, in
-        ``calls.safetensors``; ``calls`` reads them. Calls of the skills before they learnt on are
-        replaced. A run without a directory of its own (a weights file, a copy of the hub's) keeps
-        calls in memory.
+        ``calls.safetensors``; ``calls`` reads them. Calls of the skills before they learnt on, or
+        without a key of ``info`` that is asked for now, are replaced, which is said. A run without
+        a directory of its own (a weights file, a copy of the hub's) keeps calls in memory.
 
         Args:
             steps: environment steps to record; open calls are completed, so there are a few more.
@@ -832,7 +832,7 @@ class Run:
 
     @property
     def has_calls(self) -> bool:
-        """Whether ``log_calls`` recorded calls in this run.
+        """True if ``log_calls`` recorded calls in this run.
 
         Raises:
             RunError: their file is damaged or of other skills.

@@ -122,6 +122,8 @@ def _render(command: commands.Render) -> None:
 
 def _log(command: commands.Log) -> None:
     run = _load_with_code(command.run, command.recipe)
+    if not command.quiet:
+        say(f"recording {command.steps:,} steps")
     log = run.log_calls(
         command.steps,
         choose=Explorer() if command.choose == "explore" else "random",

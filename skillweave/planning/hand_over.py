@@ -176,6 +176,14 @@ class Chain:
     calls: tuple[int, ...]
     """The number of calls that each factor was counted from."""
 
+    def __str__(self) -> str:
+        """Return the estimate and the product as a sentence."""
+        factors = " × ".join(f"{rate:.0%}" for rate in self.rates)
+        return (
+            f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
+            f"{self.product:.0%} as the product {factors}"
+        )
+
 
 def hand_over(
     log: CallColumns, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
@@ -267,6 +275,14 @@ class CallEnds:
     """Share of calls that succeeded."""
     quantiles: Array
     """(3, F) numbers of the flat observation that 10, 50 and 90 % of the calls end below."""
+
+    def __str__(self) -> str:
+        """Return all but the quantiles as a sentence."""
+        ends = ", ".join(f"{why} {count / self.calls:.0%}" for why, count in self.reasons.items())
+        return (
+            f"{self.skill}: {self.calls:,} calls of {self.steps:.1f} steps, of which "
+            f"{self.succeeded:.0%} succeeded; ends: {ends}"
+        )
 
 
 def call_ends(log: CallColumns, skill: str) -> CallEnds:

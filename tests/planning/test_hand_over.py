@@ -126,6 +126,15 @@ def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
     assert any("ends by itself in" in sentence for sentence in broken)
 
 
+def test_sentences_of_chains_and_ends(log: CallLog) -> None:
+    assert str(log.chain("go")) == ("go: 67% along the logged calls; 67% as the product 67%")
+    assert " then on: " in str(walks(60, 0).chain("back", "there", "on"))
+    assert str(log.call_ends("stay")) == (
+        "stay: 4 calls of 2.2 steps, of which 50% succeeded; ends: own 0%, limit 75%, "
+        "interrupted 0%, episode 25%"
+    )
+
+
 def test_where_calls_end(log: CallLog) -> None:
     ends = log.call_ends("stay")
     assert ends.reasons == {"own": 0, "limit": 3, "interrupted": 0, "episode": 1}

@@ -113,6 +113,16 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
     assert made.missing[0].startswith("There is no film of hand-overs: ")
 
 
+def test_a_log_from_elsewhere_may_hold_anything(log: CallLog) -> None:
+    made = section(replace(log, action=log.action + 7))
+    assert "the log has the action" in made.missing[0]
+    assert made.film is None
+    other = gym.spaces.Discrete(3)
+    assert (
+        "the log has actions of Discrete(3)" in section(replace(log, action_space=other)).missing[0]
+    )
+
+
 def test_few_points_and_a_short_film_of_many_calls(log: CallLog, monkeypatch: Any) -> None:
     monkeypatch.setattr(hand_over, "MOST_POINTS", 60)
     monkeypatch.setattr(hand_over, "MOST_FILMED", 6)

@@ -18,6 +18,7 @@ from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError, SkillweaveError
+from skillweave.messages import short
 from skillweave.planning import CallLog, HandOver
 from skillweave.planning.hand_over import before_each
 from skillweave.reporting.report import charts
@@ -135,8 +136,9 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
         cells: list[dict[str, Any] | None] = []
         for j in range(len(matrix.skills)):
             calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-            cell = {"id": f"{i}-{j}", "share": done / calls if calls else 0.0}
-            cell |= {"percent": percent(cell["share"]), "count": f"{done:,} of {calls:,}"}
+            share = done / calls if calls else 0.0
+            cell = {"id": f"{i}-{j}", "share": share, "percent": percent(share)}
+            cell |= {"count": f"{done:,} of {calls:,}"}
             cell |= {"words": _interval(matrix, i, j), "weak": (i, j) in weak}
             cells.append(cell if calls else None)
         rows.append({"name": name if i else "start of an episode", "cells": cells})
@@ -273,6 +275,7 @@ def _film(
     engine = GymnasiumEngine(lambda number: env, 1, spec.name)
     fps = (env.metadata.get("render_fps") or USUAL_FPS) / 2
     try:
+        log.check_spaces(engine.observation_space, engine.action_space)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
             with VideoWriter(path, fps, int(8 * MOST_BYTES * fps / frames)) as video:
@@ -357,7 +360,10 @@ def _replay(
                 break
             if t >= first and (t - first) % every == 0:
                 video.add(enlarged(frame_of(env)))
-            obs = engine.step(np.asarray(log.action[step])[None], row).next_obs
+            action = np.asarray(log.action[step])
+            if not engine.action_space.contains(action[()]):
+                raise EnvError(f"the log has the action {short(action)}, which does not exist")
+            obs = engine.step(action[None], row).next_obs
             t += 1
             _check_same(obs[0], log.next_obs[step], t)
     for _ in range(HOLD):
