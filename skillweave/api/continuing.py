@@ -63,9 +63,9 @@ def prepared(
         known = ", ".join(run.manifest.get("track", ())) or "none"
         sentences.append(f"the run continues with its own trackers: {known}")
     if content.get("log_calls") != run.manifest.get("log_calls"):
-        known = run.manifest.get("log_calls")
-        steps = "no log of calls" if known is None else f"log_calls={known:,}"
-        sentences.append(f"the run continues as it began, with {steps}")
+        steps = run.manifest.get("log_calls")
+        log = "no log of calls" if steps is None else f"log_calls={steps:,}"
+        sentences.append(f"the run continues as it began, with {log}")
     if not run.finished or max(_more(run.manifest["stages"], budgets).values()) > 0:
         run.begin(finished=True)
     try:
