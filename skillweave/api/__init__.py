@@ -6,13 +6,14 @@ The three classes refer to one another, so they are one module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import (
     Trained,
@@ -33,7 +34,7 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
-from skillweave.api.planning import planned, untasked
+from skillweave.api.planning import planned, start_of, to_train, untasked
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, evolving, go_on
@@ -66,6 +67,7 @@ from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.initial_policies import Learnt
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
@@ -220,6 +222,8 @@ class Hierarchy(Declaration):
 
     recipe: str | None = None
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
+    _starts: ClassVar[Callable[[], Mapping[str, Learnt]] | None] = None
+    """Makes the policies with which learners start, by name; None: they are given to ``train``."""
 
     def __repr__(self) -> str:
         names = [skill.name for skill in self.skills]
@@ -316,6 +320,9 @@ class Hierarchy(Declaration):
         )
         declared, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(declared, seed=seed, flat=flat, how=how)
+        begins = _directories(start_from)
+        if begins is None and self._starts is not None and flat is False:
+            begins = self._starts()
         trained = begin(
             declared,
             content | {"recipe": declared.recipe},
@@ -324,7 +331,7 @@ class Hierarchy(Declaration):
             track,
             evolve,
             cluster,
-            _directories(start_from),
+            begins,
             note,
             callback,
             resume=resume,
@@ -829,6 +836,45 @@ class PlannedRun(Run):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
     _mark = "-plan"
+
+    @checked_names
+    def with_selector(
+        self,
+        algorithm: AlgorithmConfig | None = None,
+        *,
+        steps: int = 100_000,
+        target_kl: float | None = 0.1,
+    ) -> Hierarchy:
+        """Return the skills on the task, with a selector to train that starts from the plan.
+
+        ```python
+        def trained(planned):
+            return planned.with_selector(steps=50_000).train("runs/mission")
+        ```
+
+        Before its training the selector learns to choose as the plan does, in logged observations;
+        then it learns by itself, and the plan guides it. Skills are not trained. The selector also
+        sees the state of the task; skills see what they saw. ``load`` of the same declaration loads
+        the run later.
+
+        Args:
+            algorithm: settings of the selector, ``PPO``; None: ``PPO()``.
+            steps: training steps of the selector.
+            target_kl: while it learns, keep the selector within this KL of the plan; None: the plan
+                is its start alone.
+
+        Raises:
+            DeclarationError: an argument is wrong, or the selector cannot start from a plan.
+        """
+        spec, planner = self._own_spec(), self.hierarchy.selector
+        assert isinstance(self.policy, HierarchyPolicy) and isinstance(planner, Planner)
+        config = PPO() if algorithm is None else algorithm
+        declared = Hierarchy(
+            **to_train(spec, self.policy, planner, config, target_kl),
+            steps=whole_number(steps, "with_selector(): steps", 1),
+        )
+        declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
+        return declared
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

@@ -115,6 +115,7 @@ class Planner(ReadySelector):
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
         self.log, self.task = log, as_task(task, predicates)
+        self.lengths = log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.pays:
             raise DeclarationError(
                 "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
@@ -130,8 +131,8 @@ class Planner(ReadySelector):
         self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
         self._own_end = _own_end(self.task, self.graph)
-        self._machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
-        self._states = PlanningStates(self._machine)
+        self.machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
+        self._states = PlanningStates(self.machine)
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
             if not known:
                 notice(f"the log has no call of {name!r}, so the planner never calls it")
@@ -182,7 +183,7 @@ class Planner(ReadySelector):
         Returns:
             Values; −infinity for choices of which the log has no call.
         """
-        state = self._machine.start(len(obs)) if state is None else state
+        state = self.machine.start(len(obs)) if state is None else state
         return self._values(self.graph.near(obs), obs, state)
 
     def _values(self, near: Near, obs: Array, state: Array) -> Array:
@@ -203,6 +204,38 @@ class Planner(ReadySelector):
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
         q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
+
+    def situations(
+        self, count: int, goals: int, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Draw logged observations, and states of the task that is not over in them.
+
+        Args:
+            count: how many at most.
+            goals: the most goals that they have, where observations hold goals.
+            rng: the source of chance.
+
+        Returns:
+            (n, *obs_shape), half of them where calls start or end, and (n, 1 + H).
+        """
+        log, machine = self.log, self.machine
+        ends = np.concatenate([log.start, log.end])
+        inside = rng.integers(log.steps, size=count // 2)
+        at_ends = rng.integers(len(ends), size=count - len(inside))
+        obs: Array = np.concatenate([log.next_obs[inside], ends[at_ends]])
+        if isinstance(self.task, GoalTask) and self.task.columns is not None:
+            known = np.unique(self.task.of(log.start), axis=0)
+            known = known[rng.permutation(len(known))[:goals]]
+            for goal, rows in zip(known, np.array_split(np.arange(len(obs)), len(known)), strict=True):
+                obs[rows] = self.task.put(obs[rows], goal)
+        state = np.zeros((len(obs), 1 + machine.slots), np.int64)
+        goes_on = np.flatnonzero(~(machine.accepting | machine.failing))
+        state[:, 0] = rng.choice(goes_on, len(obs))
+        steps = machine.counter_steps[state[:, 0]]
+        used = steps < np.iinfo(np.int64).max
+        counted = rng.integers(np.where(used, steps, 1)) * (rng.random(steps.shape) < 0.5)
+        state[:, 1:] = counted
+        return obs, state
 
     # A ready selector
 
@@ -232,13 +265,13 @@ class Planner(ReadySelector):
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments: the task's state, and no call so far."""
-        state = self._machine.start(n)
+        state = self.machine.start(n)
         return {"state": state[:, 0], "counters": state[:, 1:], **self._tried.start(n)}
 
     @property
     def ranges(self) -> dict[str, range]:
         """Return the range of the task's states."""
-        return {"state": range(len(self._machine.state_names))}
+        return {"state": range(len(self.machine.state_names))}
 
     def act(
         self,
@@ -272,16 +305,16 @@ class Planner(ReadySelector):
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a ``step``: the task's state goes on."""
-        after, reward, _ = self._machine.step(_state(memory), step)
+        after, reward, _ = self.machine.step(_state(memory), step)
         changed = {"state": after[:, 0], "counters": after[:, 1:]}
-        return memory | changed | self._tried.pay(memory, reward, self._gamma)
+        return memory | changed | self._tried.pay(memory, reward, self._gamma, last)
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its log, with the names of its task's states."""
         digest = [
             checksum(np.ascontiguousarray(x).tobytes()) for x in columns_of(self.log).values()
         ]
-        about = [digest, self._machine.state_names, self._gamma, self._caution, self._temperature]
+        about = [digest, self.machine.state_names, self._gamma, self._caution, self._temperature]
         whole = json.dumps(about)
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 

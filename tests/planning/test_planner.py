@@ -354,7 +354,7 @@ def test_it_chooses_lengths_when_they_are_chosen() -> None:
     choice, memory = bound.act(memory, np.float32([[4, 0, 0]]))
     assert choice[0] // 3 == 1
     memory = bound.watch(
-        memory, step_to([[0, 1, 0]]), LastCall(choice, np.int8([2]), np.zeros(1, bool))
+        memory, step_to([[0, 1, 0]]), LastCall(choice // 3, np.int8([1]), np.zeros(1, bool))
     )
     assert memory["state"].tolist() == [1]
     choice, _ = bound.act(memory, np.float32([[0, 1, 0]]))
