@@ -67,8 +67,8 @@ from skillweave.reporting.report.single import write_report
 from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.initial_policies import Learnt
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.runs.initial_policies import Learnt
 from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
@@ -765,8 +765,9 @@ class Run:
 
         Args:
             steps: environment steps to record; open calls are completed, so there are a few more.
-            choose: "random": uniformly among the skills that may start; or a selector: any policy
-                over the skills, a ready selector, or a ``planning.Explorer``.
+            choose: "random": uniformly among the skills that may start; "explore": what is unlike
+                the calls so far; or a selector: any policy over the skills, a ready selector, or a
+                ``planning.Explorer``.
             num_envs: environments side by side.
             seed: of the environments and of all that is sampled.
             info: keys of the environment's ``info`` to record, so that tasks may read them.
@@ -867,7 +868,8 @@ class PlannedRun(Run):
             DeclarationError: an argument is wrong, or the selector cannot start from a plan.
         """
         spec, planner = self._own_spec(), self.hierarchy.selector
-        assert isinstance(self.policy, HierarchyPolicy) and isinstance(planner, Planner)
+        assert isinstance(self.policy, HierarchyPolicy)
+        assert isinstance(planner, Planner)
         config = PPO() if algorithm is None else algorithm
         declared = Hierarchy(
             **to_train(spec, self.policy, planner, config, target_kl),

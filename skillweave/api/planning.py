@@ -23,21 +23,13 @@ from skillweave.hierarchy.settings import Guide, Selection
 from skillweave.messages import short
 from skillweave.paths import SELECTOR
 from skillweave.planning import Planner
-from skillweave.planning.task_env import OwnView, Tasked, own_step
+from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
 from skillweave.seeding import Seeds
 from skillweave.training.imitation import imitate
-from skillweave.types import Memory, Policy, Step
+from skillweave.types import Policy
 
 D = TypeVar("D", bound=Declaration)
-
-
-class PlannedPolicy(HierarchyPolicy):
-    """Skills under a planner, which observe what the environment itself gives, not their score."""
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Return the ``memory`` after a ``step``, of the environment or of its ``TaskEnv``."""
-        return super().observe(memory, own_step(step))
 
 
 def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, HierarchyPolicy]:
@@ -58,7 +50,7 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     hierarchy.guide = None
     hierarchy.together = replace(declared.together, interrupt=False)
     hierarchy.selection = replace(declared.selection, target_return=None)
-    return hierarchy, PlannedPolicy(selector, skills)
+    return hierarchy, HierarchyPolicy(selector, skills)
 
 
 def tasked(spec: EnvSpec, planner: Planner, *, observe: bool = False) -> EnvSpec:
@@ -90,7 +82,7 @@ def to_train(
             "can start from a plan: PPO()"
         )
     observed = tasked(spec, planner, observe=True)
-    view = OwnView(spec.spaces.observation, observes=True)
+    view = OwnView(spec.spaces.observation)
     skills = own_skills(replace(policy.skills, interruption=None), view, observed.spaces[0])
     guide = None
     if target_kl is not None:
@@ -106,7 +98,7 @@ def to_train(
     }
 
 
-PAIRS = 20_000
+PAIRS = 10_000
 """The observations, each with a state of the task, by which a selector learns to act as a plan."""
 GOALS = 64
 """The goals that they have, where observations hold goals."""
@@ -132,7 +124,7 @@ def start_of(
     may |= ~may.any(axis=1, keepdims=True)
     chosen = np.where(may, planner.values(obs, state), -np.inf).argmax(1)
     chances = np.exp(as_logits(np.eye(log.choices, dtype=np.float32)[chosen], may)) * may
-    view = OwnView(log.observation_space, observes=True)
+    view = OwnView(log.observation_space)
     seen = view.joined(obs, planner.machine.observe(state))
     selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds)
     names = tuple(skill.name for skill in policy.skills.skills)

@@ -1,6 +1,6 @@
 """Skills, reflexes and selectors in an environment whose observations hold a task's state.
 
-They were made for the environment itself, so each sees only what that gives. Stands alone because
+They were made for the environment itself, so each sees its observations alone. Stands alone because
 it makes the parts of a hierarchy for other observations, and ``planning`` joins them.
 """
 
@@ -25,7 +25,7 @@ from skillweave.types import Array, Memory, Policy, Step
 
 
 class OwnPolicy:
-    """A policy that sees what the environment itself gives.
+    """A policy that sees the environment's own observations.
 
     Args:
         policy: made for the environment's own observations.
@@ -62,7 +62,7 @@ class OwnPolicy:
 
 
 class OwnSelector(ReadySelector):
-    """A ready selector that sees what the environment itself gives; see ``OwnPolicy``."""
+    """A ready selector that sees the environment's own observations; see ``OwnPolicy``."""
 
     def __init__(self, selector: Any, view: OwnView) -> None:
         super().__init__(selector.name)
@@ -133,7 +133,7 @@ class OwnSelector(ReadySelector):
 
 
 def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:
-    """Return skills, of all levels, that see what the environment itself gives.
+    """Return skills, of all levels, that see the environment's own observations.
 
     Args:
         skills: with policies for the environment's own observations.

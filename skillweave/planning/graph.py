@@ -147,6 +147,10 @@ class CallGraph:
         """(E,) bool: the episode terminated there."""
         self.may = log.may_follow[call].copy()
         """(E, choices) bool: what may follow."""
+        # A call that the time limit cut would have gone on: its skill alone may follow.
+        self._cut = np.flatnonzero(log.was_cut[call] & whole & self._goes_on(call))
+        own = log.choice[call[self._cut]]
+        self.may[self._cut] = own[:, None] == np.arange(log.choices)
         parts = np.flatnonzero(~whole)
         if len(parts) and skills is not None and skills.restricts:
             self.may[parts] = skills.startable(self.end[parts])
@@ -176,8 +180,33 @@ class CallGraph:
     def after(self) -> Near:
         """The nearest pieces to the ends of calls."""
         if self._after is None:
-            self._after = self.near_features(self._end_features)
+            self._after = self._without_own(self.near_features(self._end_features))
         return self._after
+
+    def _goes_on(self, call: Array) -> Array:
+        """Return whether other logged calls say how each of these calls would have gone on."""
+        calls = np.bincount(self.log.choice, minlength=self.log.choices)
+        return (
+            ~np.array(self.log.recurrent)[self.log.skill[call]] & (calls > 1)[self.log.choice[call]]
+        )
+
+    def _without_own(self, near: Near) -> Near:
+        """Return the neighbours where no cut call is followed by its own pieces."""
+        for c, rows in enumerate(self._of_choice):
+            call = self.end_call[self._cut]
+            cut = self._cut[self.log.choice[call] == c]
+            if not len(cut):
+                continue
+            of = self.pieces.call[rows]
+            features = self._end_features[self.skill_of[c]][cut]
+            found, far = nearest(self._starts[c], features, self.neighbours + 1, of)
+            far[of[found] == self.end_call[cut][:, None]] = np.inf
+            order = np.argsort(far, axis=1, kind="stable")[:, : self.neighbours]
+            far = np.take_along_axis(far, order, 1)
+            finite = np.where(np.isfinite(far), far, 1e9)
+            near.pieces[cut, c] = rows[np.take_along_axis(found, order, 1)]
+            near.weights[cut, c], near.distance[cut, c] = weights_of(finite), far[:, 0]
+        return near
 
     def judge(
         self,
@@ -227,7 +256,7 @@ class CallGraph:
         may: Array,
         *,
         caution: float = 0.0,
-        novel: float | None = None,
+        novel: Array | None = None,
         bonus: float = 1.0,
     ) -> tuple[Array, int]:
         """Return the worth of each piece from each planning state, (P, M), and the sweeps.
@@ -240,7 +269,8 @@ class CallGraph:
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
             caution: share by which a value falls for each unit of distance to the nearest piece.
-            novel: distance from which on a choice is new, and worth ``bonus``; None: none is.
+            novel: (choices,), the distance from which on each choice is new, and worth ``bonus``;
+                None: none is.
             bonus: its value.
         """
         count = judged.reward.shape[1]
@@ -256,7 +286,7 @@ class CallGraph:
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
-                    q = np.where((near.distance[:, c] > novel)[:, None], np.float32(bonus), q)
+                    q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(bonus), q)
                 np.maximum(best, q, out=best, where=may[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
             change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)

@@ -27,6 +27,25 @@ Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
 
 
+def check_features(features: Any, who: str) -> None:
+    """Raise a DeclarationError where features have a wrong type; ``who`` begins the message."""
+    each = features.values() if isinstance(features, Mapping) else [features]
+    for one in each:
+        places = isinstance(one, Sequence | np.ndarray) and not isinstance(one, str | bytes)
+        if isinstance(one, type) or not (one is None or callable(one) or places):
+            raise DeclarationError(
+                f"{who}: features is {short(one)}; give places in the observation, features=[0, 1],"
+                " or a function of observations (n, …) to (n, F), or a dict of these by skill"
+            )
+
+
+def check_number(name: str, value: Any, low: float, high: float) -> None:
+    """Raise a DeclarationError where a number is no number, or out of its range."""
+    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
+    if not real or not low <= value <= high:
+        raise DeclarationError(f"{name} is {short(value)}; it must be from {low:g} to {high:g}")
+
+
 class FeatureMap:
     """Standardised features of observations for one skill.
 

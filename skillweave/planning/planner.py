@@ -14,6 +14,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.guide import LastCall
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.envs.infos import own_step
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
@@ -22,6 +23,7 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
+from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
 from skillweave.planning.task import Task, as_task
 from skillweave.planning.tried import Tried
@@ -109,9 +111,10 @@ class Planner(ReadySelector):
         temperature: float = 0.0,
     ) -> None:
         super().__init__("planner")
-        _check_number("gamma", gamma, 0.0, 1.0)
-        _check_number("caution", caution, 0.0, 10.0)
-        _check_number("temperature", temperature, 0.0, 10.0)
+        check_number("Planner: gamma", gamma, 0.0, 1.0)
+        check_number("Planner: caution", caution, 0.0, 10.0)
+        check_number("Planner: temperature", temperature, 0.0, 10.0)
+        check_features(features, "Planner")
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
         self.log, self.task = log, as_task(task, predicates)
@@ -205,9 +208,7 @@ class Planner(ReadySelector):
         q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
 
-    def situations(
-        self, count: int, goals: int, rng: np.random.Generator
-    ) -> tuple[Array, Array]:
+    def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Draw logged observations, and states of the task that is not over in them.
 
         Args:
@@ -226,7 +227,9 @@ class Planner(ReadySelector):
         if isinstance(self.task, GoalTask) and self.task.columns is not None:
             known = np.unique(self.task.of(log.start), axis=0)
             known = known[rng.permutation(len(known))[:goals]]
-            for goal, rows in zip(known, np.array_split(np.arange(len(obs)), len(known)), strict=True):
+            for goal, rows in zip(
+                known, np.array_split(np.arange(len(obs)), len(known)), strict=True
+            ):
                 obs[rows] = self.task.put(obs[rows], goal)
         state = np.zeros((len(obs), 1 + machine.slots), np.int64)
         goes_on = np.flatnonzero(~(machine.accepting | machine.failing))
@@ -305,7 +308,7 @@ class Planner(ReadySelector):
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a ``step``: the task's state goes on."""
-        after, reward, _ = self.machine.step(_state(memory), step)
+        after, reward, _ = self.machine.step(_state(memory), own_step(step))
         changed = {"state": after[:, 0], "counters": after[:, 1:]}
         return memory | changed | self._tried.pay(memory, reward, self._gamma, last)
 
@@ -354,11 +357,3 @@ def _own_end(task: Task, graph: CallGraph) -> Array | None:
 def _known_skills(graph: CallGraph) -> list[bool]:
     """Return whether the log has a call of each skill."""
     return [bool(graph.known[graph.skill_of == i].any()) for i in range(len(graph.log.skills))]
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
-    if not real or not low <= value <= high:
-        raise DeclarationError(
-            f"Planner: {name} is {short(value)}; it must be from {low:g} to {high:g}"
-        )

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.infos import batched_infos
+from skillweave.envs.infos import OWN_REWARD, OWN_SUCCESS, SUCCESS, batched_infos
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.task import Task
@@ -19,41 +19,23 @@ from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import put_observation
 from skillweave.types import Array, Step
 
-OWN_REWARD = "env_reward"
-OWN_SUCCESS = "env_success"
-SUCCESS = "success"
-"""Keys of info."""
 OBSERVATION, TASK = "observation", "task"
 """Parts of observations that hold the task's state: what the environment gives, and that state."""
 
 
-def own_step(step: Step) -> Step:
-    """Return a step of a ``TaskEnv`` as the environment itself gave it; another is unchanged."""
-    if OWN_REWARD not in step.info:
-        return step
-    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
-    for mark in ("", "_"):  # batches mark under "_key" where a key is there
-        if mark + OWN_SUCCESS in info:
-            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
-    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
-
-
 class OwnView:
-    """What an environment itself gives, of observations and steps of its ``TaskEnv``.
+    """An environment's own observations, of those of its ``TaskEnv`` that hold the task's state.
 
     Args:
-        space: the environment's own observations.
-        observes: the observations of its ``TaskEnv`` hold the task's state.
+        space: of the environment's own observations.
     """
 
-    def __init__(self, space: gym.Space[Any], observes: bool) -> None:
-        self.space, self._observes = space, observes
+    def __init__(self, space: gym.Space[Any]) -> None:
+        self.space = space
         self._parts = obs_dtype(space).names if isinstance(space, gym.spaces.Dict) else None
 
     def obs(self, obs: Array) -> Array:
         """Return observations (n, …) without the task's state."""
-        if not self._observes:
-            return obs
         if self._parts is None:
             return np.ascontiguousarray(obs[OBSERVATION])
         own = np.empty(len(obs), obs_dtype(self.space))
@@ -73,11 +55,8 @@ class OwnView:
         return joined
 
     def step(self, step: Step) -> Step:
-        """Return a step with the environment's own observations, reward and ``info``."""
-        own = own_step(step)
-        if not self._observes:
-            return own
-        return replace(own, obs=self.obs(step.obs), next_obs=self.obs(step.next_obs))
+        """Return a step with the environment's own observations."""
+        return replace(step, obs=self.obs(step.obs), next_obs=self.obs(step.next_obs))
 
 
 @dataclass(frozen=True)
@@ -98,7 +77,7 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     ``info["success"]`` says in each step whether the task has succeeded, if it can. The reward and
     the success of the environment itself are ``info["env_reward"]`` and ``info["env_success"]``:
-    skills and planners go by these, see ``OwnView``.
+    skills and planners go by these, see ``own_step``.
 
     Args:
         env: the environment.

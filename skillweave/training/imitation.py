@@ -21,7 +21,7 @@ from skillweave.seeding import Seeds
 from skillweave.spaces import pack, to_tensor
 from skillweave.types import Array
 
-GRADIENT_STEPS = 3_000
+GRADIENT_STEPS = 2_000
 BATCH = 256
 RATE = 1e-3
 """Adam's step size at the start; it falls linearly to 0."""
