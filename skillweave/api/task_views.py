@@ -33,6 +33,11 @@ class OwnPolicy:
         space: of the observations that hold the task's state.
     """
 
+    not_exported = (
+        "acts where observations hold the state of a task, which no runner follows: export the run "
+        "that its skills are from"
+    )
+
     def __init__(self, policy: Policy, view: OwnView, space: gym.Space[Any]) -> None:
         self.policy, self._view = policy, view
         self.observation_space, self.action_space = space, policy.action_space

@@ -55,6 +55,8 @@ class States:
             PolicyError: it cannot be exported; the message has the reason, and what to do.
         """
         where = f"the policy of {name!r}" if name else "the policy"
+        if why := getattr(policy, "not_exported", ""):
+            raise PolicyError(f"{where} {why}")
         match policy:
             case HierarchyPolicy():
                 return self._hierarchy(policy, f"{name}/" if name else "", sampled)

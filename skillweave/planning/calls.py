@@ -16,6 +16,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import close_matches, shortened
 from skillweave.planning.call_file import INFO, read_calls, write_calls
+from skillweave.planning.skill_code import code_of
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.spaces import same_space
 from skillweave.types import Array, Step
@@ -243,7 +244,8 @@ class CallLog:
             if now != then:
                 raise RunError(
                     f"the skill {name!r} has changed since the log was recorded (it has learnt on, "
-                    "or its limits are others), so its calls end elsewhere now; record a new log"
+                    "or its limits or its code are others), so its calls end elsewhere now; record "
+                    "a new log"
                 )
 
     def check_spaces(self, observation: gym.Space[Any], action: gym.Space[Any]) -> None:
@@ -300,7 +302,7 @@ def join(logs: Iterable[CallLog]) -> CallLog:
             if a != b:
                 raise RunError(
                     f"the skill {name!r} differs between the logs: it has learnt in between, or "
-                    "its limits are others; join logs of the same skills"
+                    "its limits or its code are others; join logs of the same skills"
                 )
         if log.info.keys() != first.info.keys():
             raise RunError(
@@ -332,14 +334,15 @@ def join(logs: Iterable[CallLog]) -> CallLog:
 def skill_checksums(skills: SkillSet) -> tuple[str, ...]:
     """Return a checksum of each skill: its policy, the limit of its calls, and the reflexes.
 
-    Functions of the user enter by their names.
+    The user's classes and functions enter by their code, where Python has it, else by their names.
     """
     checksums = []
     for i, policy in enumerate(skills.policies):
         source = source_of(policy)
         acts = source.get("sha256") or source.get("name")
         reflexes = [reflex.name for reflex in skills.reflexes]
-        whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
+        code = code_of(skills.skills[i], policy, skills.reflexes)
+        whole = repr([acts, skills.limit(i), skills.greedy, reflexes, code])
         checksums.append(checksum(whole.encode()))
     return tuple(checksums)
 

@@ -15,13 +15,20 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
-from skillweave.planning.neighbours import SOFT, feature_maps, nearest, weights_of
+from skillweave.planning.neighbours import (
+    SOFT,
+    compared_places,
+    feature_maps,
+    nearest,
+    weights_of,
+)
 from skillweave.planning.states import PlanningStates
 from skillweave.types import Array
 
@@ -93,7 +100,7 @@ class CallGraph:
     Args:
         log: the calls.
         features: for all skills or by skill: places, or a function of observations; None: what each
-            skill sees.
+            skill sees, and what changes in most steps.
         neighbours: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
@@ -124,7 +131,9 @@ class CallGraph:
         self.log, self.neighbours, self.skills = log, neighbours, skills
         self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
-        self.maps = feature_maps(log.observation_space, features, log.sees, known, log.skills)
+        space = log.observation_space
+        places = compared_places(space, log.sees, log.before, log.next_obs)
+        self.maps = feature_maps(space, features, places, known, log.skills)
         self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
         self.known = np.array([len(rows) > 0 for rows in self._of_choice])
         """(choices,) bool: the log has a call of the choice."""
@@ -147,8 +156,9 @@ class CallGraph:
         """(E,) bool: the episode terminated there."""
         self.may = log.may_follow[call].copy()
         """(E, choices) bool: what may follow."""
-        # A call that the time limit cut would have gone on: its skill alone may follow.
-        self._cut = np.flatnonzero(log.was_cut[call] & whole & self._goes_on(call))
+        # A call that was cut would have gone on: its skill alone may follow.
+        cut = log.was_cut | (log.end_reason == CallEnd.INTERRUPTED)
+        self._cut = np.flatnonzero(cut[call] & whole & self._goes_on(call))
         own = log.choice[call[self._cut]]
         self.may[self._cut] = own[:, None] == np.arange(log.choices)
         parts = np.flatnonzero(~whole)

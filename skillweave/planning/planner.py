@@ -82,7 +82,7 @@ class Planner(ReadySelector):
             nothing is compared, and initiation sets are those that were recorded.
         features: by what calls are near one another: places in the flat observation, or a function
             of observations (n, …) to (n, F); or a dict of these by skill. None: what each skill
-            sees. They are standardised by the log.
+            sees, and what changes in most steps. They are standardised by the log.
         neighbours: K.
         gamma: γ of one step.
         caution: the share by which a value falls for each unit of distance to the nearest call.

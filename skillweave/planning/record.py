@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
@@ -111,6 +112,7 @@ def record_calls(
         raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
     if isinstance(choose, str) and choose == "explore":
         choose = Explorer()
+    skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seeds = Seeds(seed) / "calls"
     with global_generators(seeds), closing(make_engine(spec, num_envs)) as engine:
