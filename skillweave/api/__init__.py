@@ -789,7 +789,7 @@ class Run:
         """Return the skills with a selector that plans a new task on logged calls; no training.
 
         Evaluations, films and players are about the task: its reward, its end, its success. Nothing
-        is written, so ``evaluate(save=True)``, ``report`` and ``export`` are not for it.
+        is written, so ``evaluate(save=True)`` and ``report`` are not for it; ``export`` is.
 
         Args:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a

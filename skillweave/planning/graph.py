@@ -168,6 +168,11 @@ class CallGraph:
         self._depths = _by_depth(pieces.then)
         self._after: Near | None = None
 
+    @property
+    def pieces_by_choice(self) -> list[tuple[Array, Array]]:
+        """Of each choice, its pieces (m,) and the features of their starts (m, F)."""
+        return list(zip(self._of_choice, self._starts, strict=True))
+
     def near(self, obs: Array) -> Near:
         """Return the nearest pieces of each choice to observations (n, …)."""
         return self.near_features([each(obs) for each in self.maps])

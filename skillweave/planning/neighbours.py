@@ -71,7 +71,7 @@ class FeatureMap:
                     "features=, a function from observations to numbers"
                 )
             self._places = self._checked_places(features, self._codec.size)
-        raw = self._raw(known)
+        raw = self.raw(known)
         if wrong := np.flatnonzero(~np.isfinite(raw).all(0)).tolist():
             raise DeclarationError(
                 f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
@@ -90,7 +90,7 @@ class FeatureMap:
 
     def __call__(self, obs: Array) -> Array:
         """Return standardised features, (n, F) float32; constant ones are left out."""
-        raw = self._raw(obs)
+        raw = self.raw(obs)
         if not np.isfinite(raw).all():
             raise DeclarationError(
                 f"a feature of {self._who} is not finite in an observation; clip it"
@@ -98,7 +98,18 @@ class FeatureMap:
         standard = (raw[:, self._varies] - self.mean[self._varies]) * self.scale
         return np.asarray(standard, np.float32)
 
-    def _raw(self, obs: Array) -> Array:
+    @property
+    def places(self) -> list[int] | None:
+        """The places in the flat observation; None: the features are a function."""
+        return None if self._codec is None else self._places
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The numbers by which raw features are standardised, and those that are left out."""
+        return {"mean": self.mean, "scale": self.scale, "varies": self._varies}
+
+    def raw(self, obs: Array) -> Array:
+        """Return the features of observations (n, …) as they are, (n, F) float64."""
         if self._codec is not None:
             vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
             features: Array = vector[:, self._places].astype(np.float64)

@@ -130,12 +130,12 @@ class Planner(ReadySelector):
             whole_number(neighbours, "Planner: neighbours", 1),
             _skill_set(log, skills),
         )
-        self._gamma, self._caution, self._temperature = gamma, caution, temperature
+        self.gamma, self.caution, self.temperature = gamma, caution, temperature
         self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
         self._own_end = _own_end(self.task, self.graph)
         self.machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
-        self._states = PlanningStates(self.machine)
+        self.states = PlanningStates(self.machine)
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
             if not known:
                 notice(f"the log has no call of {name!r}, so the planner never calls it")
@@ -145,10 +145,12 @@ class Planner(ReadySelector):
                 f"these skills have a memory: {names}. The planner compares their calls by "
                 "observations alone"
             )
+        self.plan = Plan(np.zeros((0, 0), np.float32), 0)
+        """The plan; empty where each observation has a goal of its own."""
         if isinstance(self.task, RewardMachine):
-            self._plan = self._solve(self.task)
+            self.plan = self._solve(self.task)
         elif self.task.goal is not None:
-            self._plan_of(self.task.goal)
+            self.plan = self._plan_of(self.task.goal)
 
     # Planning
 
@@ -160,8 +162,8 @@ class Planner(ReadySelector):
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
-        judged = graph.judge(task, self._states, readings, self._gamma, self._own_end)
-        worth, sweeps = graph.solve(judged, near, may, caution=self._caution)
+        judged = graph.judge(task, self.states, readings, self.gamma, self._own_end)
+        worth, sweeps = graph.solve(judged, near, may, caution=self.caution)
         return Plan(worth, sweeps)
 
     def _plan_of(self, goal: Array) -> Plan:
@@ -191,7 +193,7 @@ class Planner(ReadySelector):
 
     def _values(self, near: Near, obs: Array, state: Array) -> Array:
         if not isinstance(self.task, GoalTask):
-            return self._values_in(self._plan, near, state)
+            return self._values_in(self.plan, near, state)
         goals = self.task.of(obs)
         values = np.empty((len(obs), self.log.choices), np.float32)
         unique, which = np.unique(goals, axis=0, return_inverse=True)
@@ -201,11 +203,11 @@ class Planner(ReadySelector):
         return values
 
     def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
-        place, share = self._states.corners(state)
+        place, share = self.states.corners(state)
         # (n, choices, K, J): the worth of each neighbour at each corner.
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
-        q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
+        q = np.where(q > 0, q / (1.0 + self.caution * near.distance), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
 
     def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -289,7 +291,7 @@ class Planner(ReadySelector):
         may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
         features = [each(obs) for each in self.graph.maps]
         near, state = self.graph.near_features(features), _state(memory)
-        logged, place = self._values(near, obs, state), self._states.place(state)
+        logged, place = self._values(near, obs, state), self.states.place(state)
         seen = self._tried.padded(features)
         memory = memory | self._tried.end(memory, seen, logged, near, place, may)
         q = self._tried.corrected(memory, seen, logged, near, place)
@@ -299,9 +301,9 @@ class Planner(ReadySelector):
     def _choose(self, q: Array, may: Array, rng: np.random.Generator | None) -> Array:
         """Return the best choices, or samples."""
         score = np.where(may, np.maximum(q, -1e30), -np.inf)  # one without a call comes last
-        if self._temperature:
+        if self.temperature:
             largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max(1, keepdims=True)
-            score = score / (self._temperature * np.maximum(largest, 1e-12))
+            score = score / (self.temperature * np.maximum(largest, 1e-12))
             score = score + (rng or np.random.default_rng()).gumbel(size=q.shape)
         choice: Array = score.argmax(1)
         return choice
@@ -310,14 +312,14 @@ class Planner(ReadySelector):
         """Return the memory after a ``step``: the task's state goes on."""
         after, reward, _ = self.machine.step(_state(memory), own_step(step))
         changed = {"state": after[:, 0], "counters": after[:, 1:]}
-        return memory | changed | self._tried.pay(memory, reward, self._gamma, last)
+        return memory | changed | self._tried.pay(memory, reward, self.gamma, last)
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its log, with the names of its task's states."""
         digest = [
             checksum(np.ascontiguousarray(x).tobytes()) for x in columns_of(self.log).values()
         ]
-        about = [digest, self.machine.state_names, self._gamma, self._caution, self._temperature]
+        about = [digest, self.machine.state_names, self.gamma, self.caution, self.temperature]
         whole = json.dumps(about)
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
