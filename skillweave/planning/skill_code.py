@@ -6,6 +6,7 @@ Stands alone because it reads Python's source, and a log only compares the resul
 from __future__ import annotations
 
 import ast
+import functools
 import inspect
 import textwrap
 from collections.abc import Callable
@@ -34,6 +35,7 @@ def code_of(skill: Skill, policy: Policy, reflexes: tuple[Reflex, ...]) -> list[
     return [_written(part) for part in (*classes, *filter(callable, functions))]
 
 
+@functools.lru_cache(maxsize=256)
 def _written(part: type | Callable[..., Any]) -> str | None:
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
