@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -68,7 +68,6 @@ from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
-from skillweave.runs.initial_policies import Learnt
 from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
@@ -222,8 +221,8 @@ class Hierarchy(Declaration):
 
     recipe: str | None = None
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
-    _starts: ClassVar[Callable[[], Mapping[str, Learnt]] | None] = None
-    """Makes the policies with which learners start, by name; None: they are given to ``train``."""
+    _starts: Any = None
+    """Function that returns the policies with which learners start, by name; None: no function."""
 
     def __repr__(self) -> str:
         names = [skill.name for skill in self.skills]
@@ -870,7 +869,7 @@ class PlannedRun(Run):
         spec, planner = self._own_spec(), self.hierarchy.selector
         assert isinstance(self.policy, HierarchyPolicy)
         assert isinstance(planner, Planner)
-        config = PPO() if algorithm is None else algorithm
+        config: Any = PPO() if algorithm is None else algorithm
         declared = Hierarchy(
             **to_train(spec, self.policy, planner, config, target_kl),
             steps=whole_number(steps, "with_selector(): steps", 1),

@@ -452,9 +452,12 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
         """Return what each skill's calls are compared by, (F,) each."""
         each, obs = [], self.runner.obs
         for i, code in enumerate(self.entry["features"]):
-            part = {k: self.data.get(f"{k}.{i}") for k in ("mean", "scale", "varies", "places")}
-            raw = self.runner.code[code](obs) if code else np.reshape(obs, (1, -1))
-            raw = np.asarray(raw if code else np.float32(raw)[:, part["places"]], "f8").ravel()
+            part: Any = {
+                k: self.data.get(f"{k}.{i}") for k in ("mean", "scale", "varies", "places")
+            }
+            raw: Any = self.runner.code[code](obs) if code else np.reshape(obs, (1, -1))
+            raw = raw if code else raw.astype("f4")[:, part["places"]]
+            raw = np.asarray(raw, "f8").ravel()
             varies = part["varies"]
             each.append(np.asarray((raw[varies] - part["mean"][varies]) * part["scale"], "f4"))
         return each
