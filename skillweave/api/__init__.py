@@ -843,7 +843,7 @@ class PlannedRun(Run):
         algorithm: AlgorithmConfig | None = None,
         *,
         steps: int = 100_000,
-        target_kl: float | None = 0.1,
+        target_kl: float | None = 0.05,
     ) -> Hierarchy:
         """Return the skills on the task, with a selector to train that starts from the plan.
 
