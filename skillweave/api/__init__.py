@@ -6,13 +6,14 @@ The three classes refer to one another, so they are one module.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from skillweave.algorithms.config import AlgorithmConfig, config_from_json
+from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import (
     Trained,
@@ -34,7 +35,7 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
-from skillweave.api.planning import mission_words, planned, untasked
+from skillweave.api.planning import mission_words, planned, start_of, to_train, untasked
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, evolving, go_on
@@ -222,6 +223,8 @@ class Hierarchy(Declaration):
 
     recipe: str | None = None
     """The place of the declaration: a shipped recipe's name or a file; written into runs."""
+    _starts: Any = None
+    """Function that returns the policies with which learners start, by name; None: no function."""
 
     def __repr__(self) -> str:
         names = [skill.name for skill in self.skills]
@@ -334,6 +337,9 @@ class Hierarchy(Declaration):
         )
         declared, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(declared, seed=seed, flat=flat, how=how)
+        begins = _directories(start_from)
+        if begins is None and self._starts is not None and flat is False:
+            begins = self._starts()
         trained = begin(
             declared,
             content | {"recipe": declared.recipe},
@@ -342,7 +348,7 @@ class Hierarchy(Declaration):
             track,
             evolve,
             cluster,
-            _directories(start_from),
+            begins,
             note,
             callback,
             resume=resume,
@@ -795,8 +801,9 @@ class Run:
 
         Args:
             steps: environment steps to record; open calls are completed, so there are a few more.
-            choose: "random": uniformly among the skills that may start; or a selector: any policy
-                over the skills, a ready selector, or a ``planning.Explorer``.
+            choose: "random": uniformly among the skills that may start; "explore": what is unlike
+                the calls so far; or a selector: any policy over the skills, a ready selector, or a
+                ``planning.Explorer``.
             num_envs: environments side by side.
             seed: of the environments and of all that is sampled; None: 0, or a new one if the run
                 has calls, so that more are recorded. With the same seed the same calls are
@@ -844,7 +851,7 @@ class Run:
         """Return the skills with a selector that plans a new task on logged calls; no training.
 
         Evaluations, films and players are about the task: its reward, its end, its success. Nothing
-        is written, so ``evaluate(save=True)``, ``report`` and ``export`` are not for it.
+        is written, so ``evaluate(save=True)`` and ``report`` are not for it; ``export`` is.
 
         Args:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
@@ -902,6 +909,46 @@ class PlannedRun(Run):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
     _mark = "-plan"
+
+    @checked_names
+    def with_selector(
+        self,
+        algorithm: AlgorithmConfig | None = None,
+        *,
+        steps: int = 100_000,
+        target_kl: float | None = 0.05,
+    ) -> Hierarchy:
+        """Return the skills on the task, with a selector to train that starts from the plan.
+
+        ```python
+        def trained(planned):
+            return planned.with_selector(steps=50_000).train("runs/mission")
+        ```
+
+        Before its training the selector learns to choose as the plan does, in logged observations;
+        then it learns by itself, and the plan guides it. Skills are not trained. The selector also
+        sees the state of the task; skills see what they saw. ``load`` of the same declaration loads
+        the run later.
+
+        Args:
+            algorithm: settings of the selector, ``PPO``; None: ``PPO()``.
+            steps: training steps of the selector.
+            target_kl: while it learns, keep the selector within this KL of the plan; None: the plan
+                is its start alone.
+
+        Raises:
+            DeclarationError: an argument is wrong, or the selector cannot start from a plan.
+        """
+        spec, planner = self._own_spec(), self.hierarchy.selector
+        assert isinstance(self.policy, HierarchyPolicy)
+        assert isinstance(planner, Planner)
+        config: Any = PPO() if algorithm is None else algorithm
+        declared = Hierarchy(
+            **to_train(spec, self.policy, planner, config, target_kl),
+            steps=whole_number(steps, "with_selector(): steps", 1),
+        )
+        declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
+        return declared
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

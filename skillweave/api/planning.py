@@ -12,26 +12,28 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import gymnasium as gym
+import numpy as np
 
+from skillweave.algorithms.config import PPO
+from skillweave.api.task_views import OwnSelector, own_skills
+from skillweave.collecting.guide import as_logits
 from skillweave.envs.make import EnvSpec
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.settings import Guide, Selection
+from skillweave.messages import short
 from skillweave.paths import SELECTOR
 from skillweave.planning import Planner, successes
 from skillweave.planning.mission_text import RESERVED
 from skillweave.planning.predicates import WORD
-from skillweave.planning.task_env import Tasked, own_step
-from skillweave.types import Memory, Policy, Step
+from skillweave.planning.task_env import OwnView, Tasked
+from skillweave.runs.initial_policies import Learnt
+from skillweave.seeding import Seeds
+from skillweave.training.imitation import imitate
+from skillweave.types import Policy
 
 D = TypeVar("D", bound=Declaration)
-
-
-class PlannedPolicy(HierarchyPolicy):
-    """Skills under a planner, which observe what the environment itself gives, not their score."""
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Return the ``memory`` after a ``step``, of the environment or of its ``TaskEnv``."""
-        return super().observe(memory, own_step(step))
 
 
 def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, HierarchyPolicy]:
@@ -47,12 +49,91 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     selector: Any = planner.among(tuple(s.name for s in skills.skills)).bind(*spaces, SELECTOR)
     hierarchy = copy.copy(declared)
     spec = untasked(declared.spec)
-    hierarchy.env = replace(spec, wrappers=(*spec.wrappers, Tasked(planner.task)))
+    hierarchy.env = tasked(spec, planner)
     hierarchy.selector = planner
     hierarchy.guide = None
     hierarchy.together = replace(declared.together, interrupt=False)
     hierarchy.selection = replace(declared.selection, target_return=None)
-    return hierarchy, PlannedPolicy(selector, skills)
+    return hierarchy, HierarchyPolicy(selector, skills)
+
+
+def tasked(spec: EnvSpec, planner: Planner, *, observe: bool = False) -> EnvSpec:
+    """Return an environment that is scored by a planner's task; see ``TaskEnv``."""
+    wrapper = Tasked(planner.task, observe)
+    # A pool would make the environment without its task.
+    return replace(spec, wrappers=(*spec.wrappers, wrapper), engine="sync", pool=None)
+
+
+def to_train(
+    spec: EnvSpec,
+    policy: HierarchyPolicy,
+    planner: Planner,
+    algorithm: Any,
+    target_kl: float | None,
+) -> dict[str, Any]:
+    """Return arguments of a ``Hierarchy`` whose selector is trained on a planner's task.
+
+    Args:
+        spec: the environment without the task.
+        policy: with the skills.
+        planner: guides the selector.
+        algorithm: settings of PPO, by which the selector learns.
+        target_kl: the KL within which it stays of the plan; None: without limit.
+    """
+    if not isinstance(algorithm, PPO):
+        raise DeclarationError(
+            f"with_selector(): algorithm is {short(algorithm)}; only a selector that learns by PPO "
+            "can start from a plan: PPO()"
+        )
+    observed = tasked(spec, planner, observe=True)
+    view = OwnView(spec.spaces.observation)
+    skills = own_skills(replace(policy.skills, interruption=None), view, observed.spaces[0])
+    guide = None
+    if target_kl is not None:
+        guide = Guide(OwnSelector(planner, view), restrict=False, target_kl=target_kl)
+    return {
+        "env": observed,
+        "skills": list(skills.skills),
+        "call_steps": skills.call_steps,
+        "selector": algorithm,
+        "reflexes": skills.reflexes,
+        "selection": Selection(call_cost=skills.call_cost, greedy_skills=skills.greedy),
+        "guide": guide,
+    }
+
+
+PAIRS = 10_000
+"""The observations, each with a state of the task, by which a selector learns to act as a plan."""
+GOALS = 64
+"""The goals that they have, where observations hold goals."""
+
+
+def start_of(
+    planner: Planner, policy: HierarchyPolicy, spec: EnvSpec, config: PPO
+) -> dict[str, Learnt]:
+    """Return the policy with which a selector starts, by its path: it chooses as the plan does.
+
+    It learns the plan's choices in logged observations, with states of the task drawn at random.
+
+    Args:
+        planner: with its log.
+        policy: with the skills.
+        spec: the environment whose observations hold the task's state.
+        config: settings of the selector.
+    """
+    seeds = Seeds(0) / "plan"
+    log = planner.log
+    obs, state = planner.situations(PAIRS, GOALS, (seeds / "pairs").numpy())
+    may = policy.skills.startable(obs)
+    may |= ~may.any(axis=1, keepdims=True)
+    chosen = np.where(may, planner.values(obs, state), -np.inf).argmax(1)
+    chances = np.exp(as_logits(np.eye(log.choices, dtype=np.float32)[chosen], may)) * may
+    view = OwnView(log.observation_space)
+    seen = view.joined(obs, planner.machine.observe(state))
+    selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds)
+    names = tuple(skill.name for skill in policy.skills.skills)
+    sha256 = selector.source()["sha256"]
+    return {SELECTOR: Learnt(selector, sha256, log.steps, None, (names, log.lengths))}
 
 
 def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,8 +24,8 @@ from skillweave.spaces import same_space
 from skillweave.training.role import Role
 
 Directory = str | Path
-Directories = Directory | Mapping[str, Directory] | None
-"""The directory of a run to start from, or such directories by the learners' names."""
+Directories = Directory | Mapping[str, Directory | Learnt] | None
+"""The directory of a run to start from, or such directories, or policies, by learners' names."""
 
 
 def starts(
@@ -48,7 +48,7 @@ def starts(
     else:
         place = _place(start_from, "start_from")
         learnt = learners_of_run(place)
-        places = dict.fromkeys(learnt, place)
+        places = dict[str, Path | str].fromkeys(learnt, place)
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
     started = record_initial_policies(content["stages"], learnt, where)
@@ -119,9 +119,9 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 
 def _learnt_by_name(
-    content: dict[str, Any], start_from: Mapping[str, Directory]
-) -> tuple[dict[str, Learnt], dict[str, Path]]:
-    """Return the policy that each named learner starts from, and the run that holds it.
+    content: dict[str, Any], start_from: Mapping[str, Directory | Learnt]
+) -> tuple[dict[str, Learnt], dict[str, Path | str]]:
+    """Return the policy that each named learner starts from, and the run that holds it, in words.
 
     Raises:
         DeclarationError: a name does not learn here.
@@ -129,7 +129,7 @@ def _learnt_by_name(
     """
     here = sorted({name for entry in content["stages"] for name in entry["learns"]})
     learnt: dict[str, Learnt] = {}
-    places: dict[str, Path] = {}
+    places: dict[str, Path | str] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     if not start_from:
         raise DeclarationError('start_from is {}; name the run of each learner: {"left": run}')
@@ -140,6 +140,9 @@ def _learnt_by_name(
                 f"start_from names {short(name)}, which does not learn here; here learn "
                 f"{', '.join(here)}.{near}"
             )
+        if isinstance(run, Learnt):
+            learnt[name], places[name] = run, "the plan"
+            continue
         place = _place(run, f"start_from[{name!r}]")
         if place not in known:
             known[place] = learners_of_run(place)
@@ -157,7 +160,7 @@ def _learnt_by_name(
 
 
 def _check_start(
-    name: str, algorithm: Algorithm, chooses: Chooses, learnt: Learnt, where: Path
+    name: str, algorithm: Algorithm, chooses: Chooses, learnt: Learnt, where: Path | str
 ) -> None:
     """Raise a RunError where a learner cannot start from its policy in another run."""
     before = learnt.policy.algorithm

@@ -27,6 +27,8 @@ class Ready(Protocol):
     """A ready selector as a guide uses it; its state is in the memory that it is given."""
 
     skills: tuple[str, ...]
+    lengths: tuple[int, ...]
+    """The lengths of calls that it chooses with skills; empty: it chooses skills alone."""
 
     @property
     def ranges(self) -> dict[str, range]:
@@ -46,11 +48,11 @@ class Ready(Protocol):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Return the skill that it chooses, (n,), and the memory after that."""
+        """Return its choices, (n,), and the memory after them."""
         ...
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """Return the probability that it chooses each skill, (n, S), and the memory after that."""
+        """Return the probability of each of its choices, (n, …), and the memory after them."""
         ...
 
     def allowed(self, memory: Memory) -> Array | None:
@@ -93,7 +95,7 @@ class ActiveGuide:
     ) -> Array:
         """Return the probability of each choice at decisions of environments ``rows`` (k,).
 
-        Of a skill's lengths all are equally likely.
+        Where it chooses no lengths, all lengths of a skill are equally likely.
 
         Args:
             obs: (k, …).
@@ -104,13 +106,13 @@ class ActiveGuide:
             (k, choices) float32, the sum of each row is 1.
         """
         own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
-        skills = len(self.selector.skills)
-        lengths = may.shape[1] // skills
+        choices = len(self.selector.skills) * max(1, len(self.selector.lengths))
+        lengths = may.shape[1] // choices
         if self.decides:
-            skill, after = self.selector.act(
+            choice, after = self.selector.act(
                 own, obs, may[:, ::lengths], deterministic=greedy, rng=rng
             )
-            chances: Array = np.eye(skills, dtype=np.float32)[skill]
+            chances: Array = np.eye(choices, dtype=np.float32)[choice]
         else:
             chances, after = self.selector.chances(own, obs, may[:, ::lengths])
         for k, v in after.items():

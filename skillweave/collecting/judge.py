@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from skillweave.envs.infos import info_rows, random_actions, reported_success
+from skillweave.envs.infos import info_rows, own_step, random_actions, reported_success
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
@@ -139,11 +139,14 @@ class JudgedBy:
 def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None = None) -> Step:
     """Return a step as a skill sees it, whose calls have their own time and limit.
 
+    Where the environment is scored by a task, a skill sees the environment's own reward.
+
     Args:
-        skill: None: there is no limit.
+        skill: None: there is no limit, and the reward is the task's.
         elapsed: (m,) steps of its calls so far, this one included.
         rows: (m,) ascending, some rows of the step; None: all.
     """
+    step = step if skill is None else own_step(step)
     every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
     at = slice(None) if every else rows
     terminated = step.terminated[at]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import action_codec
-from skillweave.types import Array
+from skillweave.types import Array, Step
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -268,13 +269,34 @@ class ActionMasks:
         return allowed
 
 
+OWN_REWARD = "env_reward"
+OWN_SUCCESS = "env_success"
+SUCCESS = "success"
+"""Keys of info: the first two where a task gives the reward and says what success is."""
+
+
+def own_step(step: Step) -> Step:
+    """Return a step of a task's environment as the environment itself gave it.
+
+    A task's environment (``planning.task_env``) has the task's reward and success, and keeps the
+    environment's own in ``info``. A step of another environment is returned unchanged.
+    """
+    if OWN_REWARD not in step.info:
+        return step
+    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
+    for mark in ("", "_"):  # batches mark under "_key" where a key is there
+        if mark + OWN_SUCCESS in info:
+            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
+    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
+
+
 def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
     """Return the success of n environments' episodes by ``info["success"]``.
 
     Returns:
         (n,) float64, NaN where an environment reports none; None: no environment reports any.
     """
-    success = np.asarray(info.get("success"))
+    success = np.asarray(info.get(SUCCESS))
     if success.shape == (n,) and success.dtype == object:  # for example None until it is known
         known = [isinstance(value, NUMBERS) for value in success]
         if not any(known):

@@ -364,6 +364,11 @@ class _Reading:
             selector = FunctionSelector(self._function(code, path))
         elif entry.get("kind") == "Automaton":
             selector = self._automaton(self._fit(AutomatonEntry, entry, path), path, names)
+        elif entry.get("kind") == "Plan":
+            raise PolicyError(
+                f"{self.file}: {path} is a plan, which only the runner beside it acts by: plan "
+                "again in Skillweave, or use Runner(path)"
+            )
         else:
             raise RunError(
                 f"{self.file}: {path}.kind is {short(entry.get('kind'))}; it must be one of "

@@ -78,7 +78,7 @@ class Runner:
 
     def made(self, entry: Any) -> Any:
         """Return the part of the policy that an entry of ``policy.json`` describes."""
-        kinds = (_Code, _Network, _Model, _Hierarchy, _Function, _Automaton)
+        kinds = (_Code, _Network, _Model, _Hierarchy, _Function, _Automaton, _Plan)
         return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
     def asks(self, name: str, about: Any) -> bool:
@@ -372,3 +372,165 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
             if self.state == origin and (asks(code, step(*when)) if code else over):
                 self.state = target
                 return
+
+
+class _Plan(_Code):  # a selector: the choice whose nearest logged calls are worth most for a task
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        super().__init__(runner, entry)
+        with np.load(runner.path / entry["file"]) as data:
+            self.data = dict(data)
+        self.skill_of, self.lengths = self.data["skill_of"], self.data["lengths"]
+        self.reset()
+
+    def reset(self) -> None:
+        self.state = self.data["machine.start"]
+        self.calls: list[Any] = []  # the latest of the episode, which count beside the logged ones
+
+    def act(self, mask: Any, last: Any = None) -> Any:
+        entry, features = self.entry, self.features()
+        (pieces, weights, far, total), (places, share) = self.near(features), self.corners()
+        q = ((self.data["worth"][pieces][..., places] * share).sum(2) * weights).sum(1)
+        q = np.where(q > 0, q / (1 + entry["caution"] * far), q)
+        q = np.where(np.isfinite(far), q, -np.inf).astype("f4")
+        may = np.ones(len(q), bool) if mask is None else mask[0]
+        here = SimpleNamespace(
+            end=features, to=places[share.argmax()], q=q, total=total, far=far, may=may
+        )
+        if self.calls:
+            self.calls[-1] = SimpleNamespace(**{**vars(self.calls[-1]), **vars(here)})
+        q = self.corrected(here)
+        score = np.where(may, np.maximum(q, -1e30), -np.inf)
+        if entry["temperature"]:
+            largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max()
+            score = score / (entry["temperature"] * max(largest, 1e-12))
+            score = score + self.runner.rng.gumbel(size=len(q))
+        choice = int(score.argmax())
+        call = SimpleNamespace(choice=choice, start=features, origin=here.to)
+        call.steps, call.reward, call.discount = 0, 0.0, 1.0
+        self.calls = [*self.calls, call][-entry["latest"] :]
+        return choice
+
+    def allowed(self, mask: Any, last: Any) -> Any:
+        return mask[0] & (np.arange(mask.shape[1]) == self.act(mask, last))
+
+    def watch(self, last: Any, *when: Any) -> None:
+        step, asks = self.runner.step(*when), self.runner.asks
+        events = [asks(code, getattr(step, {"obs": "next_obs"}.get(reads, reads), step))
+                  for code, reads in self.entry["events"]]  # fmt: skip
+        code = (self.runner.code[name] for name in self.entry["rewards"])
+        values = [0.0, *(float(np.asarray(function(step))[0]) for function in code)]
+        reward = self.advance([*events, False, True], values)
+        call = self.calls[-1]
+        call.steps += 1
+        call.reward, call.discount = (
+            call.reward + call.discount * reward,
+            call.discount * self.entry["gamma"],
+        )
+        if len(self.lengths) and last.why == LIMIT:
+            at = min(np.searchsorted(self.lengths, call.steps), len(self.lengths) - 1)
+            call.choice = last.skill * len(self.lengths) + int(at)
+
+    def advance(self, events: Any, values: Any) -> float:
+        """Move the task's state by what has happened in a step; return the reward."""
+        machine = {k[8:]: v for k, v in self.data.items() if k.startswith("machine.")}
+        q, counts = self.state[0], self.state[1:]
+        goes_on = np.array(events)[machine["counted"][q]]
+        counts = np.where(goes_on, counts + 1, 0)
+        true = [*events, *(counts >= machine["counter_steps"][q])]
+        reward = machine["each"][q] + values[machine["each_by"][q]]
+        after = q
+        for t, atoms in enumerate(machine["atoms"][q]):
+            if all(true[atom] for atom in atoms):
+                after = machine["target"][q, t]
+                reward += machine["paid"][q, t] + values[machine["paid_by"][q, t]]
+                counts = np.where(machine["keeps"][q, t], counts, 0)
+                break
+        self.state = np.array([after, *counts])
+        return float(reward)
+
+    def features(self) -> list[Any]:
+        """Return what each skill's calls are compared by, (F,) each."""
+        each, obs = [], self.runner.obs
+        for i, code in enumerate(self.entry["features"]):
+            part: Any = {
+                k: self.data.get(f"{k}.{i}") for k in ("mean", "scale", "varies", "places")
+            }
+            raw: Any = self.runner.code[code](obs) if code else np.reshape(obs, (1, -1))
+            raw = raw if code else raw.astype("f4")[:, part["places"]]
+            raw = np.asarray(raw, "f8").ravel()
+            varies = part["varies"]
+            each.append(np.asarray((raw[varies] - part["mean"][varies]) * part["scale"], "f4"))
+        return each
+
+    def near(self, features: list[Any]) -> Any:
+        """Return the nearest pieces of each choice (C, K), weights, distances, and sums (C,)."""
+        entry, data, k = self.entry, self.data, self.entry["neighbours"]
+        pieces, far = (
+            np.zeros((len(self.skill_of), k), int),
+            np.full((len(self.skill_of), k), np.inf),
+        )
+        for c, skill in enumerate(self.skill_of):
+            rows = data[f"rows.{c}"]
+            if not len(rows):
+                continue
+            distance = np.sqrt(((data[f"starts.{c}"] - features[skill]) ** 2).sum(1))
+            group = data["call"][rows]
+            tries = k * entry["ahead"] if len(np.unique(group)) < len(group) else k
+            order = np.argsort(distance, kind="stable")[:tries]
+            _, first = np.unique(group[order], return_index=True)  # the nearest of each call
+            found = order[np.sort(first)[:k]]
+            pieces[c, : len(found)], far[c, : len(found)] = rows[found], distance[found]
+        far = far.astype("f4")
+        weights = 1.0 / (np.where(np.isfinite(far), far, 1e9) + entry["soft"])
+        total = weights.sum(1)
+        return pieces, weights / total[:, None], far[:, 0], total
+
+    def corners(self) -> Any:
+        """Return the planning states around the task's state, and their shares."""
+        data, q = self.data, self.state[0]
+        levels, spacing = data["states.levels"][q], data["states.spacing"][q]
+        level = self.state[1:] / spacing
+        low = np.clip(np.floor(level), 0, np.maximum(levels - 2, 0)).astype(int)
+        up = np.where(levels > 1, np.clip(level - low, 0.0, 1.0), 0.0)
+        places, shares = [], []
+        for upper in np.ndindex(*[2] * len(levels)):
+            place, share = 0, 1.0
+            for slot, higher in enumerate(upper):
+                place = place * levels[slot] + min(low[slot] + higher, levels[slot] - 1)
+                share *= up[slot] if higher else 1.0 - up[slot]
+            places.append(data["states.first"][q] + place)
+            shares.append(share)
+        return np.array(places), np.array(shares, "f4")
+
+    def corrected(self, here: Any) -> Any:
+        """Return the values of the choices where the calls of the episode count as logged ones."""
+        entry, calls = self.entry, self.calls
+        ends = [*calls, here]
+        choice = np.array([call.choice for call in calls], int)
+        skill = self.skill_of[choice] if calls else choice
+        far = np.array([[np.sqrt(np.square(e.end[s] - c.start[s]).sum())
+                         for c, s in zip(calls, skill, strict=True)] for e in ends])  # fmt: skip
+        same = np.array([[e.to == c.origin for c in calls] for e in ends], bool)
+        same &= far <= np.array([e.far[choice] for e in ends]) + entry["slack"]
+        if not same[-1].any():
+            return here.q
+        weight = np.where(same, entry["trust"] / (far + entry["soft"]), 0.0)
+        one_hot = choice[:, None] == np.arange(len(here.q))
+        own, logged = weight @ one_hot, np.array([e.q for e in ends])
+        known, may = np.isfinite(logged), np.array([e.may for e in ends])
+        total = np.where(known, np.array([e.total for e in ends]), 0.0)
+        base = np.where(known, logged, 0.0) * total
+        both = np.where(known | (own > 0), np.maximum(total + own, 1e-12), np.inf)
+        paid = np.array([[c.reward, c.discount] for c in calls])
+
+        def best(q: Any) -> Any:
+            best = np.where(may[:-1], q[:-1], -np.inf).max(1)
+            return np.where(np.isfinite(best), best, 0.0)
+
+        value, q = best(logged), logged
+        for _ in range(entry["latest"]):
+            y = paid[:, 0] + paid[:, 1] * value
+            q = (base + (weight * y) @ one_hot) / both
+            q = np.where(~known & (own <= 0), -np.inf, q)
+            value = best(q)
+        return q[-1].astype("f4")

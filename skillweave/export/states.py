@@ -16,7 +16,9 @@ from skillweave.errors import PolicyError
 from skillweave.export.foreign import mapping_entry, model_of
 from skillweave.export.graphs import Graph, agent_graph, worth_graph
 from skillweave.export.network import ExportedNetwork
+from skillweave.export.plans import plan_entry
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.planning.planner import Planner
 from skillweave.selectors import Automaton
 from skillweave.selectors.base import function_name
 from skillweave.selectors.function import FunctionSelector
@@ -55,6 +57,8 @@ class States:
             PolicyError: it cannot be exported; the message has the reason, and what to do.
         """
         where = f"the policy of {name!r}" if name else "the policy"
+        if why := getattr(policy, "not_exported", ""):
+            raise PolicyError(f"{where} {why}")
         match policy:
             case HierarchyPolicy():
                 return self._hierarchy(policy, f"{name}/" if name else "", sampled)
@@ -234,6 +238,11 @@ class States:
                     "names": list(selector.skills),
                     "asks_last": selector.takes_last_call,
                 }
+            case Planner():
+                entry, content = plan_entry(selector, name, self._asks)
+                file = f"{name.replace('/', '.')}.npz"
+                self.files[file] = content
+                return entry | {"file": file}
             case AgentPolicy():
                 return self._network(agent_graph(selector, sampled, name), name)
             case ExportedNetwork():

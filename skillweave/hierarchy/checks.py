@@ -117,14 +117,21 @@ def check_level(level: Level) -> None:
 
 def _check_selection(level: Level) -> None:
     """Raise a DeclarationError where selector, guide and way of learning do not fit together."""
-    if level.ready_selector is None:
+    ready = level.ready_selector
+    for some in (ready, level.ready_guide):
+        if some is not None and some.lengths and some.lengths != level.lengths:
+            raise DeclarationError(
+                f"the {some.name} chooses the lengths {', '.join(map(str, some.lengths))}, so "
+                f"write call_steps=Lengths({', '.join(map(str, some.lengths))})"
+            )
+    if ready is None:
         if level.guide is not None:
             _check_guide(level, level.guide)
         return
     refused = {
         "selection.target_return is given": level.selection.target_return is not None,
         "together.interrupt is True": level.together.interrupt,
-        "call_steps are Lengths": isinstance(level.call_steps, Lengths),
+        "call_steps are Lengths": isinstance(level.call_steps, Lengths) and not ready.lengths,
         "a guide is given": level.guide is not None,
     }
     for setting, is_set in refused.items():
@@ -134,7 +141,8 @@ def _check_selection(level: Level) -> None:
 
 def _check_guide(level: Level, guide: Guide) -> None:
     """Raise a DeclarationError where a guide could not guide."""
-    _ = level.ready_guide  # raises if one of its skills does not exist
+    ready = level.ready_guide  # raises if one of its skills does not exist
+    guide_chooses_lengths = ready is not None and bool(ready.lengths)
     learns_by = type(level.selector).__name__
     if guide.target_kl is not None and not isinstance(level.selector, PPO):
         raise DeclarationError(
@@ -143,7 +151,7 @@ def _check_guide(level: Level, guide: Guide) -> None:
         )
     if not guide.restrict or isinstance(guide.selector, Automaton):
         pass
-    elif not isinstance(level.call_steps, Lengths):
+    elif not isinstance(level.call_steps, Lengths) or guide_chooses_lengths:
         raise DeclarationError(
             "the guide names one skill at each decision, so a selector that it restricts has "
             "nothing to choose: write Guide(..., restrict=False, target_kl=0.1), or let the "

@@ -88,7 +88,8 @@ def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide
     """
     if level.guide is None or (guide := level.ready_guide) is None:
         return None
-    choices, who = gym.spaces.Discrete(len(level.skills)), join(level.path, "guide")
+    choices = gym.spaces.Discrete(len(level.skills) * max(1, len(guide.lengths)))
+    who = join(level.path, "guide")
     selector = fitted(guide, observation_space, choices, who, level.spec.name)
     tells = level.guide.target_kl is not None
     return ActiveGuide(cast(ReadySelector, selector), level.guide.restrict, tells)

@@ -16,6 +16,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.call_file import INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
+from skillweave.planning.skill_code import code_of
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.spaces import same_space
 from skillweave.types import Array
@@ -136,7 +137,8 @@ class CallLog(CallColumns):
             if now != then:
                 raise RunError(
                     f"the skill {name!r} has changed since the log was recorded (it has learnt on, "
-                    "or its limits are others), so its calls end elsewhere now; record a new log"
+                    "or its limits or its code are others), so its calls end elsewhere now; record "
+                    "a new log"
                 )
 
     def check_spaces(self, observation: gym.Space[Any], action: gym.Space[Any]) -> None:
@@ -193,7 +195,7 @@ def join(logs: Iterable[CallLog]) -> CallLog:
             if a != b:
                 raise RunError(
                     f"the skill {name!r} differs between the logs: it has learnt in between, or "
-                    "its limits are others; join logs of the same skills"
+                    "its limits or its code are others; join logs of the same skills"
                 )
         if log.own_success != first.own_success:
             raise RunError(
@@ -230,7 +232,7 @@ def join(logs: Iterable[CallLog]) -> CallLog:
 def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[str, ...]:
     """Return a checksum of each skill: its policy, the limit of its calls, and the reflexes.
 
-    Functions of the user enter by their names.
+    The user's classes and functions enter by their code, where Python has it, else by their names.
 
     Args:
         learning: names of the skills that learn while their calls are recorded.
@@ -244,7 +246,8 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
         # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
         acts = source.get("sha256") or str(source.get("name")).partition(".")[2]
         reflexes = [reflex.name for reflex in skills.reflexes]
-        whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
+        code = code_of(skills.skills[i], policy, skills.reflexes)
+        whole = repr([acts, skills.limit(i), skills.greedy, reflexes, code])
         checksums.append(checksum(whole.encode()))
     return tuple(checksums)
 

@@ -12,8 +12,12 @@ from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
+from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
 from skillweave.types import Array, Memory, Memoryless
+
+PER_FEATURE = 0.25
+"""Standard deviations of each feature from which on a call is new."""
 
 
 @checked_names
@@ -24,8 +28,11 @@ class Explorer(Memoryless):
     most that can be, 1; other calls are worth what they lead to (R-max: Brafman & Tennenholtz
     2002). It plans again on the calls so far every ``every`` steps, and chooses at random before.
 
+    It looks for novelty alone: no task counts, and the value 1 has no unit.
+
     Args:
-        radius: in standard deviations of the features, over all of them.
+        radius: in standard deviations of the features, over all of them; None: a quarter of one
+            in each feature, 0.25 √F.
         features: as for ``Planner``; what makes two calls alike, a place for example.
         neighbours: K.
         gamma: γ of one step.
@@ -33,12 +40,12 @@ class Explorer(Memoryless):
         every: steps after which it plans again.
 
     Raises:
-        DeclarationError: a number is out of its range.
+        DeclarationError: a number is out of its range, or features are none.
     """
 
     def __init__(
         self,
-        radius: float = 0.25,
+        radius: float | None = None,
         *,
         features: Any = None,
         neighbours: int = 3,
@@ -46,20 +53,24 @@ class Explorer(Memoryless):
         temperature: float = 0.03,
         every: int = 4_000,
     ) -> None:
-        real = isinstance(radius, int | float) and not isinstance(radius, bool)
-        if not real or not 0 < radius < np.inf:
-            raise DeclarationError(f"Explorer: radius is {short(radius)}; it must be positive")
+        if radius is not None:
+            real = isinstance(radius, int | float) and not isinstance(radius, bool)
+            if not real or not 0 < radius < np.inf:
+                raise DeclarationError(f"Explorer: radius is {short(radius)}; it must be positive")
+        check_features(features, "Explorer")
+        check_number("Explorer: gamma", gamma, 0.0, 1.0)
+        check_number("Explorer: temperature", temperature, 1e-6, 10.0)
         self.every = whole_number(every, "Explorer: every", 1)
         self._radius, self._features, self._gamma = radius, features, gamma
         self._neighbours = whole_number(neighbours, "Explorer: neighbours", 1)
         self._temperature = temperature
         self._choices = 0
         self._graph: CallGraph | None = None
-        self._worth: Array = np.zeros(0)
+        self._worth = self._far = np.zeros(0)
 
     def begin(self, choices: int) -> None:
         """Prepare for a recording; ``choices``: of a selector, skills times lengths."""
-        self._choices = choices
+        self._choices, self._graph = choices, None
 
     def learn(self, log: CallLog) -> None:
         """Plan on the calls so far."""
@@ -69,14 +80,21 @@ class Explorer(Memoryless):
         nothing = RewardMachine({})
         readings = nothing.read(graph.log.as_steps())
         judged = graph.judge(nothing, PlanningStates(nothing), readings, self._gamma)
-        worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._radius)
+        self._far = self._radius_of(graph)
+        worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._far)
         self._graph, self._worth = graph, worth[:, 0]
+
+    def _radius_of(self, graph: CallGraph) -> Array:
+        """Return the distance from which on each choice is new, (choices,) float32."""
+        sizes = np.array([graph.maps[skill].size for skill in graph.skill_of])
+        own = PER_FEATURE * np.sqrt(sizes) if self._radius is None else self._radius
+        return np.broadcast_to(np.float32(own), sizes.shape)
 
     def new_share(self) -> float:
         """Return the share of (end of a call, choice) pairs that are new; 1 before planning."""
         if self._graph is None:
             return 1.0
-        return float((self._graph.after.distance > self._radius)[self._graph.may].mean())
+        return float((self._graph.after.distance > self._far)[self._graph.may].mean())
 
     def act(
         self,
@@ -94,7 +112,7 @@ class Explorer(Memoryless):
             return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), memory
         near = self._graph.near(obs)
         q = (self._worth[near.pieces] * near.weights).sum(2)
-        q = np.where(near.distance > self._radius, 1.0, q)
+        q = np.where(near.distance > self._far, 1.0, q)
         largest = np.maximum(np.abs(q).max(1, keepdims=True), 1e-3)
         score = q / (self._temperature * largest) + rng.gumbel(size=q.shape)
         return (score if mask is None else np.where(mask, score, -np.inf)).argmax(1), memory

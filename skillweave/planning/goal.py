@@ -131,9 +131,12 @@ def reached(function: Callable[[Array, Array], Any], goal: Any) -> Predicate:
 
 def _goal(value: Any) -> Array:
     try:
-        goal = np.atleast_1d(np.asarray(value, np.float64))
+        goal = np.atleast_1d(np.asarray(value))
     except (TypeError, ValueError) as error:
         raise DeclarationError(f"a goal is {short(value)}; give numbers: [3.0, -1.0]") from error
+    if goal.dtype.kind not in "iuf":
+        raise DeclarationError(f"a goal is {short(value)}; give numbers: [3.0, -1.0]")
+    goal = goal.astype(np.float64)
     if goal.ndim != 1 or not len(goal) or not np.isfinite(goal).all():
         raise DeclarationError(f"a goal is {short(value)}; give one row of finite numbers")
     return goal

@@ -15,13 +15,20 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
-from skillweave.planning.neighbours import SOFT, feature_maps, nearest, weights_of
+from skillweave.planning.neighbours import (
+    SOFT,
+    compared_places,
+    feature_maps,
+    nearest,
+    weights_of,
+)
 from skillweave.planning.states import PlanningStates
 from skillweave.types import Array
 
@@ -93,7 +100,7 @@ class CallGraph:
     Args:
         log: the calls.
         features: for all skills or by skill: places, or a function of observations; None: what each
-            skill sees.
+            skill sees, and what changes in most steps.
         neighbours: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
@@ -124,7 +131,9 @@ class CallGraph:
         self.log, self.neighbours, self.skills = log, neighbours, skills
         self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
-        self.maps = feature_maps(log.observation_space, features, log.sees, known, log.skills)
+        space = log.observation_space
+        places = compared_places(space, log.sees, log.before, log.next_obs)
+        self.maps = feature_maps(space, features, places, known, log.skills)
         self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
         self.known = np.array([len(rows) > 0 for rows in self._of_choice])
         """(choices,) bool: the log has a call of the choice."""
@@ -147,12 +156,22 @@ class CallGraph:
         """(E,) bool: the episode terminated there."""
         self.may = log.may_follow[call].copy()
         """(E, choices) bool: what may follow."""
+        # A call that was cut would have gone on: its skill alone may follow.
+        cut = log.was_cut | (log.end_reason == CallEnd.INTERRUPTED)
+        self._cut = np.flatnonzero(cut[call] & whole & self._goes_on(call))
+        own = log.choice[call[self._cut]]
+        self.may[self._cut] = own[:, None] == np.arange(log.choices)
         parts = np.flatnonzero(~whole)
         if len(parts) and skills is not None and skills.restricts:
             self.may[parts] = skills.startable(self.end[parts])
         self._end_features = [each(self.end) for each in self.maps]
         self._depths = _by_depth(pieces.then)
         self._after: Near | None = None
+
+    @property
+    def pieces_by_choice(self) -> list[tuple[Array, Array]]:
+        """Of each choice, its pieces (m,) and the features of their starts (m, F)."""
+        return list(zip(self._of_choice, self._starts, strict=True))
 
     def near(self, obs: Array) -> Near:
         """Return the nearest pieces of each choice to observations (n, …)."""
@@ -176,8 +195,33 @@ class CallGraph:
     def after(self) -> Near:
         """The nearest pieces to the ends of calls."""
         if self._after is None:
-            self._after = self.near_features(self._end_features)
+            self._after = self._without_own(self.near_features(self._end_features))
         return self._after
+
+    def _goes_on(self, call: Array) -> Array:
+        """Return whether other logged calls say how each of these calls would have gone on."""
+        calls = np.bincount(self.log.choice, minlength=self.log.choices)
+        return (
+            ~np.array(self.log.recurrent)[self.log.skill[call]] & (calls > 1)[self.log.choice[call]]
+        )
+
+    def _without_own(self, near: Near) -> Near:
+        """Return the neighbours where no cut call is followed by its own pieces."""
+        for c, rows in enumerate(self._of_choice):
+            call = self.end_call[self._cut]
+            cut = self._cut[self.log.choice[call] == c]
+            if not len(cut):
+                continue
+            of = self.pieces.call[rows]
+            features = self._end_features[self.skill_of[c]][cut]
+            found, far = nearest(self._starts[c], features, self.neighbours + 1, of)
+            far[of[found] == self.end_call[cut][:, None]] = np.inf
+            order = np.argsort(far, axis=1, kind="stable")[:, : self.neighbours]
+            far = np.take_along_axis(far, order, 1)
+            finite = np.where(np.isfinite(far), far, 1e9)
+            near.pieces[cut, c] = rows[np.take_along_axis(found, order, 1)]
+            near.weights[cut, c], near.distance[cut, c] = weights_of(finite), far[:, 0]
+        return near
 
     def judge(
         self,
@@ -227,7 +271,7 @@ class CallGraph:
         may: Array,
         *,
         caution: float = 0.0,
-        novel: float | None = None,
+        novel: Array | None = None,
         bonus: float = 1.0,
     ) -> tuple[Array, int]:
         """Return the worth of each piece from each planning state, (P, M), and the sweeps.
@@ -240,7 +284,8 @@ class CallGraph:
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
             caution: share by which a value falls for each unit of distance to the nearest piece.
-            novel: distance from which on a choice is new, and worth ``bonus``; None: none is.
+            novel: (choices,), the distance from which on each choice is new, and worth ``bonus``;
+                None: none is.
             bonus: its value.
         """
         count = judged.reward.shape[1]
@@ -256,7 +301,7 @@ class CallGraph:
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
-                    q = np.where((near.distance[:, c] > novel)[:, None], np.float32(bonus), q)
+                    q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(bonus), q)
                 np.maximum(best, q, out=best, where=may[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
             change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)

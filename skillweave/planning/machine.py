@@ -206,6 +206,21 @@ class RewardMachine:
         self.failing = np.isin(np.arange(count), list(plan.failing))
         """The states in which it has failed, (Q,) bool."""
 
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The machine as arrays, one row for each state, by which a runner follows it."""
+        return {
+            "counted": self._counted,
+            "counter_steps": self.counter_steps,
+            "atoms": self._atoms,
+            "target": self._target,
+            "paid": self._paid,
+            "paid_by": self._paid_by,
+            "keeps": self._keeps,
+            "each": self._each,
+            "each_by": self._each_by,
+        }
+
     def arrows_from(self, state: int) -> list[Arrow]:
         """Return the transitions from a state, in the order in which they are checked."""
         return self._by_state[state]

@@ -20,11 +20,32 @@ SOFT = 0.01
 """Distance that is added before weights are inverse distances: two equal calls count equally."""
 AHEAD = 8
 """Points that are looked at for each one that is wanted, as several may be of one group."""
+MOST_STEPS = 0.5
+"""The share of steps in which a number has to change to be compared, if a skill does not see it."""
 CONSTANT = 1e-6
 """A feature whose deviation is less, relative to its size, is constant."""
 
 Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
+
+
+def check_features(features: Any, who: str) -> None:
+    """Raise a DeclarationError where features have a wrong type; ``who`` begins the message."""
+    each = features.values() if isinstance(features, Mapping) else [features]
+    for one in each:
+        places = isinstance(one, Sequence | np.ndarray) and not isinstance(one, str | bytes)
+        if isinstance(one, type) or not (one is None or callable(one) or places):
+            raise DeclarationError(
+                f"{who}: features is {short(one)}; give places in the observation, features=[0, 1],"
+                " or a function of observations (n, …) to (n, F), or a dict of these by skill"
+            )
+
+
+def check_number(name: str, value: Any, low: float, high: float) -> None:
+    """Raise a DeclarationError where a number is no number, or out of its range."""
+    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
+    if not real or not low <= value <= high:
+        raise DeclarationError(f"{name} is {short(value)}; it must be from {low:g} to {high:g}")
 
 
 class FeatureMap:
@@ -50,7 +71,7 @@ class FeatureMap:
                     "features=, a function from observations to numbers"
                 )
             self._places = self._checked_places(features, self._codec.size)
-        raw = self._raw(known)
+        raw = self.raw(known)
         if wrong := np.flatnonzero(~np.isfinite(raw).all(0)).tolist():
             raise DeclarationError(
                 f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
@@ -69,7 +90,7 @@ class FeatureMap:
 
     def __call__(self, obs: Array) -> Array:
         """Return standardised features, (n, F) float32; constant ones are left out."""
-        raw = self._raw(obs)
+        raw = self.raw(obs)
         if not np.isfinite(raw).all():
             raise DeclarationError(
                 f"a feature of {self._who} is not finite in an observation; clip it"
@@ -77,7 +98,18 @@ class FeatureMap:
         standard = (raw[:, self._varies] - self.mean[self._varies]) * self.scale
         return np.asarray(standard, np.float32)
 
-    def _raw(self, obs: Array) -> Array:
+    @property
+    def places(self) -> list[int] | None:
+        """The places in the flat observation; None: the features are a function."""
+        return None if self._codec is None else self._places
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The numbers by which raw features are standardised, and those that are left out."""
+        return {"mean": self.mean, "scale": self.scale, "varies": self._varies}
+
+    def raw(self, obs: Array) -> Array:
+        """Return the features of observations (n, …) as they are, (n, F) float64."""
         if self._codec is not None:
             vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
             features: Array = vector[:, self._places].astype(np.float64)
@@ -110,6 +142,28 @@ class FeatureMap:
         return [int(p) for p in whole]
 
 
+def compared_places(
+    space: gym.Space[Any], sees: Sequence[Sequence[int] | None], before: Array, after: Array
+) -> tuple[Sequence[int] | None, ...]:
+    """Return the places by which calls of each skill are compared: those that it sees, and others.
+
+    The others change in most steps, as a position does. They say where a call ends, though the
+    skill does not see them: behind which wall, for example.
+
+    Args:
+        space: of the observations.
+        sees: the places that each skill sees; None: all.
+        before: (T, *obs_shape), observations before logged steps.
+        after: (T, *obs_shape), those after them.
+    """
+    if all(places is None for places in sees):
+        return tuple(sees)
+    codec = obs_codec(space)
+    first, then = (codec.split(to_tensor(x))[0].reshape(len(x), -1) for x in (before, after))
+    moves = np.flatnonzero((first != then).float().mean(0).numpy() > MOST_STEPS).tolist()
+    return tuple(None if p is None else sorted({*p, *moves}) for p in sees)
+
+
 def feature_maps(
     space: gym.Space[Any],
     features: Any,
@@ -121,7 +175,7 @@ def feature_maps(
 
     Args:
         features: for all skills, or by skill; None: what each skill sees.
-        sees: the places that each skill sees; None: all.
+        sees: the places by which each skill's calls are compared; None: all.
         known: logged observations.
         skills: names.
     """

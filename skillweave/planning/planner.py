@@ -14,6 +14,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.guide import LastCall
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.envs.infos import own_step
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
@@ -22,6 +23,7 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
+from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
 from skillweave.planning.task import Task, as_task
 from skillweave.planning.tried import Tried
@@ -80,7 +82,7 @@ class Planner(ReadySelector):
             nothing is compared, and initiation sets are those that were recorded.
         features: by what calls are near one another: places in the flat observation, or a function
             of observations (n, …) to (n, F); or a dict of these by skill. None: what each skill
-            sees. They are standardised by the log.
+            sees, and what changes in most steps. They are standardised by the log.
         neighbours: K.
         gamma: γ of one step.
         caution: the share by which a value falls for each unit of distance to the nearest call.
@@ -109,12 +111,14 @@ class Planner(ReadySelector):
         temperature: float = 0.0,
     ) -> None:
         super().__init__("planner")
-        _check_number("gamma", gamma, 0.0, 1.0)
-        _check_number("caution", caution, 0.0, 10.0)
-        _check_number("temperature", temperature, 0.0, 10.0)
+        check_number("Planner: gamma", gamma, 0.0, 1.0)
+        check_number("Planner: caution", caution, 0.0, 10.0)
+        check_number("Planner: temperature", temperature, 0.0, 10.0)
+        check_features(features, "Planner")
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
         self.log, self.task = log, as_task(task, predicates)
+        self.lengths = log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.pays:
             raise DeclarationError(
                 "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
@@ -126,12 +130,12 @@ class Planner(ReadySelector):
             whole_number(neighbours, "Planner: neighbours", 1),
             _skill_set(log, skills),
         )
-        self._gamma, self._caution, self._temperature = gamma, caution, temperature
+        self.gamma, self.caution, self.temperature = gamma, caution, temperature
         self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
         self._own_end = _own_end(self.task, self.graph)
-        self._machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
-        self._states = PlanningStates(self._machine)
+        self.machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
+        self.states = PlanningStates(self.machine)
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
             if not known:
                 notice(f"the log has no call of {name!r}, so the planner never calls it")
@@ -141,10 +145,12 @@ class Planner(ReadySelector):
                 f"these skills have a memory: {names}. The planner compares their calls by "
                 "observations alone"
             )
+        self.plan = Plan(np.zeros((0, 0), np.float32), 0)
+        """The plan; empty where each observation has a goal of its own."""
         if isinstance(self.task, RewardMachine):
-            self._plan = self._solve(self.task)
+            self.plan = self._solve(self.task)
         elif self.task.goal is not None:
-            self._plan_of(self.task.goal)
+            self.plan = self._plan_of(self.task.goal)
 
     # Planning
 
@@ -156,8 +162,8 @@ class Planner(ReadySelector):
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
-        judged = graph.judge(task, self._states, readings, self._gamma, self._own_end)
-        worth, sweeps = graph.solve(judged, near, may, caution=self._caution)
+        judged = graph.judge(task, self.states, readings, self.gamma, self._own_end)
+        worth, sweeps = graph.solve(judged, near, may, caution=self.caution)
         return Plan(worth, sweeps)
 
     def _plan_of(self, goal: Array) -> Plan:
@@ -182,12 +188,12 @@ class Planner(ReadySelector):
         Returns:
             Values; −infinity for choices of which the log has no call.
         """
-        state = self._machine.start(len(obs)) if state is None else state
+        state = self.machine.start(len(obs)) if state is None else state
         return self._values(self.graph.near(obs), obs, state)
 
     def _values(self, near: Near, obs: Array, state: Array) -> Array:
         if not isinstance(self.task, GoalTask):
-            return self._values_in(self._plan, near, state)
+            return self._values_in(self.plan, near, state)
         goals = self.task.of(obs)
         values = np.empty((len(obs), self.log.choices), np.float32)
         unique, which = np.unique(goals, axis=0, return_inverse=True)
@@ -197,12 +203,44 @@ class Planner(ReadySelector):
         return values
 
     def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
-        place, share = self._states.corners(state)
+        place, share = self.states.corners(state)
         # (n, choices, K, J): the worth of each neighbour at each corner.
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
-        q = np.where(q > 0, q / (1.0 + self._caution * near.distance), q)
+        q = np.where(q > 0, q / (1.0 + self.caution * near.distance), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
+
+    def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Draw logged observations, and states of the task that is not over in them.
+
+        Args:
+            count: how many at most.
+            goals: the most goals that they have, where observations hold goals.
+            rng: the source of chance.
+
+        Returns:
+            (n, *obs_shape), half of them where calls start or end, and (n, 1 + H).
+        """
+        log, machine = self.log, self.machine
+        ends = np.concatenate([log.start, log.end])
+        inside = rng.integers(log.steps, size=count // 2)
+        at_ends = rng.integers(len(ends), size=count - len(inside))
+        obs: Array = np.concatenate([log.next_obs[inside], ends[at_ends]])
+        if isinstance(self.task, GoalTask) and self.task.columns is not None:
+            known = np.unique(self.task.of(log.start), axis=0)
+            known = known[rng.permutation(len(known))[:goals]]
+            for goal, rows in zip(
+                known, np.array_split(np.arange(len(obs)), len(known)), strict=True
+            ):
+                obs[rows] = self.task.put(obs[rows], goal)
+        state = np.zeros((len(obs), 1 + machine.slots), np.int64)
+        goes_on = np.flatnonzero(~(machine.accepting | machine.failing))
+        state[:, 0] = rng.choice(goes_on, len(obs))
+        steps = machine.counter_steps[state[:, 0]]
+        used = steps < np.iinfo(np.int64).max
+        counted = rng.integers(np.where(used, steps, 1)) * (rng.random(steps.shape) < 0.5)
+        state[:, 1:] = counted
+        return obs, state
 
     # A ready selector
 
@@ -232,13 +270,13 @@ class Planner(ReadySelector):
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments: the task's state, and no call so far."""
-        state = self._machine.start(n)
+        state = self.machine.start(n)
         return {"state": state[:, 0], "counters": state[:, 1:], **self._tried.start(n)}
 
     @property
     def ranges(self) -> dict[str, range]:
         """Return the range of the task's states."""
-        return {"state": range(len(self._machine.state_names))}
+        return {"state": range(len(self.machine.state_names))}
 
     def act(
         self,
@@ -253,7 +291,7 @@ class Planner(ReadySelector):
         may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
         features = [each(obs) for each in self.graph.maps]
         near, state = self.graph.near_features(features), _state(memory)
-        logged, place = self._values(near, obs, state), self._states.place(state)
+        logged, place = self._values(near, obs, state), self.states.place(state)
         seen = self._tried.padded(features)
         memory = memory | self._tried.end(memory, seen, logged, near, place, may)
         q = self._tried.corrected(memory, seen, logged, near, place)
@@ -263,25 +301,25 @@ class Planner(ReadySelector):
     def _choose(self, q: Array, may: Array, rng: np.random.Generator | None) -> Array:
         """Return the best choices, or samples."""
         score = np.where(may, np.maximum(q, -1e30), -np.inf)  # one without a call comes last
-        if self._temperature:
+        if self.temperature:
             largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max(1, keepdims=True)
-            score = score / (self._temperature * np.maximum(largest, 1e-12))
+            score = score / (self.temperature * np.maximum(largest, 1e-12))
             score = score + (rng or np.random.default_rng()).gumbel(size=q.shape)
         choice: Array = score.argmax(1)
         return choice
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a ``step``: the task's state goes on."""
-        after, reward, _ = self._machine.step(_state(memory), step)
+        after, reward, _ = self.machine.step(_state(memory), own_step(step))
         changed = {"state": after[:, 0], "counters": after[:, 1:]}
-        return memory | changed | self._tried.pay(memory, reward, self._gamma)
+        return memory | changed | self._tried.pay(memory, reward, self.gamma, last)
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its log, with the names of its task's states."""
         digest = [
             checksum(np.ascontiguousarray(x).tobytes()) for x in columns_of(self.log).values()
         ]
-        about = [digest, self._machine.state_names, self._gamma, self._caution, self._temperature]
+        about = [digest, self.machine.state_names, self.gamma, self.caution, self.temperature]
         whole = json.dumps(about)
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
@@ -321,11 +359,3 @@ def _own_end(task: Task, graph: CallGraph) -> Array | None:
 def _known_skills(graph: CallGraph) -> list[bool]:
     """Return whether the log has a call of each skill."""
     return [bool(graph.known[graph.skill_of == i].any()) for i in range(len(graph.log.skills))]
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
-    if not real or not low <= value <= high:
-        raise DeclarationError(
-            f"Planner: {name} is {short(value)}; it must be from {low:g} to {high:g}"
-        )

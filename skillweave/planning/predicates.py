@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -11,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short, whole_number
 from skillweave.selectors.base import function_name
 from skillweave.skills import Skill
@@ -33,7 +34,8 @@ class Predicate:
 
     Args:
         function: of observations (n, *obs_shape), which are those after the step, or of a ``Step``;
-            it returns (n,) bool.
+            it returns (n,) bool. A Dict's observations are parts by key: ``obs["place"]`` is
+            (n, …).
         name: used in messages and texts; default: the function's name.
         reads: "obs" or "step", the function's argument. None: "step" if its first argument is
             named ``step`` or annotated ``Step``, else "obs".
@@ -92,7 +94,12 @@ class Predicate:
             raise DeclarationError(
                 f"the predicate {self.name!r} reads a step, but only an observation is known here"
             )
-        return answer(self.function, obs, len(obs), bool, "task", self.name)
+        try:
+            return answer(self.function, obs, len(obs), bool, "task", self.name)
+        except SkillError as error:
+            if (hint := _hint(error, obs)) is None:
+                raise
+            raise SkillError(f"{str(error).rstrip('.')}; {hint}") from error.__cause__
 
 
 @dataclass(frozen=True)
@@ -212,6 +219,21 @@ def _joined(
     if a.reads == b.reads == "obs":
         return Predicate(lambda obs: join(a.at(obs), b.at(obs)), name, "obs")
     return Predicate(lambda step: join(a.holds(step), b.holds(step)), name, "step")
+
+
+def _hint(error: SkillError, obs: Array) -> str | None:
+    """Return what a function that failed on observations has perhaps mistaken them for."""
+    cause = error.__cause__
+    fields = {field.name for field in dataclasses.fields(Step)}
+    if isinstance(cause, AttributeError) and cause.name in fields:
+        return (
+            "it was given observations, (n, …), as its argument is not named 'step': write "
+            "lambda step: ..., annotate it with Step, or write Predicate(function, reads='step')"
+        )
+    if obs.dtype.names and cause is not None:
+        parts = ", ".join(f"obs[{name!r}] {obs[name].shape}" for name in obs.dtype.names)
+        return f"observations of a Dict have parts by key, each of n environments: {parts}"
+    return None
 
 
 def _argument(function: Callable[[Any], Any]) -> Reads:

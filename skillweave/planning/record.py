@@ -20,6 +20,7 @@ from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError
 from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
+from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import CALL, Recorder, TraceFeed, check_size
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
@@ -87,8 +88,8 @@ def record_calls(
         env: an ``EnvSpec``, a Gymnasium id, or a function that makes an environment.
         skills: a ``HierarchyPolicy`` (``run.policy``), or its ``skills``.
         steps: environment steps to record.
-        choose: "random" (uniformly among the skills that may start), or a selector: any policy over
-            the skills, a ready selector, or an ``Explorer``.
+        choose: "random" (uniformly among the skills that may start); "explore" (``Explorer()``); or
+            a selector: any policy over the skills, a ready selector, or an ``Explorer``.
         num_envs: environments side by side.
         seed: of the environments and of all that is sampled.
         info: keys of the environment's ``info`` to record, so that tasks may read them.
@@ -106,6 +107,9 @@ def record_calls(
         )
     if isinstance(info, str):
         raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    if isinstance(choose, str) and choose == "explore":
+        choose = Explorer()
+    skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out
     spec = env if isinstance(env, EnvSpec) else EnvSpec(env)
     seeds = Seeds(seed) / "calls"
     with global_generators(seeds), closing(make_engine(spec, num_envs)) as engine:
@@ -143,8 +147,9 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
             )
         return choose
     raise DeclarationError(
-        f"choose is {short(choose)}; it must be 'random', an Explorer, a function of observations "
-        "that returns names of skills, another ready selector, or a policy over the skills"
+        f"choose is {short(choose)}; it must be 'random', 'explore', an Explorer, a function of "
+        "observations that returns names of skills, another ready selector, or a policy over the "
+        "skills"
     )
 
 

@@ -62,6 +62,11 @@ class PlanningStates:
             self.exact[:, 1 + slot] = np.round(place % levels * spacing)
             place //= levels
 
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """The levels of each counter (Q, H), their spacing, and each state's first number (Q,)."""
+        return {"levels": self._levels, "spacing": self._spacing, "first": self._first[:-1]}
+
     def corners(self, state: Array) -> tuple[Array, Array]:
         """Return the planning states around states of the task, and their weights.
 

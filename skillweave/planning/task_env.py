@@ -11,28 +11,52 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.infos import batched_infos
+from skillweave.envs.infos import OWN_REWARD, OWN_SUCCESS, SUCCESS, batched_infos
+from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.task import Task
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import put_observation
 from skillweave.types import Array, Step
 
-OWN_REWARD = "env_reward"
-OWN_SUCCESS = "env_success"
-SUCCESS = "success"
-"""Keys of info."""
+OBSERVATION, TASK = "observation", "task"
+"""Parts of observations that hold the task's state: what the environment gives, and that state."""
 
 
-def own_step(step: Step) -> Step:
-    """Return a step of a ``TaskEnv`` as the environment itself gave it; another is unchanged."""
-    if OWN_REWARD not in step.info:
-        return step
-    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
-    for mark in ("", "_"):  # batches mark under "_key" where a key is there
-        if mark + OWN_SUCCESS in info:
-            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
-    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
+class OwnView:
+    """An environment's own observations, of those of its ``TaskEnv`` that hold the task's state.
+
+    Args:
+        space: of the environment's own observations.
+    """
+
+    def __init__(self, space: gym.Space[Any]) -> None:
+        self.space = space
+        self._parts = obs_dtype(space).names if isinstance(space, gym.spaces.Dict) else None
+
+    def obs(self, obs: Array) -> Array:
+        """Return observations (n, …) without the task's state."""
+        if self._parts is None:
+            return np.ascontiguousarray(obs[OBSERVATION])
+        own = np.empty(len(obs), obs_dtype(self.space))
+        for part in self._parts:
+            own[part] = obs[part]
+        return own
+
+    def joined(self, obs: Array, state: Array) -> Array:
+        """Return the environment's observations (n, …) with the task's state (n, S)."""
+        whole = _with_task(self.space, gym.spaces.Box(0.0, 1.0, state.shape[1:], np.float32))
+        joined = np.empty(len(obs), obs_dtype(whole))
+        joined[TASK] = state
+        if self._parts is None:
+            joined[OBSERVATION] = obs
+        for part in self._parts or ():
+            joined[part] = obs[part]
+        return joined
+
+    def step(self, step: Step) -> Step:
+        """Return a step with the environment's own observations."""
+        return replace(step, obs=self.obs(step.obs), next_obs=self.obs(step.next_obs))
 
 
 @dataclass(frozen=True)
@@ -40,10 +64,12 @@ class Tasked:
     """A wrapper, for ``EnvSpec(wrappers=)``: an environment's episodes are scored by a task."""
 
     task: Task
+    observe: bool = False
+    """Observations hold the task's state."""
 
     def __call__(self, env: gym.Env[Any, Any]) -> TaskEnv:
         """Return the environment with the task's reward."""
-        return TaskEnv(env, self.task)
+        return TaskEnv(env, self.task, observe=self.observe)
 
 
 class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -52,11 +78,23 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
     ``info["success"]`` says in each step whether the task has succeeded, if it can. The reward and
     the success of the environment itself are ``info["env_reward"]`` and ``info["env_success"]``:
     skills and planners go by these, see ``own_step``.
+
+    Args:
+        env: the environment.
+        task: its task.
+        observe: observations also hold the task's state, ``RewardMachine.observe``: a Dict has a
+            part ``task`` more, other observations become a Dict of ``observation`` and ``task``.
+
+    Raises:
+        EnvError: the environment has a part or a key of ``info`` of such a name itself.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
+    def __init__(self, env: gym.Env[Any, Any], task: Task, *, observe: bool = False) -> None:
         super().__init__(env)
         self.machine = task.own() if isinstance(task, GoalTask) else task
+        self._own, self._observes = env.observation_space, observe
+        if observe:
+            self.observation_space = _with_task(self._own, self.machine.observation_space)
         self._state, self._elapsed = self.machine.start(1), 0
         self._obs = self._batch_of_one(None)
 
@@ -65,7 +103,7 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         obs, info = self.env.reset(seed=seed, options=options)
         self._state, self._elapsed = self.machine.start(1), 0
         self._obs = self._batch_of_one(obs)
-        return obs, info
+        return self._seen(obs), info
 
     def step(self, action: Any) -> Any:
         """Take a step; the reward is the task's."""
@@ -85,17 +123,43 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         )
         self._state, paid, over = self.machine.step(self._state, step)
         self._obs = after
+        for key in (OWN_REWARD, OWN_SUCCESS):
+            if key in info:
+                raise EnvError(
+                    f"info has the key {key!r}, under which a task keeps what the environment "
+                    "itself gives; let the environment use another key"
+                )
         info = {**info, OWN_REWARD: float(reward)}
         if SUCCESS in info:
             info[OWN_SUCCESS] = info.pop(SUCCESS)
         if self.machine.accepting.any():
             info[SUCCESS] = bool(self.machine.has_succeeded(self._state)[0])
-        return obs, float(paid[0]), bool(terminated or over[0]), bool(truncated), info
+        ended = bool(terminated or over[0])
+        return self._seen(obs), float(paid[0]), ended, bool(truncated), info
+
+    def _seen(self, obs: Any) -> Any:
+        """Return an observation with the task's state, if it is to be observed."""
+        if not self._observes:
+            return obs
+        own = obs if isinstance(self._own, gym.spaces.Dict) else {OBSERVATION: obs}
+        return {**own, TASK: self.machine.observe(self._state)[0]}
 
     def _batch_of_one(self, obs: Any) -> Array:
         """Return an observation as skills see it, (1, *obs_shape)."""
-        space = self.observation_space
+        space = self._own
         batch = np.zeros((1, *obs_shape(space)), obs_dtype(space))
         if obs is not None:
             put_observation(space, batch, 0, obs)
         return batch
+
+
+def _with_task(space: gym.Space[Any], task: gym.Space[Any]) -> gym.spaces.Dict:
+    """Return the space of observations that hold a task's state."""
+    if not isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({OBSERVATION: space, TASK: task})
+    if TASK in space.spaces:
+        raise EnvError(
+            f"the environment's observations have a part {TASK!r}, and the task's state would have "
+            "the same name; rename the environment's"
+        )
+    return gym.spaces.Dict({**space.spaces, TASK: task})

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.guide import LastCall
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.neighbours import SOFT
 from skillweave.types import Array, Memory
@@ -27,9 +29,8 @@ SLACK = 0.03
 class Tried:
     """The latest calls of n episodes, as arrays of a selector's memory.
 
-    Each has the choice, the features of its start (for its skill), those of its end (for every
-    skill), what it paid, γ^τ, the task's planning states before and after it, and what the log says
-    at its end.
+    Each has the choice, the features of its start and its end (for every skill), its steps, what it
+    paid, γ^τ, the task's planning states before and after it, and what the log says at its end.
 
     Args:
         graph: the logged calls.
@@ -37,6 +38,7 @@ class Tried:
 
     def __init__(self, graph: CallGraph) -> None:
         self._skill_of, self._choices = graph.skill_of, graph.log.choices
+        self._lengths = np.array(graph.log.lengths)
         self._skills = len(graph.maps)
         self._size = max(each.size for each in graph.maps)
 
@@ -46,7 +48,8 @@ class Tried:
         return {
             "tried.count": np.zeros(n, np.int64),
             "tried.choice": np.full(calls, -1),
-            "tried.start": np.zeros((*calls, self._size), np.float32),
+            "tried.steps": np.zeros(calls, np.int64),
+            "tried.start": np.zeros((*calls, self._skills, self._size), np.float32),
             "tried.end": np.zeros((*calls, self._skills, self._size), np.float32),
             "tried.reward": np.zeros(calls),
             "tried.discount": np.ones(calls),
@@ -70,7 +73,8 @@ class Tried:
         rows, slot = np.arange(len(choice)), memory["tried.count"] % LATEST
         new = {
             "tried.choice": choice,
-            "tried.start": features[rows, self._skill_of[choice]],
+            "tried.steps": 0,
+            "tried.start": features,
             "tried.reward": 0.0,
             "tried.discount": 1.0,
             "tried.from": place,
@@ -78,15 +82,33 @@ class Tried:
         }
         return _put(memory, new, rows, slot) | {"tried.count": memory["tried.count"] + 1}
 
-    def pay(self, memory: Memory, reward: Array, gamma: float) -> Memory:
-        """Add a step's rewards (n,) of the task to the running calls."""
+    def pay(self, memory: Memory, reward: Array, gamma: float, last: LastCall) -> Memory:
+        """Add a step's rewards (n,) of the task to the running calls, which ``last`` describes.
+
+        A planner that only guides did not make the choices: they are those of the selector beside
+        it.
+        """
         rows, slot = np.arange(len(reward)), (memory["tried.count"] - 1) % LATEST
         discount = memory["tried.discount"][rows, slot]
+        steps = memory["tried.steps"][rows, slot] + 1
         new = {
+            "tried.choice": self._called(memory["tried.choice"][rows, slot], steps, last),
+            "tried.steps": steps,
             "tried.reward": memory["tried.reward"][rows, slot] + discount * reward,
             "tried.discount": discount * gamma,
         }
         return _put(memory, new, rows, slot)
+
+    def _called(self, choice: Array, steps: Array, last: LastCall) -> Array:
+        """Return the choices (n,) that the calls are of, after so many of their steps."""
+        other = self._skill_of[np.maximum(choice, 0)] != last.skill
+        if not len(self._lengths):
+            return np.where(other, last.skill, choice)
+        # Which length another selector has chosen is known where the call has reached it.
+        count, at = len(self._lengths), np.searchsorted(self._lengths, steps)
+        length = np.where(other | (last.why == CallEnd.LIMIT), at, choice % count)
+        called: Array = last.skill * count + np.minimum(length, count - 1)
+        return called
 
     def end(
         self, memory: Memory, features: Array, q: Array, near: Near, place: Array, may: Array
@@ -130,7 +152,8 @@ class Tried:
         same = (states[:, :, None] == memory["tried.from"][:, None]) & (choice >= 0)[:, None]
         skill = self._skill_of[np.maximum(choice, 0)]
         to = where[np.arange(n)[:, None], :, skill].swapaxes(1, 2)  # (n, ends, calls, F)
-        far = np.sqrt(np.square(to - memory["tried.start"][:, None]).sum(3))
+        start = memory["tried.start"][np.arange(n)[:, None], np.arange(LATEST), skill]
+        far = np.sqrt(np.square(to - start[:, None]).sum(3))
         # The distance of the nearest logged call of the same choice, (n, ends, calls).
         nearest = np.concatenate([memory["tried.far"], near.distance[:, None]], 1)
         logged_far = np.take_along_axis(nearest, np.maximum(choice, 0)[:, None], 2)

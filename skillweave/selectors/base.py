@@ -21,6 +21,9 @@ class ReadySelector(Foreign):
     mask. Its whole state is its memory, with a row for each environment.
     """
 
+    lengths: tuple[int, ...] = ()
+    """The lengths of calls that it chooses with skills; empty: it chooses skills alone."""
+
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.skills: tuple[str, ...] = ()
@@ -41,13 +44,14 @@ class ReadySelector(Foreign):
         return selector
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """Return the probability of each skill where a call is over, (n, S) float32.
+        """Return the probability of each choice where a call is over, (n, choices) float32.
 
         Returns:
             The probabilities, and the memory after the choice.
         """
-        skill, after = self.act(memory, obs, mask)
-        return np.eye(len(self.skills), dtype=np.float32)[skill], after
+        choice, after = self.act(memory, obs, mask)
+        choices = len(self.skills) * max(1, len(self.lengths))
+        return np.eye(choices, dtype=np.float32)[choice], after
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""

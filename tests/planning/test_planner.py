@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import linecache
+import sys
+import types
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +18,7 @@ from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leav
 from skillweave import EnvSpec, Hierarchy, HierarchyPolicy, Lengths, evaluate
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.errors import DeclarationError, RunError
+from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import (
     CallLog,
     Explorer,
@@ -154,6 +157,38 @@ def test_nothing_follows_where_the_episode_terminated() -> None:
         at(3), neighbours=1, gamma=GAMMA, caution=0.0,
     )  # fmt: skip
     assert cut.values(np.float32([[0]]))[0, 0] == pytest.approx(GAMMA)
+
+
+@pytest.mark.parametrize("why", ["cut", "interrupted"])
+def test_a_call_that_was_cut_would_have_gone_on(why: str) -> None:
+    """From 3 "back" leads to the goal, but "go", which was cut there, goes on to where all ends."""
+    log = log_of(
+        ["go", "back"],
+        [
+            (0, [(0, [1, 2, 3], True, "cut")]),
+            (3, [(0, [4, 5, 6], True, "end")]),
+            (3, [(1, [-1], True, "own")]),
+        ],
+    )
+    if why == "interrupted":
+        first = np.arange(len(log)) == 0
+        reason = np.where(first, CallEnd.INTERRUPTED, log.end_reason).astype(np.int8)
+        log = replace(log, end_reason=reason, truncated=np.zeros(len(log), bool))
+    planner = Planner(log, at(-1), neighbours=1, gamma=GAMMA, caution=0.0)
+    q = planner.values(np.float32([[0], [3]]))
+    assert q[:, 0].tolist() == [0, 0]
+    assert q[1, 1] == pytest.approx(1.0)
+
+
+def test_a_position_that_a_skill_does_not_see_counts() -> None:
+    """A number that changes in most steps says where a call ends; the skill sees another one."""
+    calls = [
+        ((p, p % 2), [(0, [(p + 1, (p + 1) % 2), (p + 2, p % 2)], True, "own")]) for p in range(9)
+    ]
+    log = replace(log_of(["go"], calls, size=2), sees=((1,),))
+    planner = Planner(log, at(5), neighbours=1, gamma=GAMMA, caution=0.0)
+    q = planner.values(np.float32([[3, 1], [8, 0]]))[:, 0]
+    assert q[0] > q[1] == 0.0
 
 
 def test_only_what_may_follow_counts() -> None:
@@ -353,7 +388,7 @@ def test_it_chooses_lengths_when_they_are_chosen() -> None:
     choice, memory = bound.act(memory, np.float32([[4, 0, 0]]))
     assert choice[0] // 3 == 1
     memory = bound.watch(
-        memory, step_to([[0, 1, 0]]), LastCall(choice, np.int8([2]), np.zeros(1, bool))
+        memory, step_to([[0, 1, 0]]), LastCall(choice // 3, np.int8([1]), np.zeros(1, bool))
     )
     assert memory["state"].tolist() == [1]
     choice, _ = bound.act(memory, np.float32([[0, 1, 0]]))
@@ -491,6 +526,42 @@ def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
         Planner(log, has_key, skills=skill_set(call_steps=3))
 
 
+def with_end(body: str) -> SkillSet:
+    """The corridor's skills, of which one has this code, in a file as a user's is."""
+    source = f"import numpy as np\nfrom skillweave import Skill\n\n{body}"
+    name = f"written_{abs(hash(body))}.py"
+    linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+    module = types.ModuleType(f"user_{abs(hash(body))}")
+    module.__file__ = name
+    sys.modules[module.__name__] = module
+    exec(compile(source, name, "exec"), module.__dict__)
+    skills = (module.Wait(), *SKILLS[:3])
+    policies = (SKILLS[3].policy, *(s.policy for s in SKILLS[:3]))
+    return SkillSet(skills, policies)
+
+
+WAITING = """
+class Wait(Skill):
+    max_steps = 2
+    far = 3
+
+    def reward(self, step):
+        return step.reward
+
+    def termination(self, step):
+        return step.next_obs[:, 0] > self.far
+"""
+
+
+def test_a_skill_whose_code_has_changed_is_refused() -> None:
+    log = record_calls(SPEC, with_end(WAITING), 300)
+    same = WAITING.replace("far = 3", "far = 3  # places").replace("step.reward", "2 * step.reward")
+    log.check_skills(with_end(same))
+    for other in (WAITING.replace("> self", "< self"), WAITING.replace("far = 3", "far = 4")):
+        with pytest.raises(RunError, match=r"'wait' has changed .* or its code are others"):
+            log.check_skills(with_end(other))
+
+
 @pytest.mark.parametrize(
     ("how", "kind", "message"),
     [
@@ -505,6 +576,7 @@ def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
         ({"features": {"walk": [0]}}, DeclarationError, "names 'walk', which is no skill"),
         ({"features": lambda obs: obs[:, 9]}, DeclarationError, "raised IndexError"),
         ({"features": lambda obs: obs[:2]}, DeclarationError, r"returned shape \(2, 3\)"),
+        ({"features": "place"}, DeclarationError, r"features is 'place'; give places"),
         (
             {"features": lambda obs: obs * np.nan}, DeclarationError,
             "feature 0 of skill 'get_key' is not finite in the log",
@@ -518,6 +590,94 @@ def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
 def test_wrong_arguments_of_a_planner(log: CallLog, how: Any, kind: Any, message: str) -> None:
     with pytest.raises(kind, match=message):
         Planner(**({"log": log, "task": has_key} | how))
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"features": 3}, "Explorer: features is 3; give places"),
+        ({"gamma": 2}, "Explorer: gamma is 2; it must be from 0 to 1"),
+        ({"temperature": 0}, "Explorer: temperature is 0"),
+        ({"radius": 0}, "radius is 0; it must be positive"),
+    ],
+)
+def test_wrong_arguments_of_an_explorer(how: Any, message: str) -> None:
+    with pytest.raises(DeclarationError, match=message):
+        Explorer(**how)
+
+
+def test_a_word_lets_it_explore() -> None:
+    seen = record_calls(SPEC, skill_set(), 400, num_envs=4, choose="explore")
+    assert seen.steps >= 400
+
+
+class Places(gym.ObservationWrapper):  # type: ignore[type-arg]
+    """The corridor in a Dict, perhaps with a picture of it."""
+
+    def __init__(self, env: Any, picture: bool) -> None:
+        super().__init__(env)
+        spaces = {"at": gym.spaces.Box(0, 9, (1,)), "has": gym.spaces.MultiBinary(2)}
+        image = {"picture": gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)} if picture else {}
+        self.observation_space = gym.spaces.Dict(spaces | image)
+
+    def observation(self, obs: Any) -> Any:
+        numbers = {"at": obs[:1], "has": obs[1:].astype(np.int8)}
+        picture = np.full((8, 8, 1), 20 * obs[0], np.uint8)
+        return {k: (numbers | {"picture": picture})[k] for k in self.observation_space.spaces}
+
+
+def in_places(picture: bool) -> tuple[EnvSpec, SkillSet]:
+    def go(action: int) -> Any:
+        class Go(Skill):
+            name, max_steps = ("left", "stay", "right")[action], 2
+            policy = ScriptedPolicy(
+                lambda obs: np.full(len(obs), action),
+                spec.spaces.observation,
+                Corridor.action_space,
+            )
+
+        return Go()
+
+    spec = EnvSpec(lambda: Places(Corridor(), picture), engine="sync")
+    skills = (go(0), go(2))
+    return spec, SkillSet(skills, tuple(s.policy for s in skills))
+
+
+def test_observations_in_a_dict_are_planned_on() -> None:
+    spec, skills = in_places(picture=False)
+    log = record_calls(spec, skills, 1_500, num_envs=4)
+    task = Mission(lambda obs: obs["has"][:, 0] == 1, lambda obs: obs["at"][:, 0] == 4)
+    planner = Planner(log, task, skills=skills).among(("left", "right"))
+    here = log.start[:1].copy()
+    here["at"], here["has"] = 2.0, 0
+    assert planner.act(planner.start(1), here)[0].tolist() == [0]
+    with pytest.raises(SkillError, match=r"parts by key, each of n environments: obs\['at'\] \("):
+        Planner(log, lambda obs: obs[:, 0] > 3)
+    near = GoalTask(lambda obs, goal: obs["at"][:, 0] == goal[..., 0], columns=(0,))
+    with pytest.raises(DeclarationError, match="columns are places in vectors"):
+        Planner(log, near).values(here)
+
+
+def test_images_need_features() -> None:
+    spec, skills = in_places(picture=True)
+    log = record_calls(spec, skills, 600, num_envs=4)
+    task = Mission(lambda obs: obs["at"][:, 0] == 6)
+    with pytest.raises(DeclarationError, match=r"sees images, .*; give features="):
+        Planner(log, task)
+    planner = Planner(log, task, features=lambda obs: obs["at"]).among(("left", "right"))
+    assert planner.act(planner.start(1), log.start[:1])[0].tolist() == [1]
+
+
+def test_a_function_of_a_step_that_is_given_observations_is_explained(log: CallLog) -> None:
+    with pytest.raises(SkillError, match="its argument is not named 'step': write lambda step"):
+        Planner(log, lambda s: s.reward > 0)
+    Planner(log, lambda step: step.next_obs[:, KEY] == 1.0)
+
+
+def test_a_goal_is_numbers() -> None:
+    for goal in ("3", ["3"], [True], [[1.0]], []):
+        with pytest.raises(DeclarationError, match="a goal is"):
+            GoalTask(lambda obs, goal: obs[:, 0] == goal, goal=goal)
 
 
 def test_a_log_of_one_call_is_refused(log: CallLog) -> None:

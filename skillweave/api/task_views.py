@@ -1,0 +1,208 @@
+"""Skills, reflexes and selectors in an environment whose observations hold a task's state.
+
+They were made for the environment itself, so each sees its observations alone. Stands alone because
+it makes the parts of a hierarchy for other observations, and ``planning`` joins them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.collecting.guide import ActiveGuide, LastCall
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.planning.task_env import OwnView
+from skillweave.selectors import ReadySelector
+from skillweave.skills import Reflex, Skill
+from skillweave.skills.foreign_policy import source_of
+from skillweave.types import Array, Memory, Policy, Step
+
+
+class OwnPolicy:
+    """A policy that sees the environment's own observations.
+
+    Args:
+        policy: made for the environment's own observations.
+        view: returns these.
+        space: of the observations that hold the task's state.
+    """
+
+    not_exported = (
+        "acts where observations hold the state of a task, which no runner follows: export the run "
+        "that its skills are from"
+    )
+
+    def __init__(self, policy: Policy, view: OwnView, space: gym.Space[Any]) -> None:
+        self.policy, self._view = policy, view
+        self.observation_space, self.action_space = space, policy.action_space
+        self.labels = policy.labels
+        self.start, self.acting = policy.start, policy.acting
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return the policy's actions (n, …)."""
+        how: Any = {"deterministic": deterministic, "rng": rng}
+        return self.policy.act(memory, self._view.obs(obs), mask, **how)
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Let the policy notice a step."""
+        return self.policy.observe(memory, self._view.step(step))
+
+    def source(self) -> dict[str, Any]:
+        """Return the policy's source."""
+        return source_of(self.policy)
+
+
+class OwnSelector(ReadySelector):
+    """A ready selector that sees the environment's own observations; see ``OwnPolicy``."""
+
+    def __init__(self, selector: Any, view: OwnView) -> None:
+        super().__init__(selector.name)
+        self.selector, self._view = selector, view
+        self.kind, self.skills, self.lengths = selector.kind, selector.skills, selector.lengths
+
+    def among(self, skills: tuple[str, ...]) -> Self:
+        """Return a copy that chooses among the skills of these names."""
+        return self._with(self.selector.among(skills))
+
+    def bind(
+        self, observation_space: gym.Space[Any], action_space: gym.Space[Any], who: str
+    ) -> Self:
+        """Return a copy for these spaces; ``who`` begins messages."""
+        bound = self._with(self.selector.bind(self._view.space, action_space, who))
+        bound.observation_space, bound.action_space = observation_space, action_space
+        return bound
+
+    def _with(self, selector: Any) -> Self:
+        changed = copy.copy(self)
+        changed.selector, changed.skills = selector, selector.skills
+        return changed
+
+    @property
+    def ranges(self) -> dict[str, range]:
+        """Return the valid range of each index in its memory."""
+        ranges: dict[str, range] = self.selector.ranges
+        return ranges
+
+    def start(self, n: int) -> Memory:
+        """Return the selector's memory of ``n`` environments."""
+        memory: Memory = self.selector.start(n)
+        return memory
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return the selector's choices (n,)."""
+        how: Any = {"deterministic": deterministic, "rng": rng}
+        choice, after = self.selector.act(memory, self._view.obs(obs), mask, **how)
+        return choice, after
+
+    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
+        """Return the probability of each choice."""
+        chances, after = self.selector.chances(memory, self._view.obs(obs), mask)
+        return chances, after
+
+    def allowed(self, memory: Memory) -> Array | None:
+        """Return what it may choose next."""
+        allowed: Array | None = self.selector.allowed(memory)
+        return allowed
+
+    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
+        """Return the memory after a step."""
+        after: Memory = self.selector.watch(memory, self._view.step(step), last)
+        return after
+
+    def source(self) -> dict[str, Any]:
+        """Return the selector's source."""
+        source: dict[str, Any] = self.selector.source()
+        return source
+
+
+def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:
+    """Return skills, of all levels, that see the environment's own observations.
+
+    Args:
+        skills: with policies for the environment's own observations.
+        view: returns these.
+        space: of the observations that hold the task's state.
+    """
+    policies = tuple(_own_policy(policy, view, space) for policy in skills.policies)
+    cuts = skills.interruption
+    return replace(
+        skills,
+        skills=tuple(
+            _own_skill(skill, policy, view)
+            for skill, policy in zip(skills.skills, policies, strict=True)
+        ),
+        policies=policies,
+        reflexes=tuple(_own_reflex(reflex, view) for reflex in skills.reflexes),
+        interruption=cuts and replace(cuts, worth=_of_own(cuts.worth, view)),
+    )
+
+
+def _own_policy(policy: Policy, view: OwnView, space: gym.Space[Any]) -> Policy:
+    if not isinstance(policy, HierarchyPolicy):
+        return OwnPolicy(policy, view, space)
+    selector: Any = policy.selector
+    spaces = space, selector.action_space
+    if isinstance(selector, ReadySelector):
+        selector = OwnSelector(selector, view).bind(*spaces, "selector")
+    else:
+        selector = OwnPolicy(selector, view, space)
+    guide: ActiveGuide | None = policy.guide
+    if guide is not None:
+        ready: Any = guide.selector
+        guide = replace(guide, selector=OwnSelector(ready, view).bind(*spaces, "guide"))
+    return HierarchyPolicy(selector, own_skills(policy.skills, view, space), guide)
+
+
+def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
+    """Return a skill with the methods, limits and colour of another, and a ready policy."""
+
+    def of_step(method: str) -> Callable[[Any, Step], Array]:
+        asked = getattr(skill, method)
+        return lambda self, step: asked(view.step(step))
+
+    attributes: dict[str, Any] = {
+        field: getattr(skill, field)
+        for field in ("name", "max_steps", "call_steps", "color", "needs_info", "reward_changes")
+    }
+    attributes |= {
+        method: of_step(method)
+        for method in ("reward", "termination", "success")
+        if skill.defines(method)
+    }
+    if skill.defines("initiation"):
+        attributes["initiation"] = lambda self, obs: skill.initiation(view.obs(obs))
+    kind = type(type(skill).__name__, (Skill,), attributes | {"policy": policy})
+    own: Skill = kind()
+    own._path = skill._path
+    return own
+
+
+def _own_reflex(reflex: Reflex, view: OwnView) -> Reflex:
+    action = _of_own(reflex.action, view) if callable(reflex.action) else reflex.action
+    return Reflex(_of_own(reflex.condition, view), action, reflex.name)
+
+
+def _of_own(function: Callable[[Array], Array], view: OwnView) -> Callable[[Array], Array]:
+    return lambda obs: function(view.obs(obs))

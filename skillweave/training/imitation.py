@@ -1,0 +1,69 @@
+"""Imitation: a network learns the choices of another policy, before it learns by itself.
+
+Stands alone because it is a fit to given choices; all else here learns from experience.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.registry import make_algorithm
+from skillweave.errors import DeclarationError
+from skillweave.ops.distributions import mask_logits
+from skillweave.ops.optim import adam_
+from skillweave.ops.threads import torch_threads
+from skillweave.seeding import Seeds
+from skillweave.spaces import pack, to_tensor
+from skillweave.types import Array
+
+GRADIENT_STEPS = 2_000
+BATCH = 256
+RATE = 1e-3
+"""Adam's step size at the start; it falls linearly to 0."""
+
+
+def imitate(
+    config: Any, obs: Array, may: Array, chances: Array, space: gym.Space[Any], seeds: Seeds
+) -> AgentPolicy:
+    """Return a policy whose choices are as likely as given ones, by cross-entropy.
+
+    Args:
+        config: settings of PPO; the network has no memory.
+        obs: (n, *obs_shape).
+        may: (n, choices) bool, the allowed choices.
+        chances: (n, choices), the probability of each choice.
+        space: of ``obs``.
+        seeds: of the network's first weights and of the order of rows.
+
+    Raises:
+        DeclarationError: the network has a memory.
+    """
+    choices = gym.spaces.Discrete(may.shape[1])
+    algorithm: Any = make_algorithm(config, space, choices)
+    if algorithm.memory_size:
+        raise DeclarationError(
+            "a selector with a recurrent network cannot start from a plan: use a network without "
+            "memory, which sees the task's state"
+        )
+    state = algorithm.init([seeds])
+    rows = to_tensor(np.ascontiguousarray(pack(space, obs)))[None]
+    mask, wanted = torch.from_numpy(may)[None], torch.from_numpy(np.float32(chances))[None]
+    rng = (seeds / "rows").torch()
+    with torch.enable_grad(), torch_threads(1):
+        algorithm.update_obs_stats(state, rows)
+        for step in range(GRADIENT_STEPS):
+            some = torch.randint(len(obs), (min(BATCH, len(obs)),), generator=rng)
+            leaves = algorithm.layout.leaves(state.params)
+            params = algorithm.learning_params(state)
+            logits = algorithm.actor_net(leaves, algorithm.inputs(params, rows[:, some]))
+            logits = mask_logits(logits, mask[:, some])
+            loss = -(wanted[:, some] * logits.log_softmax(-1)).sum(-1).mean(1)
+            gradient = algorithm.layout.gradient(loss, leaves)
+            rate = torch.full_like(loss.detach(), RATE * (1.0 - step / GRADIENT_STEPS))
+            adam_(state.params, gradient, state.mu, state.nu, state.count, rate)
+    return AgentPolicy.of(algorithm, state)

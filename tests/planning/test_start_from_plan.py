@@ -1,0 +1,354 @@
+"""Selectors that are trained on a task that was planned: by its plan as a start, and as a guide."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from planning.logs import log_of
+from planning.steps import step_to
+from ready_selectors.chain import (
+    DOOR,
+    KEY,
+    PLACE,
+    SPEC,
+    Corridor,
+    GetKey,
+    Leave,
+    OpenDoor,
+    Wait,
+    always,
+    bound,
+    has_key,
+    hierarchy,
+)
+
+import skillweave as sw
+from skillweave.api import Run
+from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import DeclarationError, EnvError, SkillweaveError
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.networks.config import RNN, Network
+from skillweave.planning import CallLog, GoalTask, Mission, Planner, held
+from skillweave.planning.task import as_task
+from skillweave.planning.task_env import OwnView, Tasked
+from skillweave.selectors import LastCall
+from skillweave.skills import ready_policy
+from skillweave.skills.foreign_policy import fitted, made_up
+
+QUICK: dict[str, Any] = {"num_envs": 4, "n_steps": 32, "batch_size": 32, "update_epochs": 2}
+
+
+def at_four(obs: Any) -> Any:
+    return obs[:, PLACE] == 4
+
+
+def door_open(obs: Any) -> Any:
+    return obs[:, DOOR] == 1
+
+
+TASK = Mission(at_four, door_open, held(at_four, 2))
+
+
+def run_of(skills: Any = (), **how: Any) -> Run:
+    """Skills that nothing trained, under a selector that always calls the first."""
+    skills = list(skills) or [GetKey(), OpenDoor(), Leave(), Wait()]
+    first = skills[0].name
+    declared = sw.Hierarchy(
+        SPEC, skills, **{"call_steps": None, "selector": lambda obs: [first] * len(obs)} | how
+    )
+    ready = [fitted(ready_policy(s), *SPEC.spaces, s.name, "corridor") for s in skills]
+    skill_set = SkillSet(tuple(skills), tuple(ready), tuple(declared.reflexes))
+    selector = bound(declared.selector, tuple(s.name for s in skills))
+    return Run(declared, Path("runs/corridor"), HierarchyPolicy(selector, skill_set))
+
+
+@pytest.fixture(scope="module")
+def planned() -> Run:
+    run = run_of()
+    return run.plan(TASK, run.log_calls(1_500, seed=1))
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: Any) -> None:
+    """Less to imitate, as the tasks are small."""
+    monkeypatch.setattr("skillweave.training.imitation.GRADIENT_STEPS", 200)
+    monkeypatch.setattr("skillweave.api.planning.PAIRS", 1_000)
+
+
+def test_a_selector_starts_as_the_plan(planned: Run) -> None:
+    """Before any training it chooses as the plan does where the plan is played."""
+    declared = planned.with_selector(sw.PPO(**QUICK), steps=500)
+    start = declared._starts()["selector"]
+    assert start.steps == planned.hierarchy.selector.log.steps
+    view = OwnView(Corridor.observation_space)
+    obs = np.float32([[2, 0, 0], [4, 0, 0], [0, 1, 0], [5, 1, 0], [6, 1, 1]])
+    state = np.array([[0, 0], [1, 0], [1, 0], [1, 0], [2, 0]])
+    seen = view.joined(obs, TASK.observe(state))
+    may = planned.policy.skills.startable(obs)
+    chosen, _ = start.policy.act({}, seen, may)
+    q = np.where(may, planned.hierarchy.selector.values(obs, state), -np.inf)
+    assert (q[np.arange(len(q)), chosen] >= 0.95 * q.max(1)).all()
+
+
+@pytest.mark.slow
+def test_it_is_trained_and_loaded(planned: Run, tmp_path: Path) -> None:
+    declared = planned.with_selector(sw.PPO(**QUICK), steps=400)
+    run = declared.train(tmp_path / "run", seed=3, quiet=True, checkpoint_every=128)
+    score = run.evaluate(20, quiet=True)
+    assert score.success_rate is not None
+    assert score.success_rate > 0.9
+    assert score.mean == pytest.approx(score.success_rate, abs=0.1), "the reward is the task's"
+    loaded = planned.with_selector(sw.PPO(**QUICK), steps=400).load(tmp_path / "run")
+    assert loaded.evaluate(20, quiet=True).returns == score.returns
+    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert any("reference_kl" in row for row in rows), "the plan guides it"
+    more = planned.with_selector(sw.PPO(**QUICK), steps=600)
+    assert more.train(tmp_path / "run", seed=3, quiet=True, resume=True).policy is not None
+    free = planned.with_selector(sw.PPO(**QUICK), steps=100, target_kl=None)
+    assert free.guide is None
+
+
+def test_what_cannot_start_from_a_plan_is_refused(planned: Run, tmp_path: Path) -> None:
+    with pytest.raises(DeclarationError, match="only a selector that learns by PPO can start"):
+        planned.with_selector(sw.DQN())
+    with pytest.raises(DeclarationError, match="steps is 0"):
+        planned.with_selector(steps=0)
+    with pytest.raises(DeclarationError, match="target_kl"):
+        planned.with_selector(target_kl=-1.0)
+    network = Network(rnn=RNN())
+    recurrent = planned.with_selector(sw.PPO(network=network), steps=100)
+    with pytest.raises(DeclarationError, match="recurrent network cannot start from a plan"):
+        recurrent.train(tmp_path / "run", quiet=True)
+
+
+# Observations with the task's state
+
+
+class InDict(gym.ObservationWrapper):  # type: ignore[type-arg]
+    observation_space = gym.spaces.Dict(
+        {"door": gym.spaces.Discrete(2), "at": gym.spaces.Box(0, 9, (1,))}
+    )
+
+    def observation(self, obs: Any) -> Any:
+        return {"at": obs[:1], "door": int(obs[DOOR])}
+
+
+class Renamed(InDict):
+    observation_space = gym.spaces.Dict({"task": gym.spaces.Box(0, 9, (1,))})
+
+
+class Keyed(Corridor):
+    key_name = "env_reward"
+
+    def step(self, action: int) -> Any:
+        *rest, info = super().step(action)
+        return *rest, info | {self.key_name: 1.0}
+
+
+def test_an_environment_shows_the_state_of_its_task() -> None:
+    task = Mission(at_four, door_open)
+    env = Tasked(task, observe=True)(Corridor())
+    obs, _ = env.reset(seed=1)
+    assert env.observation_space.contains(obs)
+    assert obs["observation"][PLACE] != 4
+    assert obs["task"].tolist() == [1, 0, 0]
+    while obs["observation"][PLACE] != 4:
+        obs, *_ = env.step(2 if obs["observation"][PLACE] < 4 else 0)
+    assert obs["task"].tolist() == [0, 1, 0]
+    inside = as_task(Mission(lambda obs: obs["door"] == 1))
+    env = Tasked(inside, observe=True)(InDict(Corridor()))
+    obs, _ = env.reset(seed=4)
+    assert set(obs) == {"door", "at", "task"}
+    assert env.observation_space.contains(obs)
+    view = OwnView(InDict.observation_space)
+    joined = view.joined(
+        own := made_up(InDict.observation_space, 3), np.eye(3, 2, dtype=np.float32)
+    )
+    np.testing.assert_array_equal(view.obs(joined), own)
+
+
+def test_names_that_a_task_would_hide_are_refused() -> None:
+    with pytest.raises(EnvError, match="have a part 'task', and the task's state"):
+        Tasked(TASK, observe=True)(Renamed(Corridor()))
+    for key in ("env_reward", "env_success"):
+        env = Tasked(TASK)(Keyed())
+        env.unwrapped.key_name = key
+        env.reset(seed=0)
+        with pytest.raises(EnvError, match=f"info has the key '{key}'"):
+            env.step(1)
+
+
+class Watching(GetKey):
+    """Its policy, its end and its initiation see three numbers, and the corridor's own reward."""
+
+    max_steps = 5
+
+    def policy(self, obs: Any) -> Any:
+        assert obs.shape[1:] == (3,)
+        return np.zeros(len(obs), int)
+
+    def initiation(self, obs: Any) -> Any:
+        assert obs.shape[1:] == (3,)
+        return obs[:, KEY] == 0
+
+    def termination(self, step: Any) -> Any:
+        assert step.obs.shape[1:] == step.next_obs.shape[1:] == (3,)
+        assert not step.reward.any()
+        return step.next_obs[:, KEY] == 1
+
+    def success(self, step: Any) -> Any:
+        assert "env_reward" not in step.info
+        return step.next_obs[:, KEY] == 1
+
+    def reward(self, step: Any) -> Any:
+        return step.next_obs[:, KEY]
+
+
+def test_skills_see_what_they_saw(tmp_path: Path) -> None:
+    """Also reflexes, and the skills, masks and selectors of a hierarchy that is a skill."""
+    asked = []
+
+    def stays(obs: Any) -> Any:
+        asked.append(obs.shape[1:])
+        return obs[:, PLACE] == 99
+
+    pair = (OpenDoor(), Leave())
+    inner = hierarchy(
+        sw.Automaton({"on": ["open_door", "leave"], "off": ["leave"]}, {("on", "off"): "success"}),
+        skills=pair,
+    )
+
+    class Right(sw.Skill):
+        policy = inner
+        max_steps = 6
+
+    skills = [Watching(), Right(), Wait()]
+    reflexes = [sw.Reflex(stays, 1, "stays")]
+    run = run_of(skills, reflexes=reflexes, selector=lambda obs: ["wait"] * len(obs))
+    with pytest.warns(UserWarning, match="these skills have a memory: right"):
+        first = run.plan(Mission(has_key, door_open), run.log_calls(1_500, seed=1))
+    assert first.evaluate(10, quiet=True).success_rate == 1.0
+    trained = first.with_selector(sw.PPO(**QUICK), steps=200).train(tmp_path / "run", quiet=True)
+    score = trained.evaluate(10, quiet=True)
+    assert score.success_rate is not None
+    assert set(asked) == {(3,)}
+
+
+# As a guide
+
+
+@pytest.mark.slow
+def test_a_planner_guides_a_selector_that_is_trained(tmp_path: Path) -> None:
+    run = run_of()
+    planner = Planner(run.log_calls(1_500, seed=1), TASK, skills=run.policy)
+    guided = sw.Hierarchy(
+        SPEC,
+        run.hierarchy.skills,
+        call_steps=None,
+        steps=400,
+        selector=sw.PPO(**QUICK),
+        guide=sw.Guide(planner, restrict=False, target_kl=0.1),
+    )
+    trained = guided.train(tmp_path / "run", quiet=True, checkpoint_every=128)
+    rows = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert all(np.isfinite(row["reference_kl"]) for row in rows if "reference_kl" in row)
+    assert guided.load(tmp_path / "run").policy.source() == trained.policy.source()
+    restricts = sw.Guide(planner)
+    with pytest.raises(DeclarationError, match="has nothing to choose"):
+        sw.Hierarchy(SPEC, run.hierarchy.skills, call_steps=None, guide=restricts)
+
+
+@pytest.mark.slow
+def test_a_guide_that_is_a_planner_also_chooses_lengths(tmp_path: Path) -> None:
+    class Go(sw.Skill):
+        policy = always(2)
+
+    class Back(sw.Skill):
+        policy = always(0)
+
+    def declared(**how: Any) -> sw.Hierarchy:
+        return sw.Hierarchy(SPEC, [Go(), Back()], call_steps=sw.Lengths(1, 2, 4), **how)
+
+    chance = declared(steps=64, selector=sw.PPO(**QUICK)).train(tmp_path / "chance", quiet=True)
+    log = chance.log_calls(1_500, seed=0)
+    assert log.lengths == (1, 2, 4)
+    task = Mission(door_open, at_four)
+    planner = Planner(log, task, skills=chance.policy)
+    alone = declared(selector=planner).train(tmp_path / "alone", quiet=True)
+    assert max(alone.evaluate(5, quiet=True).lengths) > 0
+    planned = chance.plan(task, log)
+    assert planned.evaluate(10, quiet=True).success_rate == 1.0
+    guided = declared(
+        steps=200, selector=sw.PPO(**QUICK), guide=sw.Guide(planner, restrict=False, target_kl=0.1)
+    )
+    guided.train(tmp_path / "guided", quiet=True)
+    with pytest.raises(DeclarationError, match="has nothing to choose"):
+        declared(guide=sw.Guide(planner))
+    with pytest.raises(SkillweaveError, match="chooses the lengths 1, 2, 4, so write call_steps"):
+        sw.Hierarchy(SPEC, [Go(), Back()], selector=planner)
+
+
+def test_a_planner_that_guides_remembers_the_calls_that_were_made() -> None:
+    """Another selector calls "right", and there is a wall: "left" has not failed."""
+    calls = [(p, [(1, [p + 1], True, "limit")]) for p in range(9)]
+    calls += [(p, [(0, [p - 1], True, "limit")]) for p in range(1, 9)]
+    log = log_of(["left", "right"], calls)
+    task = Mission(lambda obs: obs[:, 0] == 0)
+    planner = Planner(log, task, neighbours=1, gamma=0.9).among(log.skills)
+    obs = np.float32([[2]])
+    memory = planner.start(1)
+    choice, memory = planner.act(memory, obs)
+    assert choice.tolist() == [0]
+    last = LastCall(np.array([1]), np.full(1, CallEnd.LIMIT, np.int8), np.zeros(1, bool))
+    memory = planner.watch(memory, step_to(obs, obs), last)
+    assert memory["tried.choice"][0, 0] == 1
+    choice, memory = planner.act(memory, obs)
+    assert choice.tolist() == [0], "what failed was not the plan's choice"
+
+
+@pytest.mark.slow
+def test_goals_that_observations_hold_are_learnt(tmp_path: Path) -> None:
+    """A selector that starts from a plan starts with many goals."""
+
+    class Aim(gym.Wrapper):  # type: ignore[type-arg]
+        observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            obs, info = self.env.reset(seed=seed)
+            self.goal = np.float32(self.env.unwrapped.np_random.integers(0, 7))
+            return np.array([obs[PLACE], self.goal]), info
+
+        def step(self, action: Any) -> Any:
+            obs, *rest = self.env.step(action)
+            return np.array([obs[PLACE], self.goal]), *rest
+
+    def near(obs: Any, goal: Any) -> Any:
+        return np.abs(obs[:, :1] - goal).max(1) < 0.5
+
+    class Left(sw.Skill):
+        max_steps = 1
+        policy = staticmethod(lambda obs: np.zeros(len(obs), int))
+
+    class Right(sw.Skill):
+        max_steps = 1
+        policy = staticmethod(lambda obs: np.full(len(obs), 2))
+
+    spec = sw.EnvSpec(lambda: Aim(Corridor()), engine="sync")
+    declared = sw.Hierarchy(
+        spec, [Left(), Right()], call_steps=None, selector=lambda obs: ["left"] * len(obs)
+    )
+    run = declared.train(tmp_path / "run", quiet=True)
+    log: CallLog = run.log_calls(3_000)
+    planned = run.plan(GoalTask(near, columns=(1,)), log, features=[0])
+    assert planned.evaluate(20, quiet=True).success_rate == 1.0
+    start = planned.with_selector(sw.PPO(**QUICK), steps=100)._starts()["selector"]
+    view = OwnView(spec.spaces.observation)
+    obs = np.float32([[1, 5], [5, 1], [3, 6], [3, 0]])
+    seen = view.joined(obs, np.float32([[1, 0]] * 4))
+    assert start.policy.act({}, seen, np.ones((4, 2), bool))[0].tolist() == [1, 0, 1, 0]
