@@ -38,6 +38,7 @@ from skillweave.api.notebook_tables import (
 from skillweave.api.planning import mission_words, planned, start_of, to_train, untasked
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
+from skillweave.api.repairing import repair
 from skillweave.api.running import begin, evolving, go_on
 from skillweave.api.starting import Directories
 from skillweave.arguments import checked_names
@@ -51,6 +52,7 @@ from skillweave.hierarchy import training
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.repair import Repair, repairs_of
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.weights import (
     open_weights,
@@ -876,6 +878,77 @@ class Run:
         planner = Planner(log, task, skills=self.policy, **settings)
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)
+
+    @checked_names
+    def repair(
+        self,
+        skill: str,
+        *,
+        after: str,
+        steps: int = 200_000,
+        run_dir: str | Path | None = None,
+        done: Mapping[str, Any] | None = None,
+        calls: int = 200,
+        seed: int = 0,
+        quiet: bool = False,
+        callback: Callback | None = None,
+        resume: bool = False,
+    ) -> Run:
+        """Train a skill on from where another one ends, and keep the result if it is better.
+
+        Half of the episodes begin after a call of the other skill; the others as usual, so that the
+        skill does not forget. Before and after, calls are recorded, and the hand-overs counted: the
+        new weights are kept if this one is clearly better and no other one clearly worse. All other
+        weights stay as they are. What was done is in ``Run.repairs``.
+
+        Args:
+            skill: the skill that fails, by its path.
+            after: the skill after which it fails, of the same selector.
+            steps: environment steps of training; measuring takes more.
+            run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
+            done: by skill, the event that a call is for, in place of the skill's ``success``; as
+                for ``planning.hand_over``. The skill learns by its own reward in any case.
+            calls: calls of the pair to measure at least, before and after.
+            seed: the root of every random stream.
+            quiet: no progress.
+            callback: as in ``Hierarchy.train``.
+            resume: finish the repair in ``run_dir``, with the run's own settings.
+
+        Returns:
+            The new run, with the repaired weights or the earlier ones.
+
+        Raises:
+            DeclarationError: no such skill, one that does not learn, one that may not start after
+                the other or needs no repair; or too few steps.
+            RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
+                something else.
+        """
+        self._check_written()
+        declared = self.hierarchy
+        assert isinstance(self.policy, HierarchyPolicy)
+        return run_of(
+            repair(
+                declared,
+                self.path,
+                self.policy,
+                skill,
+                after,
+                whole_number(steps, "steps", 1),
+                run_dir,
+                done,
+                whole_number(calls, "calls", 1),
+                whole_number(seed, "seed", 0),
+                quiet,
+                callback,
+                resume,
+            )
+        )
+
+    @property
+    def repairs(self) -> list[Repair]:
+        """The repairs of its skills, the latest last: both matrices, the reason, the result."""
+        self._check_written()
+        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
 
     def _own_spec(self) -> EnvSpec:
         """Return the environment of the hierarchy's own task."""

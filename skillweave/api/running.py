@@ -6,7 +6,7 @@ import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +30,7 @@ from skillweave.paths import AGENT
 from skillweave.planning.recorder import check_size
 from skillweave.reporting.progress import Progress
 from skillweave.runs.command_words import called_by, resume_words, saved_words
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import First, RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import copy_initial_policies
 from skillweave.runs.manifest import identity
@@ -75,10 +75,13 @@ def begin(
     callback: Callback | None = None,
     *,
     resume: bool = False,
+    base: Base | None = None,
+    done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
     """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
 
-    With ``resume``, continue what is in ``run_dir`` instead, if there is something.
+    With ``resume``, continue what is in ``run_dir`` instead, if there is something. With ``base``,
+    the stages of the manifest come after stages that are done. ``done``: as for ``training.train``.
     """
     _may_train()
     check_callback(callback)
@@ -102,6 +105,7 @@ def begin(
             stack.callback(run.close)
             return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
         learnt, origin = starts(content, start_from, roles)
+        first: First = partial(copy_initial_policies, learnt=learnt)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
         make_trackers(track, None)  # a missing extra is reported before anything is written
         if cluster is not None:
@@ -112,14 +116,29 @@ def begin(
             if isinstance(declared, Declaration):
                 flat = content["kind"] == "agent"
                 name = name if declared.name == Declaration.name else declared.name
-            run_dir = make_numbered(_run_name(content["recipe"], name, flat), place)
+            stem = _run_name(content.get("recipe"), name, flat)
+            stem += "" if base is None else f"-{base.name}"
+            run_dir = make_numbered(stem, place)
             note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
             stack.callback(_remove_if_empty, run_dir)
-        run = RunDirectory.create(
-            run_dir, content, partial(copy_initial_policies, learnt=learnt), hold=True
-        )
+        if base is not None:
+            content["stages"] = [*base.stages, *content["stages"]]
+            first = base.write
+        run = RunDirectory.create(run_dir, content, first, hold=True)
         stack.callback(run.close)
-        return go_on(declared, run, quiet, evolve, cluster, note, callback)
+        return go_on(declared, run, quiet, evolve, cluster, note, callback, done)
+
+
+@dataclass(frozen=True)
+class Base:
+    """Finished stages with which a new run begins."""
+
+    stages: Sequence[dict[str, Any]]
+    """Their entries."""
+    write: First
+    """Writes their policies into the run."""
+    name: str
+    """The word at the end of a numbered directory's name."""
 
 
 def _kept_by_populations(content: dict[str, Any]) -> str:
@@ -226,8 +245,9 @@ def go_on(
     cluster: Ray | None,
     note: str = "",
     callback: Callback | None = None,
+    done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
-    """Train what is left of a run; ``note`` is printed first."""
+    """Train what is left of a run; ``note`` is printed first. ``done``: as of ``begin``."""
     check_callback(callback)
     if not run.finished:
         _may_train()
@@ -252,7 +272,7 @@ def go_on(
         learner = make_learner(run.manifest["stages"], evolve, make)
         try:
             with global_generators(Seeds(int(run.manifest["seed"])) / "global"):
-                policy = training.train(declared, run, listeners, learner)
+                policy = training.train(declared, run, listeners, learner, done)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
     return declared, run, policy

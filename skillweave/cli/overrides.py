@@ -261,6 +261,8 @@ def _parse(name: str, text: str, hint: Any) -> Any:
             return tuple(part.strip() for part in value.split(","))
         if origin is Sequence and isinstance(value, tuple | list):
             return tuple(value)
+        if origin is tuple and isinstance(value, str) and typing.get_args(option)[0] is str:
+            return tuple(part.strip() for part in value.split(","))
         if origin is tuple and isinstance(value, tuple | list | int):
             return tuple(value) if isinstance(value, tuple | list) else (value,)
         if origin is typing.Literal and value in typing.get_args(option):

@@ -25,6 +25,9 @@ from skillweave.types import Array, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
+NAMED_SHARE = 0.5
+"""Share of the episodes that start after a call of a named skill; the others start as usual, so
+that what a skill can do from there is not forgotten."""
 
 
 class SkillCollector(Collector):
@@ -48,6 +51,8 @@ class SkillCollector(Collector):
         search_steps: reset an episode in which the skill cannot start within this many steps; None:
             it goes on.
         episode_calls: the most calls of the skill in an episode.
+        start_after: names among ``starters``; in half of the episodes a call of one of them comes
+            last before the skill starts.
     """
 
     def __init__(
@@ -60,6 +65,7 @@ class SkillCollector(Collector):
         start_calls: int = 0,
         search_steps: int | None = None,
         episode_calls: int = 1,
+        start_after: tuple[str, ...] = (),
     ) -> None:
         super().__init__(engine)
         if acting is not None:
@@ -75,7 +81,11 @@ class SkillCollector(Collector):
         if episode_calls > 1:
             self.kept["calls_made"] = np.zeros(n, np.int64)  # of the skill, in the open episode
         self._restricted = skill is not None and skill.defines("initiation")
-        self._searches = self._restricted or self._start_calls > 0
+        known = () if starters is None else (s.name for s in starters.skills)
+        self._start_after = tuple(name for name in known if name in start_after)
+        self._draws = self._start_calls > 0 or bool(self._start_after)
+        """Whether calls come first is drawn for each episode."""
+        self._searches = self._restricted or self._draws
         self._asks = self._searches or (skill is not None and skill.defines("termination"))
         """Something is asked about each step while it is made."""
         if self._searches:
@@ -83,7 +93,10 @@ class SkillCollector(Collector):
             self.kept["searched"] = np.zeros(n, np.int64)  # steps since it last might
             self.kept["found"] = np.zeros(n, bool)  # it ever might
             self.kept["calls_left"] = np.zeros(n, np.int64)  # that come first; −1: to be drawn
-            self._starters = StartPolicy(starters, n, engine.action_space)
+            if self._start_after:
+                self.kept["named"] = np.zeros(n, bool)  # the last of these calls must be named
+                self.kept["sought"] = np.zeros(n, np.int64)  # steps until one ended; −1: one has
+            self._starters = StartPolicy(starters, n, engine.action_space, self._start_after)
             self.kept |= self._starters.kept
             self.ranges |= self._starters.ranges
 
@@ -95,7 +108,7 @@ class SkillCollector(Collector):
     def like(self, engine: Engine, acting: Acting) -> SkillCollector:
         """Return a collector of the same kind over other environments."""
         starters = self._starters.skills if self._searches else None
-        how = self._start_calls, self._search_steps, self._episode_calls
+        how = self._start_calls, self._search_steps, self._episode_calls, self._start_after
         return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
 
     def _prepare(self, request: Request) -> None:
@@ -111,7 +124,7 @@ class SkillCollector(Collector):
 
     def _step(self, out: TraceWriter) -> None:
         """One step of every environment."""
-        if self._start_calls:
+        if self._draws:
             self._draw_calls()
         obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
         acted = self.acting.all(obs, mask, memory)
@@ -177,7 +190,7 @@ class SkillCollector(Collector):
             action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         if playing is not None:
             searching, action = np.flatnonzero(~playing), action.copy()
-            action[searching] = self._starters.act(searching, obs, mask, self._rng)
+            action[searching] = self._starters.act(searching, obs, mask, self._rng, self._last())
         return action, overridden
 
     def _search(self, step: Step, searching: Array) -> None:
@@ -185,10 +198,39 @@ class SkillCollector(Collector):
         over = (step.terminated | step.truncated)[searching]
         self._begin_anew(searching[over])
         ids = searching[~over]
+        last, is_named = self._last(), self._never
+        if last is not None:
+            is_named = is_named.copy()
+            is_named[ids] = self._starters.named(ids)
         free = self._starters.observe(ids, seen_by(None, step, step.elapsed[ids], ids))
         left = self.kept["calls_left"]
         left[free] = np.maximum(left[free] - 1, 0)
+        if last is not None:
+            left[ids[last[ids] & ~is_named[ids]]] = 1  # another call must follow
+            self._seek(ids)
         self._give_up(self._look(ids))
+
+    def _last(self) -> Array | None:
+        """Return where the next call must be a named skill's, (N,) bool; None: nowhere."""
+        if not self._start_after:
+            return None
+        last: Array = self.kept["named"] & (self.kept["calls_left"] == 1)
+        return last
+
+    def _seek(self, ids: Array) -> None:
+        """Count the steps in environments ``ids`` (k,) until a call of a named skill has ended."""
+        sought = self.kept["sought"]
+        named = ids[self.kept["named"][ids]]
+        sought[named[self.kept["calls_left"][named] == 0]] = -1
+        sought[named] += sought[named] >= 0
+        if sought.max() > PATIENCE and sought.min() >= 0:
+            assert self.skill is not None
+            names = " or ".join(map(repr, self._start_after))
+            raise TrainingError(
+                f"skill {self.skill.name!r} is to start after a call of {names} (start_calls), but "
+                f"none has ended in {PATIENCE:,} steps: perhaps its initiation() is never true, or "
+                "its calls have no limit. Give it max_steps, or leave it out of start_calls"
+            )
 
     def _ends(self, raw: RawStep, step: Step | None, playing: Array | None) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
@@ -245,18 +287,24 @@ class SkillCollector(Collector):
         """Draw how many calls of others come first, where an episode has just started."""
         ids = np.flatnonzero(self.kept["calls_left"] < 0)
         if len(ids):
-            self.kept["calls_left"][ids] = self._rng.integers(self._start_calls + 1, size=len(ids))
+            left = self._rng.integers(self._start_calls + 1, size=len(ids))
+            if self._start_after:
+                named = self._rng.random(len(ids)) < NAMED_SHARE
+                self.kept["named"][ids] = named
+                left += named
+            self.kept["calls_left"][ids] = left
             self._look(ids)
 
     def _forget(self, ids: Array) -> None:
-        counted = {k: self.kept[k][ids] for k in ("searched", "found") if self._searches}
+        keys = ("searched", "found", "sought")
+        counted = {k: self.kept[k][ids] for k in keys if k in self.kept}
         super()._forget(ids)
         if self._searches:
             for name, value in counted.items():  # they count on from episode to episode
                 self.kept[name][ids] = value
             self.kept["searching"][ids] = True
             self._starters.stop(ids)
-            if self._start_calls:
+            if self._draws:
                 self.kept["calls_left"][ids] = -1
             else:
                 self._look(ids)

@@ -5,6 +5,7 @@ Stands alone because it acts, and a collector records.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -23,18 +24,28 @@ from skillweave.types import Array, Memory, Step, prefixed
 class StartPolicy:
     """Calls skills at random wherever they may start; acts at random where none may.
 
-    The skills sample, as a greedy skill may go round in circles forever.
+    The skills sample, as a greedy skill may go round in circles forever. Where skills are named,
+    all act as a selector lets them act, because their ends are the states to learn in.
 
     Args:
         skills: that can act already; None: there are none.
         num_envs: N.
         action_space: of one environment.
+        named: names among ``skills``, of which one may have to be called last.
     """
 
     def __init__(
-        self, skills: SkillSet | None, num_envs: int, action_space: gym.Space[Any]
+        self,
+        skills: SkillSet | None,
+        num_envs: int,
+        action_space: gym.Space[Any],
+        named: Collection[str] = (),
     ) -> None:
-        self.skills = None if skills is None else replace(skills, greedy=False)
+        self.skills = skills
+        if skills is not None and not named:
+            self.skills = replace(skills, greedy=False)
+        names = () if skills is None else (skill.name for skill in skills.skills)
+        self._is_named = np.array([name in named for name in names], bool)
         self._space = action_space
         self.kept: dict[str, Array] = {}
         """Its state in each environment, (N, …) each; changed in place."""
@@ -46,11 +57,22 @@ class StartPolicy:
             self.kept = prefixed("starters", self._calls)
             self.ranges = prefixed("starters", ranges_of(self._player))
 
-    def act(self, ids: Array, obs: Array, mask: Array | None, rng: np.random.Generator) -> Array:
-        """Return actions (k, …) in environments ``ids`` (k,); obs and mask are of all N."""
+    def act(
+        self,
+        ids: Array,
+        obs: Array,
+        mask: Array | None,
+        rng: np.random.Generator,
+        last: Array | None = None,
+    ) -> Array:
+        """Return actions (k, …) in environments ``ids`` (k,); obs and mask are of all N.
+
+        Args:
+            last: (N,) bool, the next call is to be one of a named skill, if one may start.
+        """
         if self.skills is None:
             return random_actions(self._space, len(ids), rng, allowed_rows(mask, ids))
-        self._call(ids[~self._runs(ids)], obs, rng)
+        self._call(ids[~self._runs(ids)], obs, rng, last)
         runs = self._runs(ids)
         called, free = ids[runs], ids[~runs]
         action: Array = np.empty((len(ids), *self._space.shape), self._space.dtype)  # type: ignore[misc]
@@ -81,6 +103,11 @@ class StartPolicy:
         end = self._player.observe(self._calls, called, part)
         return np.concatenate([ids[~runs], called[end != RUNNING]])
 
+    def named(self, ids: Array) -> Array:
+        """Return whether the open call in environments ``ids`` (k,) is a named skill's, (k,)."""
+        is_named: Array = self._runs(ids) & self._is_named[self._calls["skill"][ids]]
+        return is_named
+
     def stop(self, ids: Array) -> None:
         """End the calls in environments ``ids`` (k,): the skill starts, or an episode."""
         if self.skills is not None:
@@ -91,12 +118,18 @@ class StartPolicy:
         runs: Array = self._calls["end"][ids] == RUNNING
         return runs
 
-    def _call(self, ids: Array, obs: Array, rng: np.random.Generator) -> None:
+    def _call(
+        self, ids: Array, obs: Array, rng: np.random.Generator, last: Array | None = None
+    ) -> None:
         """Start calls in environments ``ids`` (k,) where some skill may start."""
         assert self.skills is not None
         if not len(ids):
             return
         may = self.skills.startable(obs[ids])
+        if last is not None:
+            is_named = np.repeat(self._is_named, may.shape[1] // len(self._is_named))
+            restricted = last[ids] & (may & is_named).any(axis=1)
+            may = np.where(restricted[:, None], may & is_named, may)
         chance = np.where(may, rng.random(may.shape), -1.0)
         some = may.any(axis=1)
         self._player.begin(self._calls, ids[some], chance[some].argmax(axis=1))

@@ -11,7 +11,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
-from skillweave.messages import short
+from skillweave.messages import close_matches, short
 from skillweave.paths import name_of
 from skillweave.selectors import Automaton
 from skillweave.settings import fitted
@@ -113,6 +113,7 @@ def check_level(level: Level) -> None:
     """Raise a DeclarationError where the settings of a hierarchy do not fit together."""
     _check_selection(level)
     _check_calls(level)
+    _check_start_calls(level)
 
 
 def _check_selection(level: Level) -> None:
@@ -179,6 +180,17 @@ def _check_calls(level: Level) -> None:
             raise DeclarationError(
                 f"call_steps is None, but skill {skill.name!r} never ends by itself: give it "
                 "max_steps or termination()"
+            )
+
+
+def _check_start_calls(level: Level) -> None:
+    """Raise a DeclarationError where ``apart.start_calls`` names no skill of the level."""
+    calls = level.apart.start_calls
+    for name in calls if isinstance(calls, tuple) else ():
+        if name not in level.names:
+            raise DeclarationError(
+                f"apart.start_calls names {short(name)}, which is no skill here; there are: "
+                f"{', '.join(level.names)}.{close_matches(name, level.names)}"
             )
 
 

@@ -246,7 +246,7 @@ def _apart(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list[Stage
 
 def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
     """Return the stage in which one skill of a level trains."""
-    role, apart = roles[path], level.apart
+    role, apart, calls = roles[path], level.apart, level.apart.start_calls
     assert role.config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
@@ -257,9 +257,10 @@ def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
             role,
             level.reflexes,
             level.skill_set(others) if others else None,
-            apart.start_calls or 0,
+            0 if isinstance(calls, tuple) else calls or 0,
             apart.search_steps,
             apart.episode_calls,
+            calls if isinstance(calls, tuple) else (),
         )
 
     target = check_target(level.skills[path])

@@ -9,6 +9,11 @@ from skillweave.errors import DeclarationError
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
+StartCalls = (
+    AtLeastOne | Annotated[tuple[str, ...], Check("names of skills: ('left',)", bool)] | None
+)
+"""Calls that come before a skill starts, while it trains."""
+
 GuideValue = Annotated[
     ReadyValue,
     Check("a function of observations, an Automaton or a tree", lambda x: not isinstance(x, type)),
@@ -31,10 +36,11 @@ class Apart:
     selector_steps: AtLeastOne | None = None
     """Training steps of the selector; None: its share, twice that of a skill. A ready selector
     takes none."""
-    start_calls: AtLeastOne | None = None
+    start_calls: StartCalls = None
     """While a skill trains, its episodes begin after up to this many calls of the skills that can
     act already, a number drawn for each episode: it learns in the states in which it will be
-    called. None: it starts as soon as it may."""
+    called. Or names: half of its episodes begin after a call of one of these skills, if it can act
+    already; the others begin as usual. None: it starts as soon as it may."""
     search_steps: AtLeastOne | None = None
     """Reset an episode in which the skill cannot start within this many steps. For environments of
     several kinds, where some have nothing for the skill. None: the episode goes on."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.algorithms.config import AlgorithmConfig
@@ -12,13 +12,14 @@ from skillweave.hierarchy.assembly import assembled, can_act
 from skillweave.hierarchy.checks import check_nested
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.fitting import ready_policies, ready_selectors
+from skillweave.hierarchy.repair import judge_repair, repair_stage
 from skillweave.hierarchy.roles import Level, Roles, roles_of
 from skillweave.hierarchy.schedule import budgets_of, level_stages, stages_of
 from skillweave.hierarchy.select_best import resolve_greedy, select_best
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.paths import SELECTOR, level_of
-from skillweave.runs.command_words import resume_words
+from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
@@ -100,8 +101,13 @@ def train(
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
     make_learner: MakeLearner = agents_of,
+    done: Mapping[str, Any] | None = None,
 ) -> Policy:
-    """Train, or finish training, the stages of a run; return the policy."""
+    """Train, or finish training, the stages of a run; return the policy.
+
+    Args:
+        done: the events by which a repair is judged, as for ``planning.hand_over``.
+    """
     if run.manifest["kind"] == "agent":
         agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
         (stage,) = agent.stages()
@@ -121,7 +127,34 @@ def train(
         if len(apart) < len(stages):
             after = train_stages(stages[len(apart) :], run, listeners, policies, make_learner)
             policies = select_best(roles, level, run, listeners, policies, after)
+    policies = _repaired(roles, run, listeners, policies, make_learner, done)
     return assembled(resolve_greedy(roles, run), policies)
+
+
+def _repaired(
+    roles: Roles,
+    run: RunDirectory,
+    listeners: tuple[Listener, ...],
+    policies: Policies,
+    make_learner: MakeLearner,
+    done: Mapping[str, Any] | None,
+) -> Policies:
+    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+    roles = resolve_greedy(roles, run)
+    for entry in run.manifest["stages"]:
+        if "repair" not in entry:
+            continue
+        if "kept" not in entry and entry["repair"]["done"] and done is None:
+            raise RunError(
+                f"{run.path}: the repair is judged by done= of "
+                f"{', '.join(entry['repair']['done'])}, which is code: "
+                f"continue it by {repair_words(entry['repair'], run)}"
+            )
+        after = train_stages([repair_stage(roles, entry)], run, listeners, policies, make_learner)
+        later = assembled(roles, after)
+        if judge_repair(roles, run, entry, listeners, later, done):
+            policies = after
+    return policies
 
 
 def load(roles: Roles, run: RunDirectory) -> Policy:
@@ -208,7 +241,7 @@ def _level_entry(roles: Roles, level: Level) -> dict[str, Any]:
         "greedy_skills": True if skills is None and not together else skills,
         "greedy_selector": True if selector is None and not together else selector,
         "reflexes": [r.name for r in level.reflexes],
-        "start_calls": apart.start_calls,
+        "start_calls": list(calls) if isinstance(calls := apart.start_calls, tuple) else calls,
         "search_steps": apart.search_steps,
         "episode_calls": apart.episode_calls,
         "call_cost": selection.call_cost,

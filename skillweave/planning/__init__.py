@@ -1,5 +1,6 @@
 """Know and plan: tasks without training, logs of calls, and planning on them."""
 
+from skillweave.planning.blame import Blame
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.goal import GoalTask, reached
@@ -12,6 +13,7 @@ from skillweave.planning.record import record_calls
 from skillweave.planning.task import as_task
 
 __all__ = [
+    "Blame",
     "CallEnds",
     "CallLog",
     "Chain",

@@ -13,6 +13,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError
+from skillweave.planning.blame import Blame, blame
 from skillweave.planning.call_file import INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
@@ -99,6 +100,34 @@ class CallLog(CallColumns):
             RunError: the log has no call of a skill, or none of the first at an episode's start.
         """
         return chain(self, *skills, done=done, features=features)
+
+    @checked_names
+    def blame(
+        self,
+        skill: str,
+        after: str,
+        done: Mapping[str, Any] | None = None,
+        *,
+        features: Any = None,
+    ) -> Blame:
+        """Return why a skill fails after another one: would other ends of the first one do?
+
+        Each call of the second skill after the first is predicted by the nearest other ones. If the
+        third of the first skill's ends with the best predictions serve about as well as other starts
+        do, and the other ends clearly worse, then the first skill is to blame for how it ends; else the
+        second has never learnt to start there.
+
+        Args:
+            skill: the second skill.
+            after: the first skill, or "start".
+            done: as for ``hand_over``.
+            features: as for ``Planner``; images need them.
+
+        Raises:
+            DeclarationError: the log has no skill of these names.
+            RunError: the log has no call of the second skill after the first one.
+        """
+        return blame(self, skill, after, done, features=features)
 
     @checked_names
     def call_ends(self, skill: str) -> CallEnds:

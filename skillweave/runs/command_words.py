@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -61,8 +61,19 @@ def resume_words(run: RunLike, *more: str) -> str:
     """
     if from_command_line():
         return command_words("resume", run)
+    for entry in run.manifest.get("stages", ()):
+        if "repair" in entry and "kept" not in entry:
+            return repair_words(entry["repair"], run)
     seed = [f"seed={run.manifest['seed']}"] if run.manifest.get("seed") else []
     return _call(run, ", ".join([python_string(shown_path(run.path)), *seed, "resume=True", *more]))
+
+
+def repair_words(repair: Mapping[str, Any], run: RunLike) -> str:
+    """Return the line of Python that continues a repair."""
+    given = [python_string(repair["skill"]), f"after={python_string(repair['after'])}"]
+    given.append(f"run_dir={python_string(shown_path(run.path))}")
+    given += ["done=…"] if repair["done"] else []
+    return f"run.repair({', '.join(given)}, resume=True)"
 
 
 def start_words(run: RunLike) -> str:

@@ -7,7 +7,9 @@ from typing import Any, Literal, NotRequired, TypedDict
 
 from skillweave.settings import AtLeastOne
 
-Candidate = Literal["before", "greedy", "skills_sample", "selector_samples", "both_sample"]
+Candidate = Literal[
+    "before", "greedy", "skills_sample", "selector_samples", "both_sample", "repaired"
+]
 """A hierarchy that a stage could end with."""
 
 SAMPLING: dict[str, tuple[bool, bool]] = {
@@ -34,13 +36,17 @@ class Comparison(TypedDict):
     skills_sample: NotRequired[float]
     selector_samples: NotRequired[float]
     both_sample: NotRequired[float]
-    episodes: AtLeastOne
+    episodes: NotRequired[AtLeastOne]
     """Episodes of each candidate."""
+    sentence: NotRequired[str]
+    """The result of a repair, which is compared by calls."""
     kept: Candidate
 
 
 def comparison_words(kept: Mapping[str, Any]) -> str:
     """Return a sentence on the compared hierarchies and the kept one."""
+    if "sentence" in kept:
+        return str(kept["sentence"])
     returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
     return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
 
@@ -56,4 +62,6 @@ def best_words(best: Mapping[str, Any]) -> str:
 
 def needs_comparison(entry: Mapping[str, Any]) -> bool:
     """Return whether a stage of a run must end with the best of several hierarchies."""
+    if "repair" in entry:
+        return True
     return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])

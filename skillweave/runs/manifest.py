@@ -55,7 +55,7 @@ class NestedEntry(TypedDict):
     guide_restrict: NotRequired[bool]
     guide_kl: NotRequired[Positive | None]
     reflexes: list[str]
-    start_calls: AtLeastOne | None
+    start_calls: AtLeastOne | list[str] | None
     search_steps: AtLeastOne | None
     episode_calls: AtLeastOne
     call_cost: NonNegative
@@ -130,6 +130,30 @@ class Start(TypedDict):
     """Checksum of this run's copy."""
 
 
+class Matrix(TypedDict):
+    """Counts of calls, and of those that were done, by the skill before (``HandOver``)."""
+
+    skills: list[str]
+    calls: list[list[Count]]
+    done: list[list[Count]]
+    cut: list[Count]
+
+
+class RepairEntry(TypedDict):
+    """The repair of a skill after another one, at the end of a run that repairs."""
+
+    skill: NodePath
+    after: NodePath
+    calls: AtLeastOne
+    """Calls of the pair that are measured at least, before and after."""
+    done: list[str]
+    """Skills whose calls were judged by an event that the caller gave."""
+    blame: str
+    """A sentence on the reason of the failure."""
+    before: Matrix
+    later: NotRequired[Matrix]
+
+
 class StageEntry(TypedDict):
     """A stage: its learners, the policy that decides, its budget and its progress."""
 
@@ -180,6 +204,8 @@ class StageEntry(TypedDict):
     """Steps after which the stage had ended, before its budget was raised."""
     starts: NotRequired[dict[NodePath, Start]]
     """Initial policies from other runs, by learner."""
+    repair: NotRequired[RepairEntry]
+    """The stage repairs a skill that has learnt before."""
 
 
 class Manifest(TypedDict):

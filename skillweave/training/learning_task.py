@@ -85,6 +85,7 @@ def skill_task(
     start_calls: int = 0,
     search_steps: int | None = None,
     episode_calls: int = 1,
+    start_after: tuple[str, ...] = (),
 ) -> LearningTask:
     """Return the learning task of a skill's stage, or of a plain agent's.
 
@@ -94,8 +95,9 @@ def skill_task(
         start_calls: an episode starts after up to this many calls of ``starters``.
         search_steps: reset an episode in which the skill cannot start within this many steps.
         episode_calls: the most calls of the skill in an episode.
+        start_after: names among ``starters``; half of the episodes start after a call of one.
     """
-    search = start_calls, search_steps, episode_calls
+    search = start_calls, search_steps, episode_calls, start_after
     spec, skill = role.spec, role.skill
 
     def collector(

@@ -148,6 +148,8 @@ class Stage:
     """Keep the result only if it is better than the policies before."""
     greedy_judged: bool = False
     """At its end, evaluate whether skills and selector should act greedily or sample."""
+    learner: str | None = None
+    """The path of the learner, where the stage has another name: it has learnt before."""
 
     @property
     def acts_by_code(self) -> bool:
@@ -162,7 +164,7 @@ class Stage:
 
     def entry(self) -> dict[str, Any]:
         """Return the manifest's entry before training."""
-        first = join(self.level, SELECTOR) if self.together else self.name
+        first = join(self.level, SELECTOR) if self.together else self.learner or self.name
         entry: dict[str, Any] = {
             "name": self.name,
             "kind": self.kind,

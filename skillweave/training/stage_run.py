@@ -41,6 +41,11 @@ class StageRun:
         return str(self.entry["name"])
 
     @property
+    def learner(self) -> str:
+        """Path of the learner, where there is one."""
+        return str(self.entry["learns"][0])
+
+    @property
     def config(self) -> AlgorithmConfig:
         """The algorithm's settings."""
         return config_from_json(self.entry["algorithm"])

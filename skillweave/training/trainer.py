@@ -85,7 +85,12 @@ class OneAgent:
         spaces = learning_task.observation_space, learning_task.action_space
         self.algorithm = make_algorithm(stage.config, *spaces)
         self.start = None
-        if not stage.continues:
+        earlier = stage.policies.get(stage.learner)
+        if stage.continues:
+            pass  # its final state holds everything
+        elif isinstance(earlier, AgentPolicy):  # it learns again
+            self.start = earlier, _steps_of(stage)
+        else:
             self.start = initial_policy(stage.run, stage.name, stage.name, self.algorithm)
         return self._initial_state()
 
@@ -112,14 +117,16 @@ class OneAgent:
             goes_on_at=log.at["steps"],
         )
         keep_to_guide(learner, stage.entry.get("guide_kl"))
-        if stage.name in stage.entry.get("starts", {}) and isinstance(learner, ReplayLearner):
+        starts = stage.entry.get("starts", {})
+        learnt_before = stage.learner in stage.policies or stage.name in starts
+        if learnt_before and isinstance(learner, ReplayLearner):
             learner.act_from_the_start()
         return learner
 
     def stacks(self) -> dict[str, Stack]:
         """Return the stacks of the learners, by path."""
         (stack,) = self.learner.stacks
-        return {self.stage.name: stack}
+        return {self.stage.learner: stack}
 
     def policies(self) -> dict[str, AgentPolicy]:
         """Return the present policies of the learners, by path."""
@@ -260,6 +267,13 @@ class OneAgent:
     def close(self) -> None:
         """Release the environments."""
         self._resources.close()
+
+
+def _steps_of(stage: StageRun) -> int:
+    """Return the environment steps of earlier stages in which the learner has learnt."""
+    stages = stage.run.manifest["stages"]
+    done = [s for s in stages if stage.learner in s["learns"] and s["status"] == "done"]
+    return sum(s["steps"] for s in done)
 
 
 def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Collector:

@@ -323,3 +323,52 @@ def test_an_evaluated_episode_is_its_first_call():
     played = collector.play(next(requests(1)), Seeds(0), 100)
     assert played[:, 0].tolist() == [0.0] * N
     assert played[:, 2].tolist() == [7.0] * N
+
+
+class Back(Skill):
+    """One step back to the start."""
+
+    max_steps = 1
+    policy = always(0)
+
+
+def named(start_calls=0, kinds=(Five, Back), after=("five",), skill=Anywhere):
+    skills = tuple(kind() for kind in kinds)
+    starters = SkillSet(skills, tuple(s.policy for s in skills))
+    engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
+    found = SkillCollector(
+        engine, Choices(N, 5), skill(), (), starters, start_calls, start_after=after
+    )
+    found.start(Seeds(0))
+    return found
+
+
+def starts_of(collector, rows=1_500):
+    found = collector.collect(next(requests(rows))).batches[""]
+    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
+    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
+    return found["obs"][began]
+
+
+def test_half_of_the_episodes_start_after_a_call_of_a_named_skill():
+    starts = starts_of(named())
+    assert set(starts[:, X]) == {0, 5}
+    assert abs(np.mean(starts[:, X] == 5) - 0.5) < 0.12
+
+
+def test_calls_at_random_may_come_before_the_named_one():
+    starts = starts_of(named(start_calls=1))
+    ages = {(int(x), int(t)) for x, t in starts}
+    assert ages == {(0, 0), (0, 1), (5, 5), (5, 6), (10, 10)}
+
+
+@pytest.mark.parametrize("rows", [7, 50])
+def test_restored_before_a_named_call_it_goes_on_the_same(rows):
+    goes_on_the_same(lambda: named(start_calls=2), rows)
+    other = named(start_calls=2)
+    assert other.like(other.engine, other.acting).kept.keys() == other.kept.keys()
+
+
+def test_where_the_named_skill_never_starts_it_is_said():
+    with pytest.raises(SkillweaveError, match="is to start after a call of 'only_far'"):
+        named(kinds=(Five, OnlyFar), after=("only_far",)).collect(next(requests(8_000)))

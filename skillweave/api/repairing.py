@@ -1,0 +1,256 @@
+"""The course of ``Run.repair``: measure a hand-over, train on, measure again, keep the better.
+
+Stands alone because a new run needs none of it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from skillweave.algorithms.config import OnPolicy, config_to_json
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.api.applying import Trained, apply_manifest
+from skillweave.api.running import Base, begin, go_on
+from skillweave.errors import DeclarationError, RunError
+from skillweave.hierarchy import training
+from skillweave.hierarchy.assembly import parts_of
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.repair import (
+    Measured,
+    matrix_to_json,
+    measure,
+    repair_stage,
+)
+from skillweave.hierarchy.roles import Roles, roles_of
+from skillweave.messages import as_path, short, shown_path
+from skillweave.paths import join, level_of, name_of
+from skillweave.reporting.progress import Progress
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.callback import Callback
+from skillweave.training.stage import check_stages
+
+D = TypeVar("D", bound=Declaration)
+
+GOOD = 0.95
+"""A hand-over that is done at least this often needs no repair."""
+MADE_ELSEWHERE = ("metrics_bytes", "lineage_bytes", "sha256", "policies", "starts", "continued")
+"""Fields of a stage's entry that belong to files of the run that it was trained in."""
+OF_THE_RUN = ("id", "sha256", "versions", "created", "stages", "track")
+"""Fields of a manifest that a new run has of its own."""
+
+
+def repair(
+    declared: D,
+    source: Path,
+    policy: HierarchyPolicy,
+    skill: str,
+    after: str,
+    steps: int,
+    run_dir: str | Path | None,
+    done: Mapping[str, Any] | None,
+    calls: int,
+    seed: int,
+    quiet: bool,
+    callback: Callback | None,
+    resume: bool,
+) -> Trained[D]:
+    """Repair a skill of a run in a new run; see ``Run.repair``.
+
+    Args:
+        source: the run's directory, or its weights file.
+        policy: of the run.
+    """
+    roles = roles_of(declared)
+    skill, after = _checked(roles, skill, after)
+    if resume:
+        return _go_on(declared, skill, after, run_dir, done, quiet, callback)
+    learnt = parts_of(roles, policy)[skill]
+    assert isinstance(learnt, AgentPolicy)
+    content, entries, policies = _content(declared, source, roles, policy)
+    if declared.recorded and content["resume_needs_recipe"]:
+        raise RunError(
+            f"{shown_path(source)} was loaded without its code, and training needs that: load it "
+            "with the hierarchy that was trained: sw.load(directory, hierarchy)"
+        )
+    config = learnt.algorithm.config
+    entry: dict[str, Any] = {
+        "name": _stage_name(skill, {e["name"] for e in entries} | set(roles.skills)),
+        "budget": steps,
+        "repair": {"skill": skill, "after": after, "calls": calls, "done": sorted(done or ())},
+    }
+    entry = repair_stage(roles, entry).entry() | entry
+    entry["algorithm"] = config_to_json(config)
+    check_stages([entry], None)
+    if isinstance(config, OnPolicy) and steps < (one := config.n_steps * config.num_envs):
+        raise DeclarationError(
+            f"steps is {steps:,}, but {skill!r} learns for the first time after {one:,}; give more "
+            "steps"
+        )
+    with Progress(quiet=quiet) as progress:
+        found = _measured(roles, policy, skill, after, done, calls, config.num_envs, progress)
+    entry["repair"]["before"] = matrix_to_json(found.matrix)
+    reason = str(found.log.blame(name_of(skill), name_of(after), done))
+    entry["repair"]["blame"] = reason
+    content |= {"stages": [entry], "seed": seed}
+    base = Base(entries, partial(_write, policies=policies), "repair")
+    return begin(
+        declared,
+        content,
+        run_dir,
+        quiet,
+        (),
+        None,
+        None,
+        note=reason,
+        callback=callback,
+        base=base,
+        done=done,
+    )
+
+
+def _go_on(
+    declared: D,
+    skill: str,
+    after: str,
+    run_dir: str | Path | None,
+    done: Mapping[str, Any] | None,
+    quiet: bool,
+    callback: Callback | None,
+) -> Trained[D]:
+    """Finish a repair that was stopped."""
+    if run_dir is None:
+        raise DeclarationError(
+            "resume=True continues a repair, so name its directory: "
+            f'repair({name_of(skill)!r}, after={name_of(after)!r}, run_dir="runs/a", resume=True)'
+        )
+    run = RunDirectory.open(as_path(run_dir, "run_dir"))
+    repairs = [e["repair"] for e in run.manifest["stages"] if "repair" in e]
+    if not repairs or (repairs[-1]["skill"], repairs[-1]["after"]) != (skill, after):
+        raise RunError(
+            f"{shown_path(run.path)} holds no repair of {skill!r} after {after!r}; leave out "
+            "resume=True to start one in another directory"
+        )
+    return go_on(
+        apply_manifest(declared, run), run, quiet, None, None, callback=callback, done=done
+    )
+
+
+def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
+    """Return the paths of both skills.
+
+    Raises:
+        DeclarationError: the first one cannot learn, or may not follow the other one.
+    """
+    for argument, name in (("skill", skill), ("after", after)):
+        known = roles.skills
+        if not isinstance(name, str) or (argument == "skill" and name not in known):
+            raise DeclarationError(
+                f"{argument} is {short(name)}; it must be the name of a skill: {', '.join(known)}"
+            )
+    level = level_of(skill)
+    names = roles.levels[level].names
+    path = join(level, name_of(after))
+    if path not in roles.skills or after not in (path, name_of(path)):
+        raise DeclarationError(
+            f"after is {short(after)}; it must be a skill that the same selector calls: "
+            f"{', '.join(name for name in names if name != name_of(skill))}"
+        )
+    if path == skill:
+        raise DeclarationError(f"{skill!r} cannot be repaired after itself: name another skill")
+    if skill in roles.levels:
+        inside = ", ".join(roles.levels[skill].skills)
+        raise DeclarationError(
+            f"{skill!r} is a hierarchy: repair a skill of it ({inside}), after another of these"
+        )
+    if roles[skill].config is None:
+        raise DeclarationError(
+            f"{skill!r} is ready: its policy was given, so it does not learn, and cannot be "
+            f"repaired. Perhaps {name_of(after)!r} can end elsewhere"
+        )
+    return skill, path
+
+
+def _measured(
+    roles: Roles,
+    policy: HierarchyPolicy,
+    skill: str,
+    after: str,
+    done: Mapping[str, Any] | None,
+    calls: int,
+    num_envs: int,
+    progress: Progress,
+) -> Measured:
+    """Measure the hand-over as it is.
+
+    Raises:
+        DeclarationError: there is nothing to repair, or the skill may not start there.
+    """
+    level = parts_of(roles, policy)[level_of(skill)]
+    assert isinstance(level, HierarchyPolicy)
+    names = name_of(skill), name_of(after)
+    found = measure(roles.spec, level.skills, *names, done, calls, num_envs, progress.message)
+    rate, count = found.matrix.of(*names)
+    if not count:
+        why = "no call of it was done, or the episode ended with it"
+        if not found.may_start:
+            why = f"the initiation() of {skill!r} was False wherever {after!r} ended"
+        raise DeclarationError(
+            f"{skill!r} was never called after {after!r}: {why}, so there is nothing to repair it "
+            "from"
+        )
+    if rate >= GOOD:
+        raise DeclarationError(
+            f"{skill!r} is done in {rate:.0%} of {count} calls after {after!r}: there is nothing "
+            "to repair"
+        )
+    return found
+
+
+def _stage_name(skill: str, taken: set[str]) -> str:
+    """Return a name of a stage that no other one has."""
+    name, number = f"{skill}-repair", 2
+    while name in taken:
+        name, number = f"{skill}-repair-{number}", number + 1
+    return name
+
+
+Policies = dict[str, dict[str, AgentPolicy]]
+"""Policies by stage and learner."""
+
+
+def _content(
+    declared: Declaration, source: Path, roles: Roles, policy: HierarchyPolicy
+) -> tuple[dict[str, Any], list[dict[str, Any]], Policies]:
+    """Return a manifest without stages, entries of finished stages, and their policies."""
+    if source.is_dir():
+        run = RunDirectory.open(source)
+        content = {k: v for k, v in run.manifest.items() if k not in OF_THE_RUN}
+        entries = [
+            {k: v for k, v in copy.deepcopy(entry).items() if k not in MADE_ELSEWHERE}
+            for entry in run.manifest["stages"]
+        ]
+        policies = {entry["name"]: run.load_policies(entry["name"]) for entry in entries}
+        return content | {"eval_every": None, "keep": "last"}, entries, policies
+    content = training.manifest(declared, seed=0) | {"recipe": getattr(declared, "recipe", None)}
+    content |= {"eval_every": None, "keep": "last"}
+    parts, entries = parts_of(roles, policy), []
+    policies = dict[str, dict[str, AgentPolicy]]()
+    for entry in content.pop("stages"):
+        # A weights file does not record its training: the declaration's steps stand for it.
+        entries.append(entry | {"status": "done", "steps": entry["budget"], "seconds": 0.0})
+        if entry["kind"] == "together":
+            entries[-1] |= {"compared": False, "greedy_judged": False}
+        learnt = {name: parts[name] for name in entry["learns"]}
+        policies[entry["name"]] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
+    return content, entries, policies
+
+
+def _write(run: RunDirectory, policies: Policies) -> None:
+    """Write the policies of the stages that are done."""
+    for stage, by_name in policies.items():
+        run.save_policies(stage, by_name)

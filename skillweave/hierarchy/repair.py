@@ -1,0 +1,293 @@
+"""Repair of a hand-over: a skill learns on from where another one ends, and is measured again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.envs.make import EnvSpec
+from skillweave.hierarchy.assembly import parts_of, policy_at
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.roles import Roles
+from skillweave.paths import level_of, name_of
+from skillweave.planning import CallLog, HandOver, hand_over, join, record_calls
+from skillweave.planning.record import RandomChoice
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.learning_task import LearningTask, skill_task
+from skillweave.training.stage import Policies, Stage
+from skillweave.training.stage_log import Listener
+from skillweave.types import Array, Memory
+
+START_CALLS = 1
+"""The most calls at random before the other episodes of a repair, if the hierarchy has any."""
+MOST_STEPS = 2_000_000
+"""The most steps of one measurement."""
+CHUNK = 10_000
+"""The fewest steps that are recorded at once."""
+LARGEST_CHUNK = 200_000
+"""The most steps that are recorded at once, as they are kept in memory."""
+NEVER = 200_000
+"""Steps after which a pair of skills without a call is given up."""
+SEED = 7_000
+"""Seeds of measurements start here: people use smaller ones."""
+
+
+@dataclass(frozen=True)
+class Repair:
+    """The result of a repair.
+
+    Attributes:
+        skill: the path of the repaired skill.
+        after: the path of the skill after which it was repaired.
+        before: the hand-over matrix with the earlier weights.
+        later: with the repaired ones.
+        kept: True if the run has the repaired weights, False if the earlier ones.
+        blame: the reason of the failure, before the repair.
+        sentence: the result in a sentence.
+    """
+
+    skill: str
+    after: str
+    before: HandOver
+    later: HandOver
+    kept: bool
+    blame: str
+    sentence: str
+
+    def __str__(self) -> str:
+        """Return the reason, both matrices and the result."""
+        return f"{self.blame}\nbefore\n{self.before}\nafter\n{self.later}\n{self.sentence}"
+
+
+def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
+    """Return the stage of a run's entry in which a skill is repaired."""
+    repair = entry["repair"]
+    path = repair["skill"]
+    level, role = roles.levels[level_of(path)], roles[path]
+    calls = level.apart.start_calls
+
+    def learning_task(policies: Policies) -> LearningTask:
+        others = {p: policy_at(roles, policies, p) for p in level.skills if p != path}
+        return skill_task(
+            role,
+            level.reflexes,
+            level.skill_set(others),
+            0 if calls is None else START_CALLS,
+            level.apart.search_steps,
+            start_after=(name_of(repair["after"]),),
+        )
+
+    assert role.config is not None
+    return Stage(
+        entry["name"],
+        "skill",
+        role.config,
+        entry["budget"],
+        learning_task,
+        level=level.path,
+        learner=path,
+    )
+
+
+class PairChoice(RandomChoice):
+    """A selector that calls one skill after each other one, and another one often before it.
+
+    Args:
+        skills: names.
+        lengths: the number of lengths of each, at least 1.
+        skill: the name of the skill that is called after each other one in half of the decisions.
+        after: the name of the skill that is called twice as often as the others.
+    """
+
+    def __init__(self, skills: tuple[str, ...], lengths: int, skill: str, after: str) -> None:
+        super().__init__(len(skills) * lengths)
+        self._lengths, self._skill = lengths, skills.index(skill)
+        weights = np.where(np.array(skills) == after, 2.0, 1.0)
+        weights[self._skill] = 0.0
+        self._again = np.maximum(weights, 1e-6).repeat(lengths)
+        weights[self._skill] = weights.sum()
+        self._weights = weights.repeat(lengths)
+
+    def start(self, n: int) -> Memory:
+        """Return the skills that were called last, (n,) int64; −1: none."""
+        return {"last": np.full(n, -1)}
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return choices (n,)."""
+        again = memory["last"] == self._skill
+        weights = np.where(again[:, None], self._again, self._weights)
+        # The largest of u^(1/w) is choice i with probability w_i / Σw (Efraimidis & Spirakis 2006).
+        score = np.log((rng or np.random.default_rng()).random(weights.shape)) / weights
+        choice: Array = (score if mask is None else np.where(mask, score, -np.inf)).argmax(1)
+        return choice, {"last": choice // self._lengths}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A measurement of hand-overs."""
+
+    matrix: HandOver
+    log: CallLog
+    """The calls of the skill, each with the call before it."""
+    may_start: bool
+    """The skill may start at some end of a call of the other one."""
+
+
+def measure(
+    spec: EnvSpec,
+    skills: SkillSet,
+    skill: str,
+    after: str,
+    done: Mapping[str, Any] | None,
+    calls: int,
+    num_envs: int,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Measured:
+    """Let skills act until one was called after another one often enough; return what happened.
+
+    Args:
+        skills: of one level; ``skill`` and ``after`` are names there.
+        calls: calls of the pair; fewer where ``MOST_STEPS`` do not suffice.
+        done: as for ``hand_over``.
+        tell: receives a sentence about what is done now.
+    """
+    names = tuple(s.name for s in skills.skills)
+    number, first = names.index(skill), names.index(after)
+    matrix, parts, steps, may_start = None, list[CallLog](), 0, False
+    size = CHUNK
+    tell(f"measuring: calls of {skill} after {after}, at least {calls}")
+    while True:
+        choose = PairChoice(names, max(1, len(skills.lengths)), skill, after)
+        seed = SEED + len(parts)
+        log = record_calls(spec, skills, size, choose=choose, num_envs=num_envs, seed=seed)
+        steps += log.steps
+        found = hand_over(log, done)
+        matrix = found if matrix is None else _sum(matrix, found)
+        may = log.may_follow[log.skill == first][:, number * (log.choices // len(names))]
+        may_start |= bool(may.any())
+        of_skill = log.skill == number
+        following = log.followed_by
+        first_calls = np.flatnonzero(following >= 0)
+        first_calls = first_calls[of_skill[following[first_calls]]]
+        parts.append(log.take(np.union1d(np.flatnonzero(of_skill), first_calls)))
+        seen = int(matrix.of(skill, after)[1])
+        if seen >= calls or steps >= MOST_STEPS or (not seen and steps >= NEVER):
+            return Measured(matrix, join(parts), may_start)
+        needed = steps * (calls / max(seen, 1) - 1) * 1.1
+        size = int(np.clip(needed, CHUNK, min(MOST_STEPS - steps, LARGEST_CHUNK)))
+
+
+def _sum(one: HandOver, other: HandOver) -> HandOver:
+    return HandOver(one.skills, one.calls + other.calls, one.done + other.done, one.cut + other.cut)
+
+
+def matrix_to_json(matrix: HandOver) -> dict[str, Any]:
+    """Return a matrix as plain JSON."""
+    counts = {k: getattr(matrix, k).tolist() for k in ("calls", "done", "cut")}
+    return {"skills": list(matrix.skills)} | counts
+
+
+def matrix_from_json(entry: Mapping[str, Any]) -> HandOver:
+    """Return the matrix of ``matrix_to_json``."""
+    counts = (np.array(entry[k], np.int64) for k in ("calls", "done", "cut"))
+    return HandOver(tuple(entry["skills"]), *counts)
+
+
+def judge_repair(
+    roles: Roles,
+    run: RunDirectory,
+    entry: dict[str, Any],
+    listeners: tuple[Listener, ...],
+    later: HierarchyPolicy,
+    done: Mapping[str, Any] | None,
+) -> bool:
+    """Measure a repaired skill once, and record whether it is kept; return that.
+
+    Args:
+        later: the hierarchy with the repaired weights.
+        done: as for ``hand_over``.
+    """
+    if "kept" not in entry:
+        repair = entry["repair"]
+        level = parts_of(roles, later)[level_of(repair["skill"])]
+        assert isinstance(level, HierarchyPolicy)
+        names = name_of(repair["skill"]), name_of(repair["after"])
+
+        def tell(sentence: str) -> None:
+            for listener in listeners:
+                listener.message(f"{entry['name']}: {sentence}")
+
+        num_envs = int(entry["algorithm"]["num_envs"])
+        found = measure(
+            roles.spec, level.skills, *names, done, repair["calls"], num_envs, tell
+        ).matrix
+        is_kept, sentence = verdict(matrix_from_json(repair["before"]), found, *names)
+        repair["later"] = matrix_to_json(found)
+        entry["kept"] = {"kept": "repaired" if is_kept else "before", "sentence": sentence}
+        run.save()
+        tell(sentence)
+    kept: bool = entry["kept"]["kept"] == "repaired"
+    return kept
+
+
+def verdict(before: HandOver, later: HandOver, skill: str, after: str) -> tuple[bool, str]:
+    """Return whether a repair is kept, and a sentence with the reason.
+
+    It is kept if the pair is clearly better and no other pair clearly worse: their 95 % intervals
+    do not touch.
+    """
+    low, high = before.interval
+    low_later, high_later = later.interval
+    place = before.before.index(after), before.skills.index(skill)
+    pair = f"{skill} after {after}: {_rates(before, later, place)}"
+    better = low_later[place] > high[place]
+    if not better:
+        return False, f"{pair}: not clearly better, so the earlier weights are kept"
+    worse = np.argwhere(high_later < low)
+    if len(worse):
+        lost = ", ".join(
+            f"{before.skills[j]} after {before.before[i]}: {_rates(before, later, (i, j))}"
+            for i, j in worse
+        )
+        return False, f"{pair}; but {lost}: clearly worse, so the earlier weights are kept"
+    return True, f"{pair}; no other pair is clearly worse, so the repaired weights are kept"
+
+
+def _rates(before: HandOver, later: HandOver, place: tuple[int, int]) -> str:
+    return (
+        f"{before.rate[place]:.0%} of {before.calls[place]} calls before, "
+        f"{later.rate[place]:.0%} of {later.calls[place]} later"
+    )
+
+
+def repairs_of(run: RunDirectory) -> list[Repair]:
+    """Return the repairs of a run that are judged, in their order."""
+    repairs = []
+    for entry in run.manifest["stages"]:
+        repair = entry.get("repair", {})
+        if "later" in repair:
+            kept = entry["kept"]
+            repairs.append(
+                Repair(
+                    repair["skill"],
+                    repair["after"],
+                    matrix_from_json(repair["before"]),
+                    matrix_from_json(repair["later"]),
+                    kept["kept"] == "repaired",
+                    repair["blame"],
+                    kept["sentence"],
+                )
+            )
+    return repairs

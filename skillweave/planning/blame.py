@@ -1,0 +1,191 @@
+"""Attribution of a failed hand-over: to the ends of the first skill, or to the second skill."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from skillweave.collecting.call_end import CallEnd
+from skillweave.errors import RunError
+from skillweave.planning.columns import CallColumns
+from skillweave.planning.hand_over import START, before_each, calls_done, wilson
+from skillweave.planning.neighbours import compared_places, feature_maps, nearest
+from skillweave.spaces import obs_codec, to_tensor
+from skillweave.types import Array
+
+LEAST = 20
+"""The fewest calls from which something is concluded."""
+BEST = 1 / 3
+"""The share of the first skill's ends that are compared with the others."""
+LIKE_ELSEWHERE = 0.1
+"""From ends that would do, the second skill is done at most this much less often than elsewhere."""
+WORSE = 0.25
+"""From the other ends it is done at least this much less often."""
+
+
+@dataclass(frozen=True)
+class Blame:
+    """The reason why a skill fails after another one.
+
+    Attributes:
+        skill: the second skill.
+        after: the first skill.
+        rate: share of the second skill's calls that are done after the first one.
+        elsewhere: this share after all others, and at the start of an episode; NaN: no call.
+        calls: the number of calls after the first skill.
+        best: share that is done from the best third of the first skill's ends, as the other calls
+            near each end predict them; NaN where the calls are too few.
+        others: share from its other ends.
+        place: the number of the flat observation in which these ends differ most; None: images.
+        means: its mean at the best ends, and at the others.
+        reasons: how the calls that failed ended: own, limit, interrupted, episode.
+        first: True if other ends of the first skill would do, so that it is to blame.
+    """
+
+    skill: str
+    after: str
+    rate: float
+    elsewhere: float
+    calls: int
+    best: float
+    others: float
+    place: int | None
+    means: tuple[float, float]
+    reasons: dict[str, int]
+    first: bool
+
+    @property
+    def fine(self) -> bool:
+        """True if the second skill is not clearly less often done than elsewhere."""
+        high = float(wilson(self.rate * self.calls, self.calls)[1])
+        return high >= (1.0 if np.isnan(self.elsewhere) else self.elsewhere)
+
+    def __str__(self) -> str:
+        """Return the reason in plain sentences."""
+        where = "at the start of an episode" if self.after == START else f"after {self.after!r}"
+        parts = [f"{self.skill!r} is done in {self.rate:.0%} of {self.calls} calls {where}"]
+        if np.isfinite(self.elsewhere):
+            parts[0] += f", and in {self.elsewhere:.0%} elsewhere"
+        if failed := sum(self.reasons.values()):
+            words = ", ".join(
+                f"{count / failed:.0%} {_ENDS[reason]}"
+                for reason, count in sorted(self.reasons.items(), key=lambda x: -x[1])
+                if count
+            )
+            parts.append(f"Of the calls that failed, {words}")
+        if self.fine:
+            parts.append("That is no worse than elsewhere, so neither skill is to blame")
+        elif self.after == START:
+            parts.append(f"So {self.skill!r} has to learn from there")
+        elif not np.isfinite(self.best):
+            parts.append(
+                f"These are too few calls to say which skill is to blame (at least {LEAST})"
+            )
+        elif self.first:
+            parts.append(
+                f"{self.after!r} is to blame for where it ends: from the best third of its ends "
+                f"{self.skill!r} is done in {self.best:.0%}, from the others in {self.others:.0%}"
+                f"{self._difference()}"
+            )
+        else:
+            parts.append(
+                f"Other ends of {self.after!r} would not do: from the best third of them "
+                f"{self.skill!r} is done in {self.best:.0%}. So {self.skill!r} has to learn from "
+                "there"
+            )
+        return ". ".join(parts) + "."
+
+    def _difference(self) -> str:
+        if self.place is None:
+            return ""
+        one, other = (f"{mean:.2g}" for mean in self.means)
+        return (
+            f" (number {self.place} of the observation is {one} there, and {other} at the others)"
+        )
+
+
+_ENDS = {
+    "own": "ended by themselves",
+    "limit": "reached their limit of steps",
+    "interrupted": "were interrupted",
+    "episode": "ended with the episode",
+}
+
+
+def blame(
+    log: CallColumns,
+    skill: str,
+    after: str,
+    done: Mapping[str, Any] | None = None,
+    *,
+    features: Any = None,
+) -> Blame:
+    """See ``CallLog.blame``."""
+    number = log.number(skill)
+    if after != START:
+        log.number(after)
+    won = calls_done(log, done)
+    counts = log.skill == number
+    before = before_each(log, won)
+    wanted = 0 if after == START else log.number(after) + 1
+    rows = np.flatnonzero(counts & (before == wanted))
+    if not len(rows):
+        raise RunError(
+            f"the log has no call of {skill!r} after a call of {after!r} that was done; record "
+            "more calls, chosen at random"
+        )
+    others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
+    elsewhere = float(won[others].mean()) if len(others) else float("nan")
+    ends = log.end_reason[rows[~won[rows]]]
+    reasons = {end.name.lower(): int((ends == end).sum()) for end in list(CallEnd)[1:]}
+    rate, nan = float(won[rows].mean()), float("nan")
+    unknown = Blame(
+        skill, after, rate, elsewhere, len(rows), nan, nan, None, (nan, nan), reasons, False
+    )
+    if after == START or len(rows) < LEAST:
+        return unknown
+    places = compared_places(log.observation_space, log.sees, log.before, log.next_obs)
+    maps = feature_maps(log.observation_space, features, places, log.start, log.skills)
+    at = np.ascontiguousarray(maps[number](log.start[rows]))
+    score = _predicted(at, won[rows])
+    best = np.zeros(len(rows), bool)
+    best[np.argsort(-score, kind="stable")[: max(1, round(len(rows) * BEST))]] = True
+    good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
+    as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
+    low, high = (
+        wilson(won[rows[best]].sum(), best.sum())[0],
+        wilson(won[rows[~best]].sum(), (~best).sum())[1],
+    )
+    first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
+    place, means = _largest_difference(log, log.start[rows], best)
+    return Blame(
+        skill, after, rate, elsewhere, len(rows), good, bad, place, means, reasons, bool(first)
+    )
+
+
+def _predicted(at: Array, won: Array) -> Array:
+    """Return for each start (n, F) the share of the nearest other starts that were done, (n,)."""
+    n = len(at)
+    count = min(n - 1, max(5, round(n**0.5)))
+    near, _ = nearest(at, at, count + 1, np.arange(n))
+    others = near != np.arange(n)[:, None]
+    score: Array = (won[near] * others).sum(1) / others.sum(1)
+    return score
+
+
+def _largest_difference(
+    log: CallColumns, obs: Array, best: Array
+) -> tuple[int | None, tuple[float, float]]:
+    """Return the number of the observation whose means differ most between two groups of ends."""
+    codec = obs_codec(log.observation_space)
+    vector = codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
+    if not vector.shape[1]:
+        return None, (float("nan"), float("nan"))
+    one, other = vector[best].mean(0), vector[~best].mean(0)
+    spread = np.sqrt((vector[best].var(0) + vector[~best].var(0)) / 2)
+    size = np.abs(one - other) / (spread + 1e-6)
+    place = int(size.argmax())
+    return place, (float(one[place]), float(other[place]))

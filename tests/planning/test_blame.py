@@ -1,0 +1,68 @@
+"""Which of two skills is to blame, in logs whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from logs import log_of
+
+from skillweave.errors import RunError
+from skillweave.planning import CallLog
+
+A, B = 0, 1
+
+
+def log(works: str, calls: int = 120) -> CallLog:
+    """Skill a ends between 0 and 1; b, called after it, works ``never`` or where it ended "low"."""
+    rng = np.random.default_rng(0)
+    episodes: list[tuple[float, list[tuple[int, list[float], bool, str]]]] = []
+    for _ in range(calls):
+        end = float(rng.random())
+        won = {"never": False, "always": True, "low": end < 0.4}[works]
+        b = (B, [end, end], won, "own" if won else "limit")
+        episodes.append((5.0, [(A, [3.0, end], True, "own"), b]))
+        episodes.append((5.0, [(B, [4.0, 2.0], True, "own")]))
+    return log_of(["a", "b"], episodes)
+
+
+def test_the_first_is_to_blame_where_other_ends_of_it_would_do() -> None:
+    found = log("low").blame("b", "a")
+    assert found.first
+    assert found.best > 0.9
+    assert found.others < 0.3
+    assert (found.place, found.elsewhere) == (0, 1.0)
+    assert found.means[0] < 0.4 < found.means[1]
+    assert "'a' is to blame for where it ends: from the best third of its ends" in str(found)
+    assert "(number 0 of the observation is" in str(found)
+    assert "100% reached their limit of steps" in str(found)
+
+
+def test_the_second_must_learn_where_no_end_would_do() -> None:
+    found = log("never").blame("b", "a")
+    assert not found.first
+    assert (found.rate, found.calls) == (0.0, 120)
+    assert "Other ends of 'a' would not do" in str(found)
+    assert str(found).endswith("So 'b' has to learn from there.")
+
+
+def test_none_is_to_blame_where_it_works() -> None:
+    found = log("always").blame("b", "a")
+    assert found.fine
+    assert "neither skill is to blame" in str(found)
+    assert log("never").blame("b", "start").fine
+
+
+def test_an_event_judges_in_place_of_success() -> None:
+    found = log("never").blame("b", "a", done={"b": lambda obs: obs[:, 0] < 0.4})
+    assert found.first
+
+
+def test_few_calls_do_not_tell() -> None:
+    found = log("never", 8).blame("b", "a")
+    assert np.isnan(found.best)
+    assert "too few calls to say which skill is to blame" in str(found)
+
+
+def test_a_pair_without_a_call_is_said() -> None:
+    with pytest.raises(RunError, match="no call of 'a' after a call of 'b'"):
+        log("low").blame("a", "b")

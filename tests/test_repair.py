@@ -1,0 +1,377 @@
+"""A skill is repaired where another one ends; what comes out is kept only if it is better."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_runs import assert_same
+
+import skillweave as sw
+from skillweave.api import Run
+from skillweave.errors import DeclarationError, Interrupted, RunError
+from skillweave.hierarchy import repair
+from skillweave.planning import HandOver, Mission
+from skillweave.runs.directory import RunDirectory
+
+
+class Buttons(gym.Env[Any, Any]):
+    """Three presses of the right button are the goal: button 2, or button 0 once button 1 flipped.
+
+    Observations: 1, or 2 once it is flipped; the number of right presses, which a flip sets to 0.
+    """
+
+    observation_space = gym.spaces.Box(-1, 3, (2,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.side, self.count, self.t = 1, 0, 0
+        return self._obs(), {}
+
+    def step(self, action: int) -> Any:
+        self.t += 1
+        if action == 1:
+            self.side, self.count = -1, 0
+        elif action == 1 + self.side:
+            self.count = min(3, self.count + 1)
+        return self._obs(), 0.0, False, self.t == 60, {}
+
+    def _obs(self) -> Any:
+        return np.array([1.5 - self.side / 2, self.count], np.float32)
+
+
+SPEC = sw.EnvSpec(Buttons, engine="sync", workers=1)
+
+
+def at_goal(obs: Any) -> Any:
+    return obs[:, 1] == 3
+
+
+class Press(sw.Skill):
+    """Learns to press the right button before the flip alone."""
+
+    max_steps = 8
+
+    def reward(self, step: Any) -> Any:
+        flipped = step.next_obs[:, 0] > step.obs[:, 0]
+        return step.next_obs[:, 1] - step.obs[:, 1] - 2.0 * flipped
+
+    def success(self, step: Any) -> Any:
+        return at_goal(step.next_obs)
+
+    def termination(self, step: Any) -> Any:
+        return at_goal(step.next_obs)
+
+
+class Wrong(Press):
+    """Its reward is for the wrong button: it cannot learn what ``success`` says."""
+
+    name = "press"
+
+    def reward(self, step: Any) -> Any:
+        return step.obs[:, 1] - step.next_obs[:, 1] - 0.1 * (step.action == 1)
+
+
+class Flip(sw.Skill):
+    """Presses the button that flips."""
+
+    max_steps = 5
+
+    def policy(self, obs: Any) -> Any:
+        return np.ones(len(obs), np.int64)
+
+    def success(self, step: Any) -> Any:
+        return step.next_obs[:, 0] == 2
+
+    def termination(self, step: Any) -> Any:
+        return step.next_obs[:, 0] == 2
+
+
+class Never(Flip):
+    """May never start."""
+
+    def initiation(self, obs: Any) -> Any:
+        return obs[:, 1] > 5
+
+
+ON = sw.PPO(
+    num_envs=16, n_steps=16, batch_size=64, update_epochs=4, learning_rate=5e-3,
+    normalize_obs=False, gamma=0.9, ent_coef=0.05, network=sw.Network(hidden=(16,)), overlap=False,
+)  # fmt: skip
+STEPS = 2_048
+
+
+def declare(*skills: sw.Skill, algorithm: Any = ON, steps: int = STEPS, **how: Any) -> sw.Hierarchy:
+    skills = skills or (Press(), Flip())
+    first = skills[0].name
+    settings = {"call_steps": None, "learn": "apart", "selector": lambda obs: [first] * len(obs)}
+    settings |= {"apart": sw.Apart(skill_steps=steps)}
+    return sw.Hierarchy(SPEC, skills, algorithm=algorithm, **settings | how)
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(repair, "CHUNK", 1_500)
+    monkeypatch.setattr(repair, "NEVER", 3_000)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return declare().train(tmp_path_factory.mktemp("runs") / "buttons", quiet=True)
+
+
+def repaired(run: Run, path: Path, **how: Any) -> Run:
+    settings = {"after": "flip", "steps": 5_120, "calls": 20, "quiet": True} | how
+    return run.repair(settings.pop("skill", "press"), run_dir=path, **settings)
+
+
+def weights(run: Run) -> dict[str, Any]:
+    return {k: v.clone() for k, v in run.policy.skills.policies[0].weights.items()}
+
+
+def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: Path) -> None:
+    new = repaired(run, tmp_path / "new")
+    (result,) = new.repairs
+    assert result.before.of("press", "flip")[0] < 0.2
+    assert result.later.of("press", "flip")[0] > 0.9
+    assert result.later.of("press")[0] > 0.9, "nothing is forgotten"
+    assert min(result.before.of("press", "flip")[1], result.later.of("press", "flip")[1]) >= 20
+    assert result.kept
+    assert result.sentence.endswith("so the repaired weights are kept")
+    assert "has to learn from there" in result.blame
+    assert result.sentence in str(result)
+    old, now = weights(run), weights(new)
+    assert any(not np.array_equal(old[k], now[k]) for k in old)
+    again = sw.load(new.path, declare())
+    assert all(np.array_equal(v, now[k]) for k, v in weights(again).items())
+    assert again.repairs[0].sentence == result.sentence
+    manifest = json.loads((new.path / "run.json").read_text())
+    *_, entry = manifest["stages"]
+    assert (entry["name"], entry["learns"]) == ("press-repair", ["press"])
+    assert entry["repair"]["after"] == "flip"
+    assert not run.repairs, "the run itself stays as it is"
+    assert sw.load(run.path, declare()).info()["stages"] == run.info()["stages"]
+    with pytest.raises(DeclarationError, match="there is nothing to repair"):
+        repaired(new, tmp_path / "newer")
+
+
+def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:
+    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
+    new = repaired(first, tmp_path / "new", **SHORT)
+    (result,) = new.repairs
+    assert not result.kept
+    assert result.sentence.endswith("not clearly better, so the earlier weights are kept")
+    old, now = weights(first), weights(new)
+    assert all(np.array_equal(old[k], now[k]) for k in old)
+    again = sw.load(new.path, declare(Wrong(), Flip()))
+    assert all(np.array_equal(v, old[k]) for k, v in weights(again).items())
+
+
+def matrix(*rows: tuple[float, float]) -> HandOver:
+    """Rates of the skills a and b after start, a and b, from 100 calls each."""
+    done = np.rint(100 * np.array(rows)).astype(np.int64)
+    return HandOver(("a", "b"), np.full((3, 2), 100), done, np.zeros(2, np.int64))
+
+
+@pytest.mark.parametrize(
+    ("later", "kept", "says"),
+    [
+        (((0.9, 0.9), (0.9, 0.8), (0.9, 0.9)), True, "no other pair is clearly worse"),
+        (((0.9, 0.9), (0.9, 0.3), (0.9, 0.9)), False, "20% of 100 calls before, 30% of 100 later"),
+        (((0.9, 0.9), (0.9, 0.0), (0.9, 0.9)), False, "not clearly better"),
+        (
+            ((0.9, 0.6), (0.9, 0.8), (0.9, 0.9)),
+            False,
+            "b after start: 90% of 100 calls before, 60%",
+        ),
+        (((0.9, 0.9), (0.9, 0.8), (0.6, 0.9)), False, "a after b: 90% of 100 calls before, 60%"),
+        (((0.9, 0.85), (0.9, 0.8), (0.9, 0.9)), True, "b after a: 20%"),
+    ],
+)
+def test_a_repair_is_kept_if_the_pair_is_better_and_no_other_worse(
+    later: Any, kept: bool, says: str
+) -> None:
+    before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
+    found, sentence = repair.verdict(before, matrix(*later), "b", "a")
+    assert found == kept
+    assert says in sentence
+
+
+def test_a_few_calls_suffice_to_see_that_all_is_forgotten() -> None:
+    before = matrix((0.9, 0.9), (0.9, 0.2), (0.9, 0.9))
+    few = dataclasses.replace(before, calls=before.calls.copy(), done=before.done.copy())
+    few.calls[0, 0] = few.done[0, 0] = 8
+    later = matrix((0.1, 0.9), (0.9, 0.9), (0.9, 0.9))
+    assert "a after start: 100% of 8 calls before" in repair.verdict(few, later, "b", "a")[1]
+    few.calls[0, 0] = few.done[0, 0] = 0
+    assert repair.verdict(few, later, "b", "a")[0], "of a pair without a call nothing is known"
+
+
+SHORT = {"steps": 1_024, "calls": 5}
+"""Too few steps to become better."""
+
+
+def stop_at(report: int) -> Callable[[Any], None]:
+    left = [report]
+
+    def callback(event: Any) -> None:
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    return callback
+
+
+@pytest.mark.parametrize("by", ["hierarchy", "repair"])
+def test_a_stopped_repair_ends_with_the_same_weights(run: Run, tmp_path: Path, by: str) -> None:
+    whole = repaired(run, tmp_path / "whole", **SHORT)
+    with pytest.raises(Interrupted, match=r'run\.repair\("press", after="flip", run_dir='):
+        repaired(run, tmp_path / "part", callback=stop_at(3), **SHORT)
+    assert not RunDirectory.open(tmp_path / "part").finished
+    if by == "repair":
+        new = repaired(run, tmp_path / "part", resume=True)
+    else:
+        new = declare().resume(tmp_path / "part", quiet=True)
+    assert_same(new.path, whole.path)
+    assert new.repairs[0].sentence == whole.repairs[0].sentence
+
+
+def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = repaired(run, tmp_path / "whole", **SHORT)
+    judge = repair.verdict
+
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(repair, "verdict", stopped)
+    with pytest.raises(Interrupted):
+        repaired(run, tmp_path / "part", **SHORT)
+    monkeypatch.setattr(repair, "verdict", judge)
+    stages = RunDirectory.open(tmp_path / "part").manifest["stages"]
+    assert all(entry["status"] == "done" for entry in stages)
+    with pytest.raises(RunError, match=r"run\.repair"):
+        sw.load(tmp_path / "part", declare())
+    assert_same(declare().resume(tmp_path / "part", quiet=True).path, whole.path)
+
+
+def test_events_of_the_caller_judge_and_are_needed_again(run: Run, tmp_path: Path) -> None:
+    done = {"press": lambda obs: obs[:, 1] >= 0}
+    with pytest.raises(DeclarationError, match="nothing to repair"):
+        repaired(run, tmp_path / "a", done=done)
+    done = {"press": at_goal}
+    with pytest.raises(Interrupted, match="done=…"):
+        repaired(run, tmp_path / "b", done=done, callback=stop_at(2), **SHORT)
+    with pytest.raises(RunError, match=r"is judged by done= of press, which is code: continue"):
+        declare().resume(tmp_path / "b", quiet=True)
+    assert len(repaired(run, tmp_path / "b", done=done, resume=True).repairs) == 1
+    with pytest.raises(DeclarationError, match="no skill 'zero'"):
+        repaired(run, tmp_path / "c", done={"zero": at_goal})
+
+
+def test_a_repaired_run_is_repaired_again(run: Run, tmp_path: Path) -> None:
+    first = repaired(run, tmp_path / "first", **SHORT | {"steps": 256})
+    second = repaired(first, tmp_path / "second", **SHORT)
+    assert [r.kept for r in second.repairs] == [False, False]
+    names = [entry["name"] for entry in second.info()["stages"]]
+    assert names == ["press", "press-repair", "press-repair-2"]
+
+
+def test_a_weights_file_is_repaired(run: Run, tmp_path: Path) -> None:
+    run.save_weights(tmp_path / "buttons.safetensors")
+    loaded = declare().load_weights(tmp_path / "buttons.safetensors")
+    new = repaired(loaded, tmp_path / "new", **SHORT)
+    assert len(new.repairs) == 1
+    old, again = weights(new), weights(sw.load(tmp_path / "new", declare()))
+    assert all(np.array_equal(v, old[k]) for k, v in again.items())
+    assert not loaded.repairs
+
+
+@pytest.mark.slow
+def test_a_skill_of_dqn_is_repaired_too(tmp_path: Path) -> None:
+    off = sw.DQN(
+        num_envs=4, batch_size=32, learning_starts=200, buffer_size=4_000, gamma=0.9,
+        learning_rate=3e-3, update_ratio=0.25, exploration_fraction=0.4,
+        network=sw.Network(hidden=(16,)),
+    )  # fmt: skip
+    first = declare(algorithm=off, steps=1_000).train(tmp_path / "run", quiet=True)
+    new = repaired(first, tmp_path / "new", **SHORT)
+    assert len(new.repairs) == 1
+    again = sw.load(new.path, declare(algorithm=off))
+    assert again.repairs[0].sentence == new.repairs[0].sentence
+
+
+def test_a_skill_inside_another_hierarchy_is_repaired(tmp_path: Path) -> None:
+    def nested() -> sw.Hierarchy:
+        inner = declare().as_skill("inner", max_steps=60)
+        outer = declare(Flip())
+        return sw.Hierarchy(
+            SPEC, [inner, Flip()], call_steps=None, learn="apart", algorithm=ON,
+            selector=lambda obs: ["inner"] * len(obs), apart=outer.apart,
+        )  # fmt: skip
+
+    first = nested().train(tmp_path / "run", quiet=True)
+    new = repaired(first, tmp_path / "new", skill="inner/press", **SHORT)
+    assert new.repairs[0].skill == "inner/press"
+    assert new.repairs[0].after == "inner/flip"
+    with pytest.raises(DeclarationError, match="is a hierarchy: repair a skill of it"):
+        repaired(first, tmp_path / "newer", skill="inner")
+    with pytest.raises(DeclarationError, match="that the same selector calls: flip"):
+        repaired(first, tmp_path / "newer", skill="inner/press", after="to_zer")
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({"skill": "zero"}, "skill is 'zero'; it must be the name of a skill: press, flip"),
+        ({"after": "lft"}, "after is 'lft'; it must be a skill that the same selector calls: flip"),
+        ({"after": 3}, "after is 3"),
+        ({"after": "press"}, "cannot be repaired after itself"),
+        ({"skill": "flip", "after": "press"}, "is ready: its policy was given"),
+        ({"steps": 100}, "learns for the first time after 256"),
+        ({"steps": 0}, "steps is 0"),
+        ({"calls": 0}, "calls is 0"),
+        ({"resume": True}, "resume=True continues a repair, so name its directory"),
+    ],
+)
+def test_what_cannot_be_repaired_is_said(run: Run, how: dict[str, Any], says: str) -> None:
+    path = None
+    with pytest.raises(DeclarationError, match=says):
+        repaired(run, path, **how)  # type: ignore[arg-type]
+
+
+def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
+    planned = run.plan(Mission(at_goal), run.log_calls(500))
+    with pytest.raises(RunError, match="was planned"):
+        repaired(planned, tmp_path / "a")
+    agent = sw.Agent(SPEC, ON, 256).train(tmp_path / "agent", quiet=True)
+    with pytest.raises(DeclarationError, match="plain agent"):
+        repaired(agent, tmp_path / "a")
+    with pytest.raises(RunError, match="holds a finished run"):
+        repaired(run, run.path)
+    with pytest.raises(RunError, match="holds no repair of 'press' after 'flip'"):
+        repaired(run, run.path, resume=True)
+    never = declare(Press(), Never()).train(tmp_path / "never", quiet=True)
+    with pytest.raises(DeclarationError, match="'press' was never called after 'never'"):
+        repaired(never, tmp_path / "a", after="never")
+
+
+def test_start_calls_by_name_are_checked_and_recorded(tmp_path: Path) -> None:
+    with pytest.raises(DeclarationError, match="start_calls names 'flop', which is no skill here"):
+        declare(apart=sw.Apart(start_calls=("flop",)))
+    for wrong in ((), "flip", ("flip", 3)):
+        with pytest.raises(DeclarationError, match="start_calls"):
+            sw.Apart(start_calls=wrong)  # type: ignore[arg-type]
+    apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])  # type: ignore[arg-type]
+    assert apart.start_calls == ("flip",)
+    run = declare(apart=apart).train(tmp_path / "run", quiet=True)
+    assert run.info()["start_calls"] == ["flip"]
+    assert sw.load(run.path, declare()).hierarchy.apart.start_calls == ("flip",)
