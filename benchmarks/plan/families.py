@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.grouped import regroup
 from benchmarks.pay import shuttle as shuttle_suite
 from examples import bridge
 from skillweave import Apart, Array, EnvSpec, Evaluation, Hierarchy, Step
@@ -218,9 +217,8 @@ def _patrol(name: str) -> NewTask:
 
 
 def _shuttle_over(task: NewTask, skills: Policies, **how: Any) -> Hierarchy:
-    found = shuttle.with_skills(shuttle_suite.POINTS[task.name], skills, **how)
-    regroup(found, selector_steps=shuttle_suite.FURTHER_STEPS)
-    return found
+    settings = {"apart": Apart(selector_steps=shuttle_suite.FURTHER_STEPS)} | how
+    return shuttle.with_skills(shuttle_suite.POINTS[task.name], skills, **settings)
 
 
 def patrols() -> Family:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+from planning.logs import log_of
 
 from benchmarks.pay.results import Result
 from benchmarks.plan import __main__ as command
 from benchmarks.plan.cells import BY_HAND, PLANNER, SELECTOR, Cells
 from benchmarks.plan.chains import InOrder, did_all
 from benchmarks.plan.families import FAMILIES, Family, NewTask, in_box, share_done
-from planning.logs import log_of
 from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill, SkillweaveError
 from skillweave.planning import Mission
 
