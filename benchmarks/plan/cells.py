@@ -17,6 +17,7 @@ from benchmarks.pay.results import CODE, Result, Results
 from benchmarks.plan.families import Family, NewTask, Policies
 from skillweave import Apart, Evaluation, Hierarchy, Run, RunError, evaluate
 from skillweave.planning import CallLog, Explorer, record_calls
+from skillweave.runs.directory import RunDirectory
 
 LOG_SEEDS = (101, 102, 103)
 """Seeds of the logs."""
@@ -60,7 +61,7 @@ class Cells:
                 run = Hierarchy.pretrained(self.family.shipped)
             else:
                 path = self._folder / "skills" / str(self.seed)
-                run = self.family.source().train(path, seed=self.seed, quiet=True)
+                run = trained(self.family.source(), path, self.seed)
             self._skills = dict(zip(run.policy.labels, run.policy.skills.policies, strict=True))
         return self._skills
 
@@ -145,8 +146,7 @@ class Cells:
     def _trained(self, task: NewTask, steps: int, path: Path) -> tuple[Evaluation, int]:
         """Train a selector, or finish one that was begun."""
         hierarchy = self.family.over(task, self.skills(), apart=Apart(selector_steps=steps))
-        run = hierarchy.train(path, seed=self.seed, quiet=True)
-        return self._score(run), steps
+        return self._score(trained(hierarchy, path, self.seed)), steps
 
     def _score(self, run: Run) -> Evaluation:
         return run.evaluate(
@@ -161,6 +161,15 @@ class Cells:
             engine="auto",
             deterministic=self.family.greedy,
         )
+
+
+def trained(hierarchy: Hierarchy, path: Path, seed: int) -> Run:
+    """Return a finished run; one that is there goes on, or is loaded."""
+    if not path.exists():
+        return hierarchy.train(path, seed=seed, quiet=True)
+    if RunDirectory.open(path).finished:
+        return hierarchy.load(path)
+    return hierarchy.resume(path, quiet=True)
 
 
 def shares(results: list[Result], good: float) -> tuple[float, float, int]:

@@ -118,6 +118,8 @@ def test_the_rule_and_a_selector_with_as_many_steps_stand_beside_it(tmp_path):
     rule, trained = cells.run(task, BY_HAND), cells.run(task, SELECTOR)
     assert (rule.budget, rule.score) == (0, 1.0)
     assert trained.budget == 400
+    cells.results.file("line", task.name, SELECTOR, 0).unlink()  # as if it was killed just before
+    assert Cells(family(), tmp_path, 0, 4, lambda text: None).run(task, SELECTOR).scores
 
 
 def test_the_table_has_a_line_for_each_agent_and_one_for_all_tasks():
