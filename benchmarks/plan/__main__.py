@@ -23,8 +23,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.common import table
-from benchmarks.pay.results import Result, Results, of_other_code
-from benchmarks.plan.cells import AGENTS, BY_HAND, LOG_SEEDS, PLANNER, Cells, shares
+from benchmarks.pay.results import Result, of_other_code
+from benchmarks.plan.cells import AGENTS, BY_HAND, LOG_SEEDS, PLANNER, Cells, results_in, shares
 from benchmarks.plan.families import FAMILIES, Family, NewTask
 from skillweave.errors import SkillweaveError
 from skillweave.ops.threads import torch_threads
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not asked.only_table:
             for seed in asked.seeds:
                 measure(family, tasks, seed, asked)
-        results = [r for r in Results(asked.out).all(family.name) if r.seed in asked.seeds]
+        results = [r for r in results_in(asked.out).all(family.name) if r.seed in asked.seeds]
         if results:
             print(f"\n{family.name}\n{make_table(family, tasks, results)}", flush=True)
             if warning := of_other_code(results):

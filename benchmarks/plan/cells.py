@@ -30,12 +30,17 @@ AGENTS = (PLANNER, BY_HAND, SELECTOR, TRAINED)
 its recipe does."""
 
 
+def results_in(folder: Path) -> Results:
+    """Return the results of a folder, which stand beside skills and logs."""
+    return Results(folder / "results")
+
+
 class Cells:
     """The cells of a family for one seed.
 
     Args:
         family: tasks and how they are planned.
-        folder: of all results.
+        folder: of skills, logs and results.
         seed: of the skills.
         episodes: of each score.
         say: called with a line for each cell that is done.
@@ -50,7 +55,7 @@ class Cells:
         say: Callable[[str], Any] = print,
     ) -> None:
         self.family, self.seed, self.episodes, self.say = family, seed, episodes, say
-        self.results = Results(folder)
+        self.results = results_in(folder)
         self._folder = folder / family.name
         self._skills: Policies | None = None
 

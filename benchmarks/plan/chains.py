@@ -12,15 +12,16 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.common import table
-from benchmarks.pay.results import CODE, Result, Results, of_other_code
+from benchmarks.pay.results import CODE, Result, of_other_code
 from benchmarks.plan.cells import Cells
 from benchmarks.plan.families import LEGS, lander
 from skillweave import Array, Run
@@ -47,7 +48,6 @@ DONE = {"hover": LEGS["hover"], "go_left": LEGS["left"], "go_right": LEGS["right
 """The events that the calls are for; landing has its own success."""
 NEAR = 0.1
 """An estimate counts as right within this."""
-LOG_SEED = 101
 MEASURED_SEED = 201
 
 
@@ -107,44 +107,61 @@ def measured(run: Run, skills: Sequence[str], episodes: int) -> Array:
     return did_all(log, skills, episodes)
 
 
-def one_seed(folder: Path, seed: int, steps: int, episodes: int) -> list[Result]:
-    """Return estimates and measurements of all chains, measured where they are not there."""
-    family, results = lander(), Results(folder)
-    task = replace(family.tasks[0], name="chains", steps=steps)
-    cells = Cells(family, folder, seed, episodes)
-    found, run, log = [], None, None
-    for skills in CHAINS:
-        place = "chains", "-then-".join(skills)
-        known = results.find(*place, "measured", seed, episodes)
-        if known is None:
-            run = run or cells.base(task)
-            log = log or cells.log(task, 1)
-            began = time.perf_counter()
-            estimate = chain(log, *skills, done=DONE)
-            spent = time.perf_counter() - began
-            for agent, score in (("estimate", estimate.estimate), ("product", estimate.product)):
-                results.save(Result(*place, agent, seed, score, log.steps, steps, spent, code=CODE))
-            won = measured(run, skills, episodes)
-            spent = time.perf_counter() - began - spent
-            known = Result(
-                *place, "measured", seed, float(won.mean()), 0, episodes, spent,
-                scores=won.astype(float).tolist(), code=CODE,
-            )  # fmt: skip
-            results.save(known)
-        for agent in ("estimate", "product"):
-            either = results.find(*place, agent, seed, steps)
-            assert either is not None
-            found.append(either)
-        found.append(known)
-        _, estimated, product, share = _row(found[-3:])
-        print(f"seed {seed}, {', '.join(skills)}: {estimated}, {product}, {share}", flush=True)
-    return found
+class Chains:
+    """The chains of one seed's skills; what is in the folder is not made again.
 
+    Args:
+        folder: of skills, logs and results.
+        seed: of the skills.
+        steps: of the log.
+        episodes: of a measurement.
+    """
 
-def _row(results: Sequence[Result]) -> tuple[str, str, str, str]:
-    """Return a chain's line of the table."""
-    estimate, product, share = (f"{r.score:.2f}" for r in results)
-    return results[0].task.replace("-then-", ", "), estimate, product, share
+    def __init__(self, folder: Path, seed: int, steps: int, episodes: int) -> None:
+        family = lander()
+        self._task = replace(family.tasks[0], name="chains", steps=steps)
+        self._cells = Cells(family, folder, seed, episodes)
+        self._seed, self._steps, self._episodes = seed, steps, episodes
+
+    def results(self, skills: Sequence[str]) -> tuple[Result, Result, Result]:
+        """Return the estimate of a chain, the product of its pairs, and what was measured."""
+
+        def estimate() -> list[float]:
+            return [chain(self._log, *skills, done=DONE).estimate]
+
+        def product() -> list[float]:
+            return [chain(self._log, *skills, done=DONE).product]
+
+        def share() -> list[float]:
+            return measured(self._run, skills, self._episodes).astype(float).tolist()
+
+        return (
+            self._kept(skills, f"estimate-{self._steps}", self._steps, estimate),
+            self._kept(skills, f"product-{self._steps}", self._steps, product),
+            self._kept(skills, "measured", self._episodes, share),
+        )
+
+    def _kept(
+        self, skills: Sequence[str], name: str, budget: int, find: Callable[[], list[float]]
+    ) -> Result:
+        """Return a result that is there, or find it and write it down."""
+        place = "chains", "-then-".join(skills), name, self._seed
+        if (known := self._cells.results.find(*place, budget)) is not None:
+            return known
+        began, scores = time.perf_counter(), find()
+        spent = time.perf_counter() - began
+        score = float(np.mean(scores))
+        result = Result(*place, score, budget, budget, spent, scores=scores, code=CODE)
+        self._cells.results.save(result)
+        return result
+
+    @cached_property
+    def _log(self) -> CallLog:
+        return self._cells.log(self._task, 1)
+
+    @cached_property
+    def _run(self) -> Run:
+        return self._cells.base(self._task)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -157,11 +174,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/plan"))
     asked = parser.parse_args(arguments)
     for seed in asked.seeds:
-        found = one_seed(asked.out, seed, asked.steps, asked.episodes)
-        rows = [_row(found[i : i + 3]) for i in range(0, len(found), 3)]
-        print(f"\nseed {seed}")
+        chains = Chains(asked.out, seed, asked.steps, asked.episodes)
+        rows, found = [], []
+        for skills in CHAINS:
+            three = chains.results(skills)
+            found += three
+            rows.append((", ".join(skills), *(f"{r.score:.2f}" for r in three)))
+            print(f"seed {seed}, {': '.join(rows[-1][:2])}, measured {rows[-1][3]}", flush=True)
+        off = np.abs([a.score - c.score for a, c in zip(found[::3], found[2::3], strict=True)])
+        print(f"\nseed {seed}, {asked.steps:,} logged steps")
         print(table(("chain", "estimate", "product of pairs", "measured"), rows))
-        off = np.array([abs(a.score - c.score) for a, c in zip(found[::3], found[2::3])])  # noqa: B905
         print(f"within {NEAR} of the measured share: {(off <= NEAR).sum()} of {len(off)} chains")
         if warning := of_other_code(found):
             print(warning)
