@@ -112,6 +112,7 @@ def test_a_log_without_the_task_scores_nothing_and_says_why(tmp_path):
     assert "nowhere" in said[0]
 
 
+@pytest.mark.slow
 def test_the_rule_and_a_selector_with_as_many_steps_stand_beside_it(tmp_path):
     cells = Cells(family(), tmp_path, 0, 4, lambda text: None)
     task = cells.family.tasks[0]
