@@ -1,6 +1,6 @@
 """Chains of the lander's skills: their success as a log estimates it, and as it is measured.
 
-    python -m benchmarks.plan.chains [--seeds 0] [--steps 100000] [--episodes 400] [--out runs/plan]
+    python -m benchmarks.plan.chains [--seeds 0] [--steps 300000] [--episodes 400] [--out runs/plan]
 
 A chain succeeds where each of its skills does its leg within one call: one after another, from the
 start of an episode. Random calls make the log. For the measurement the skills are called in the
@@ -169,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser.add_argument("--steps", type=int, default=300_000)
     parser.add_argument("--episodes", type=int, default=400)
     parser.add_argument("--out", type=Path, default=Path("runs/plan"))
     asked = parser.parse_args(arguments)
