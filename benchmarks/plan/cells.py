@@ -67,7 +67,8 @@ class Cells:
             else:
                 path = self._folder / "skills" / str(self.seed)
                 run = trained(self.family.source(), path, self.seed)
-            self._skills = dict(zip(run.policy.labels, run.policy.skills.policies, strict=True))
+            policy: Any = run.policy
+            self._skills = dict(zip(policy.labels, policy.skills.policies, strict=True))
         return self._skills
 
     def base(self, task: NewTask) -> Run:

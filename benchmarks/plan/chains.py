@@ -86,7 +86,7 @@ def did_all(log: CallLog, skills: Sequence[str], episodes: int) -> Array:
     for i, name in enumerate(skills):
         right = won & (log.skill == log.number(name)) & (log.order == i)
         done[:, i] = np.isin(np.arange(episodes), log.episode[right])
-    every: Array = done.all(axis=1)
+    every: Array = np.asarray(done.all(axis=1))
     return every
 
 
@@ -133,7 +133,8 @@ class Chains:
             return [chain(self._log, *skills, done=DONE).product]
 
         def share() -> list[float]:
-            return measured(self._run, skills, self._episodes).astype(float).tolist()
+            found: list[float] = measured(self._run, skills, self._episodes).astype(float).tolist()
+            return found
 
         return (
             self._kept(skills, f"estimate-{self._steps}", self._steps, estimate),
@@ -175,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     for seed in asked.seeds:
         chains = Chains(asked.out, seed, asked.steps, asked.episodes)
-        rows, found = [], []
+        rows, found = [], list[Result]()
         for skills in CHAINS:
             three = chains.results(skills)
             found += three

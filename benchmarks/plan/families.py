@@ -242,7 +242,8 @@ def patrols() -> Family:
 
 def _bridge_over(task: NewTask, skills: Policies, **how: Any) -> Hierarchy:
     settings = {"learn": "apart", "apart": Apart(selector_steps=200_000)} | how
-    found = bridge.declare(steps=None, workers=1, **settings)
+    nothing_together: Any = None
+    found = bridge.declare(nothing_together, workers=1, **settings)
     for skill in found.skills:
         skill.policy = skills[skill.name]
     return found
