@@ -179,7 +179,7 @@ def _maze_over(task: NewTask, skills: Policies, **how: Any) -> Hierarchy:
 
 
 PLACE = (0, 1)
-"""What makes two calls alike: with the speed beside it, calls behind walls count as near."""
+"""What makes two calls alike."""
 
 
 def maze() -> Family:
