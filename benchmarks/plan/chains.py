@@ -27,7 +27,7 @@ from benchmarks.plan.families import LEGS, lander
 from skillweave import Array, Run
 from skillweave.errors import SkillweaveError
 from skillweave.ops.threads import torch_threads
-from skillweave.planning import CallLog, chain, record_calls
+from skillweave.planning import CallLog, record_calls
 from skillweave.planning.hand_over import calls_done
 from skillweave.recipes import lander_missions
 from skillweave.types import Memory
@@ -127,10 +127,10 @@ class Chains:
         """Return the estimate of a chain, the product of its pairs, and what was measured."""
 
         def estimate() -> list[float]:
-            return [chain(self._log, *skills, done=DONE).estimate]
+            return [self._log.chain(*skills, done=DONE).estimate]
 
         def product() -> list[float]:
-            return [chain(self._log, *skills, done=DONE).product]
+            return [self._log.chain(*skills, done=DONE).product]
 
         def share() -> list[float]:
             found: list[float] = measured(self._run, skills, self._episodes).astype(float).tolist()

@@ -14,7 +14,7 @@ from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.paths import level_of, name_of
-from skillweave.planning import CallLog, HandOver, hand_over, join, record_calls
+from skillweave.planning import CallLog, HandOver, join, record_calls
 from skillweave.planning.record import RandomChoice
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.learning_task import LearningTask, skill_task
@@ -173,7 +173,7 @@ def measure(
         seed = SEED + len(parts)
         log = record_calls(spec, skills, size, choose=choose, num_envs=num_envs, seed=seed)
         steps += log.steps
-        found = hand_over(log, done)
+        found = log.hand_over(done)
         matrix = found if matrix is None else _sum(matrix, found)
         may = log.may_follow[log.skill == first][:, number * (log.choices // len(names))]
         may_start |= bool(may.any())
