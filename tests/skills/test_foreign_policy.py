@@ -343,5 +343,4 @@ def test_a_model_that_has_just_been_trained(kind, env):
     model = getattr(sb3, kind)("MlpPolicy", env, n_steps=8, device="cpu")
     model.learn(8)
     policy = from_sb3(model)
-    assert evaluate(policy, env, episodes=1, max_steps=5).episodes == 1
-    assert not policy.policy.training
+    assert len(evaluate(policy, env, episodes=1, max_steps=5).returns) == 1
