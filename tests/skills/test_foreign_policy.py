@@ -337,10 +337,10 @@ def test_a_policy_that_fails_is_named_before_it_is_scored():
         evaluate(from_torch(torch.nn.Linear(3, 2)), "CartPole-v1", episodes=1)
 
 
-@pytest.mark.parametrize(("kind", "env"), [("PPO", "CartPole-v1"), ("A2C", "Pendulum-v1")])
-def test_a_model_that_has_just_been_trained(kind, env):
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+def test_a_model_that_has_just_been_trained(env):
     sb3 = pytest.importorskip("stable_baselines3")
-    model = getattr(sb3, kind)("MlpPolicy", env, n_steps=8, device="cpu")
+    model = sb3.A2C("MlpPolicy", env, n_steps=8, device="cpu")
     model.learn(8)
     policy = from_sb3(model)
     assert len(evaluate(policy, env, episodes=1, max_steps=5).returns) == 1
