@@ -76,6 +76,7 @@ from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.learnable import Learnable
 from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -289,6 +290,7 @@ class Hierarchy(Declaration):
                 ``{"left": run, "right": other}``; a run of a plain agent fits any name. The policy
                 is copied (of PPO and DQN all networks, of SAC and TD3 the actor). The task may be
                 another one; spaces, networks and the names of a selector's skills must be the same.
+                In place of a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
             callback: a function that is called with a ``TrainEvent`` for each report of training
                 and each checkpoint. Where it returns False, the stage ends with what it has
                 learnt, as at a target, and the next one starts. An exception in it stops the
@@ -1041,8 +1043,9 @@ class PlannedRun(Run):
 
 
 OneRun = str | Path | Run
-StartFrom = OneRun | Mapping[str, OneRun] | None
-"""A run from which learners start, or such runs by the learners' names."""
+StartFrom = OneRun | Learnable | Mapping[str, OneRun | Learnable] | None
+"""A run from which learners start, or such runs by the learners' names; or policies made elsewhere
+(``from_sb3(..., learn=True)``)."""
 
 
 def _directories(start_from: StartFrom) -> Directories:
@@ -1052,7 +1055,7 @@ def _directories(start_from: StartFrom) -> Directories:
     return None if start_from is None else _directory(start_from)
 
 
-def _directory(run: OneRun) -> str | Path:
+def _directory(run: OneRun | Learnable) -> str | Path | Learnable:
     return run.path if isinstance(run, Run) else run
 
 
@@ -1138,8 +1141,8 @@ def train_agent(
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
-        start_from: another plain agent's run, or its directory: it starts with that policy; see
-            ``Hierarchy.train``.
+        start_from: another plain agent's run, or its directory: it starts with that policy; or
+            ``from_sb3(..., learn=True)``; see ``Hierarchy.train``.
         callback: is called with a ``TrainEvent`` for each report and each checkpoint; returning
             False ends the training; see ``Hierarchy.train``.
         keep: "best": end with the weights whose periodic evaluation was best.

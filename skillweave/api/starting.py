@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.errors import DeclarationError, RunError
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import as_path, close_matches, short
-from skillweave.paths import AGENT
+from skillweave.paths import AGENT, decides
 from skillweave.runs.initial_policies import (
     Chooses,
     Learnt,
@@ -20,12 +23,16 @@ from skillweave.runs.initial_policies import (
     record_initial_policies,
     same_shapes,
 )
+from skillweave.seeding import Seeds
+from skillweave.skills.learnable import Learnable
 from skillweave.spaces import same_space
 from skillweave.training.role import Role
 
 Directory = str | Path
-Directories = Directory | Mapping[str, Directory | Learnt] | None
-"""The directory of a run to start from, or such directories, or policies, by learners' names."""
+Origin = Directory | Learnable | Learnt
+"""What a learner starts from: a run's directory, or a policy."""
+Directories = Directory | Mapping[str, Origin] | Learnable | None
+"""What to start from: a run, a policy made elsewhere (of a plain agent), or these by learner."""
 
 
 def starts(
@@ -41,27 +48,80 @@ def starts(
         content: the manifest of the new run.
         roles: of its learners, by path.
     """
-    if start_from is None:
+    if isinstance(start_from, Learnable):
+        start_from = {AGENT: start_from}
+    skills = {path: role.skill for path, role in roles.items() if role.skill is not None}
+    declared = {path: s.policy for path, s in skills.items() if isinstance(s.policy, Learnable)}
+    if start_from is None and not declared:
         return {}, ""
     if isinstance(start_from, Mapping):
-        learnt, places = _learnt_by_name(content, start_from)
+        if not start_from:
+            raise DeclarationError('start_from is {}; name the run of each learner: {"left": run}')
+        learnt, places = _learnt_by_name(content, {**declared, **start_from}, roles)
     else:
-        place = _place(start_from, "start_from")
-        learnt = learners_of_run(place)
-        places = dict[str, Path | str].fromkeys(learnt, place)
+        learnt, places = _learnt_by_name(content, declared, roles)
+        if start_from is not None:
+            place = _place(start_from, "start_from")
+            found = learners_of_run(place)
+            learnt |= found
+            places |= dict.fromkeys(found, place)
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
     started = record_initial_policies(content["stages"], learnt, where)
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
-            config = stage.get("algorithms", {}).get(name, stage["algorithm"])
             role = roles[name]
             algorithm = make_algorithm(
-                config_from_json(config), role.observation_space, role.action_space
+                _config_in(stage, name), role.observation_space, role.action_space
             )
             chooses = options_of(content, name)
             _check_start(name, algorithm, chooses, learnt[name], places[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
+
+
+def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[str, Any]) -> Learnt:
+    """Return a policy made elsewhere as one that was learnt here.
+
+    What it does not have (of PyTorch modules the critic, for example) is drawn by the run's seed.
+
+    Raises:
+        DeclarationError: the algorithm has other networks; the message has the right ones.
+        PolicyError: it was made for other spaces.
+    """
+    if decides(name):
+        raise DeclarationError(
+            f"start_from: {origin.name} acts in an environment, and {name!r} does not learn that"
+        )
+    origin.check(role.observation_space, role.action_space, f"start_from: {name!r}")
+    first = next(stage for stage in content["stages"] if name in stage["learns"])
+    config = _config_in(first, name)
+    fits = origin.learning_on(config, repr(name))
+    changed = [
+        f"{f.name}={getattr(fits, f.name)!r}"
+        for f in fields(fits)
+        if getattr(fits, f.name) != getattr(config, f.name)
+    ]
+    if changed:
+        raise DeclarationError(
+            f"start_from: {name!r} cannot start with {origin.name}, whose networks are others: "
+            f"write {origin.kind}({', '.join(changed)}), with the settings that you have"
+        )
+    algorithm = make_algorithm(config, role.observation_space, role.action_space)
+    fresh = algorithm.weights(algorithm.init([Seeds(content["seed"]) / name / "start"]))
+    weights = {k: torch.from_numpy(v) for k, v in origin.weights(role.action_space).items()}
+    wrong = [k for k, v in weights.items() if k not in fresh or fresh[k].shape != v.shape]
+    if wrong:
+        raise PolicyError(
+            f"{origin.name} does not fit {name!r}: its network takes or returns another number of "
+            "values than the spaces have"
+        )
+    policy = AgentPolicy(algorithm, fresh | weights)
+    return Learnt(policy, origin.sha256(), origin.steps, None, ((), ()))
+
+
+def _config_in(stage: Mapping[str, Any], name: str) -> Any:
+    """Return the settings by which a learner learns in a stage of a manifest."""
+    return config_from_json(stage.get("algorithms", {}).get(name, stage["algorithm"]))
 
 
 def _place(run: Directory, argument: str) -> Path:
@@ -96,7 +156,9 @@ def _use_of(value: Any) -> tuple[str, str] | None:
         bare = not path.exists() and path.with_name(f"{path.name}.zip").exists()
         if path.suffix == ".zip" or bare:
             zipped = str(path) if path.suffix == ".zip" else f"{path}.zip"
-            return f"the file {zipped}", as_skill(f'sw.from_sb3({zipped!r}, "ppo", trust=True)')
+            call = f'sw.from_sb3({zipped!r}, "ppo", trust=True'
+            further = f"; to train it further, give {call}, learn=True) in place of the file"
+            return f"the file {zipped}", as_skill(f"{call})") + further
         if path.suffix == ".onnx":
             return f"the file {path}", as_skill(f"sw.from_onnx({str(path)!r})")
         if path.suffix in (".pt", ".pth"):
@@ -106,11 +168,13 @@ def _use_of(value: Any) -> tuple[str, str] | None:
             return f"the weights file {path}", way
         return None
     if hasattr(value, "predict") and hasattr(value, "policy"):  # a model of Stable-Baselines3
-        return f"a {type(value).__name__}", as_skill("sw.from_sb3(model)")
+        further = "; to train it further, give sw.from_sb3(model, learn=True) in its place"
+        return f"a {type(value).__name__}", as_skill("sw.from_sb3(model)") + further
     if hasattr(value, "state_dict") and not isinstance(value, type):
         learns = (
-            "; or to train it further, let a function of the observation space return a copy of "
-            "its layers before the last: Network(encoder=function)"
+            "; to train it further, give sw.from_torch(module, learn=True) in its place, or let a "
+            "function of the observation space return a copy of its layers before the last: "
+            "Network(encoder=function)"
         )
         return f"a {type(value).__name__}, a torch module", as_skill("module") + learns
     if callable(value) or (hasattr(value, "act") and hasattr(value, "start")):
@@ -119,9 +183,9 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 
 def _learnt_by_name(
-    content: dict[str, Any], start_from: Mapping[str, Directory | Learnt]
+    content: dict[str, Any], start_from: Mapping[str, Origin], roles: Mapping[str, Role]
 ) -> tuple[dict[str, Learnt], dict[str, Path | str]]:
-    """Return the policy that each named learner starts from, and the run that holds it, in words.
+    """Return the policy that each named learner starts from, and where it is from, in words.
 
     Raises:
         DeclarationError: a name does not learn here.
@@ -131,8 +195,6 @@ def _learnt_by_name(
     learnt: dict[str, Learnt] = {}
     places: dict[str, Path | str] = {}
     known: dict[Path, dict[str, Learnt]] = {}
-    if not start_from:
-        raise DeclarationError('start_from is {}; name the run of each learner: {"left": run}')
     for name, run in start_from.items():
         if name not in here:
             near = close_matches(str(name), here)
@@ -142,6 +204,10 @@ def _learnt_by_name(
             )
         if isinstance(run, Learnt):
             learnt[name], places[name] = run, "the plan"
+            continue
+        if isinstance(run, Learnable):
+            learnt[name] = _learnt_elsewhere(name, run, roles[name], content)
+            places[name] = run.name
             continue
         place = _place(run, f"start_from[{name!r}]")
         if place not in known:

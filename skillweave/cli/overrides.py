@@ -18,7 +18,7 @@ from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.settings import annotations_of, described, options_of
-from skillweave.skills import Skill
+from skillweave.skills import Skill, is_trained
 
 PLAIN = ("call_steps", "steps", "learn")
 """Fields of a hierarchy that are set by themselves."""
@@ -98,7 +98,7 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
     values = {k: v for k, v in values.items() if k not in ("train.flat", "guide.selector")}
     budgets = declaration.budgets()
     for skill in declaration.skills:
-        if skill.policy is None:
+        if is_trained(skill):
             values[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
             values[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm

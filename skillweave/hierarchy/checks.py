@@ -79,8 +79,9 @@ def _check_untrained(skill: Skill) -> None:
             advice += f" (or set them to None: {', '.join(f'skill.{f} = None' for f in ignored)})"
         raise DeclarationError(
             f"skill {skill.name!r} has a policy, so it is not trained, and its {fields} would be "
-            f"ignored: {advice}, or leave out policy to train it. To train a skill of another "
-            "run of Skillweave further, leave out policy and call "
+            f"ignored: {advice}, or leave out policy to train it. To train a policy from "
+            "elsewhere further, write policy = from_sb3(..., learn=True), or from_torch's; a skill "
+            "of another run of Skillweave, leave out policy and call "
             f"train(start_from={{{skill.name!r}: run}})"
         )
 

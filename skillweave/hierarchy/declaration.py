@@ -29,7 +29,7 @@ from skillweave.planning.predicates import named_predicates
 from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import EnvValue, check_env
 from skillweave.training.defaults import TrainDefaults
@@ -184,7 +184,7 @@ class Declaration(Nestable):
             raise DeclarationError(f"scale is {factor}; it must be positive and finite")
         for path, hierarchy in hierarchies_of(self).items():
             for skill in hierarchy.skills:
-                if skill.policy is None:
+                if is_trained(skill):
                     skill.steps = _scaled(skill.steps, factor)
             # A hierarchy below without its own total shares the outer one.
             steps = hierarchy.steps or (None if path else DEFAULT_STEPS)

@@ -18,6 +18,7 @@ from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted
+from skillweave.skills.learnable import Learnable
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -48,6 +49,9 @@ def _check_learner(role: Role, where: str) -> None:
     if role.config is not None:
         check_spaces(role.config, role.action_space, where)
         read_by(role.config, role.observation_space, where)
+    if role.skill is not None and isinstance(role.skill.policy, Learnable):
+        who = f"skill {role.path!r}"
+        role.skill.policy.check(role.observation_space, role.action_space, who)
 
 
 def ready_policies(roles: Roles) -> dict[str, Policy]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -190,19 +190,21 @@ def measure(
 
 
 def _sum(one: HandOver, other: HandOver) -> HandOver:
-    return HandOver(one.skills, one.calls + other.calls, one.done + other.done, one.cut + other.cut)
+    counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "cut")}
+    return replace(one, **counts)
 
 
 def matrix_to_json(matrix: HandOver) -> dict[str, Any]:
     """Return a matrix as plain JSON."""
     counts = {k: getattr(matrix, k).tolist() for k in ("calls", "done", "cut")}
-    return {"skills": list(matrix.skills)} | counts
+    names = {"skills": list(matrix.skills), "by_itself": list(matrix.by_itself)}
+    return names | counts
 
 
 def matrix_from_json(entry: Mapping[str, Any]) -> HandOver:
     """Return the matrix of ``matrix_to_json``."""
-    counts = (np.array(entry[k], np.int64) for k in ("calls", "done", "cut"))
-    return HandOver(tuple(entry["skills"]), *counts)
+    calls, done, cut = (np.array(entry[k], np.int64) for k in ("calls", "done", "cut"))
+    return HandOver(tuple(entry["skills"]), calls, done, cut, tuple(entry["by_itself"]))
 
 
 def judge_repair(

@@ -22,7 +22,8 @@ from skillweave.messages import short
 from skillweave.paths import CRITIC, SELECTOR, is_below, join, level_of, levels_to, name_of
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Reflex, Skill, is_trained
+from skillweave.skills.learnable import Learnable
 from skillweave.training.role import Role
 from skillweave.training.stage import Together
 from skillweave.types import Policy
@@ -160,7 +161,11 @@ class Level:
     def role_of_skill(self, path: str, spec: EnvSpec) -> Role:
         """Return the role of one of its skills, in the environment ``spec``."""
         skill = self.skills[path]
-        config = None if skill.policy is not None else skill.algorithm or self.algorithm
+        config = None
+        if is_trained(skill):
+            config = skill.algorithm or self.algorithm
+        if isinstance(skill.policy, Learnable):
+            config = skill.policy.learning_on(config, f"skill {path!r}")
         greedy = self.selection.greedy_skills is not False
         return Role(path, "skill", spec, config, skill, greedy=greedy)
 
@@ -265,8 +270,7 @@ class Roles:
     def is_data(self) -> bool:
         """True if acting needs none of the user's Python code, so a saved run is complete."""
         ready = any(
-            skill.policy is not None and path not in self.levels
-            for path, skill in self.skills.items()
+            not is_trained(skill) and path not in self.levels for path, skill in self.skills.items()
         )
         return not ready and all(x.is_data for x in self.levels.values()) and self.spec.is_data
 

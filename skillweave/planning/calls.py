@@ -112,10 +112,10 @@ class CallLog(CallColumns):
     ) -> Blame:
         """Return why a skill fails after another one: would other ends of the first one do?
 
-        Each call of the second skill after the first is predicted by the nearest other ones. If the
-        third of the first skill's ends with the best predictions serve about as well as other starts
-        do, and the other ends clearly worse, then the first skill is to blame for how it ends; else the
-        second has never learnt to start there.
+        Each call of the second skill after the first is predicted by the nearest other ones. If
+        the third of the first skill's ends with the best predictions serve about as well as other
+        starts do, and the other ends clearly worse, then the first skill is to blame for how it
+        ends; else the second has never learnt to start there.
 
         Args:
             skill: the second skill.

@@ -137,6 +137,8 @@ class Matrix(TypedDict):
     calls: list[list[Count]]
     done: list[list[Count]]
     cut: list[Count]
+    by_itself: list[str]
+    """Skills whose calls were done if they ended by themselves."""
 
 
 class RepairEntry(TypedDict):

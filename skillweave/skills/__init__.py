@@ -1,7 +1,7 @@
 """Skills and reflexes, which users declare."""
 
 from skillweave.skills.answers import checked
-from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, path_of
+from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
 from skillweave.skills.sb3 import from_sb3
@@ -18,6 +18,7 @@ __all__ = [
     "from_onnx",
     "from_sb3",
     "from_torch",
+    "is_trained",
     "path_of",
     "ready_policy",
 ]

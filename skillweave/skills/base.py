@@ -17,6 +17,7 @@ from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
+from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
 from skillweave.skills.spelling import misspelt
@@ -151,7 +152,7 @@ class Skill:
         for field in ("max_steps", "call_steps", *_OF_TRAINING):
             value = getattr(self, field)
             converted = fitted(kinds[field], value, f"{where}: {field}")
-            if converted is not value and (self.policy is None or field not in _OF_TRAINING):
+            if converted is not value and (is_trained(self) or field not in _OF_TRAINING):
                 with suppress(AttributeError):  # of a property
                     setattr(self, field, converted)
         if self.color is not None and not _is_color(self.color):
@@ -212,6 +213,11 @@ def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
         value = getattr(skill, field)
         if field not in ("name", "methods", "_path") and value is not getattr(Skill, field):
             yield field, value
+
+
+def is_trained(skill: Skill) -> bool:
+    """Return whether a skill is trained: it has no policy, or one that it learns on with."""
+    return skill.policy is None or isinstance(skill.policy, Learnable)
 
 
 def path_of(skill: Skill) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.skills.base import Skill
+from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -22,7 +22,7 @@ def ready_policy(skill: Skill) -> Policy | None:
         DeclarationError: the attribute ``policy`` cannot act.
     """
     value: Any = skill.policy
-    if value is None:
+    if is_trained(skill):
         return None
     where = f"skill {skill.name!r}: policy is"
     if isinstance(value, type):

@@ -8,17 +8,18 @@ from __future__ import annotations
 import copy
 import io
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from gymnasium import Env, Space
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, MultiBinary
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.reading import check_file, read_file
-from skillweave.skills.foreign_policy import checksum
+from skillweave.skills.foreign_policy import checksum, made_up
+from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
 from skillweave.skills.plan import Shapes
@@ -64,7 +65,7 @@ class SB3Policy(MappedPolicy):
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy; images may have their channels last if the model transposes them."""
         bound = super().bind(observation_space, action_space, who)
-        bound.policy = copy.deepcopy(self.policy)
+        bound.policy = _copied(self.policy, self.model_space)
         mine = self.model_space
         theirs = observation_space
         if (
@@ -125,8 +126,47 @@ class SB3Policy(MappedPolicy):
     def restored(self, content: bytes) -> Self:
         """Return a copy with these weights."""
         policy = copy.copy(self)
-        policy.policy = with_weights(self.policy, content, self._who)
+        copied = _copied(self.policy, self.model_space)
+        policy.policy = with_weights(copied, content, self._who)
         return policy
+
+
+def _copied(policy: Any, space: Space[Any]) -> Any:
+    """Return a copy of a model's policy, in evaluation mode.
+
+    After training its latest distribution is part of a graph, which cannot be copied; acting once
+    replaces it.
+    """
+    from skillweave.spaces import unpack
+
+    policy.predict(unpack(space, made_up(space, 1)), deterministic=True)
+    return copy.deepcopy(policy)
+
+
+@overload
+def from_sb3(
+    model: Any,
+    algorithm: str | type | None = None,
+    *,
+    trust: bool = False,
+    normalize: Any = None,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    learn: Literal[False] = False,
+) -> SB3Policy: ...
+
+
+@overload
+def from_sb3(
+    model: Any,
+    algorithm: str | type | None = None,
+    *,
+    trust: bool = False,
+    normalize: Any = None,
+    learn: Literal[True],
+) -> Learnable: ...
 
 
 @checked_names
@@ -140,11 +180,17 @@ def from_sb3(
     goal: Any = None,
     acts: Any = None,
     every: int = 1,
-) -> SB3Policy:
+    learn: bool = False,
+) -> SB3Policy | Learnable:
     """Return a Stable-Baselines3 model as a skill's policy.
 
     The run records a zip's path and checksum, without a copy; it copies the weights of a model in
     memory.
+
+    With ``learn=True`` the skill is trained, and begins with the model's networks: PPO's and A2C's
+    by ``PPO``, SAC's, TD3's, DDPG's and DQN's by the same algorithm, of SAC, TD3 and DDPG the actor
+    alone. It keeps their layers (``MlpPolicy``); the other settings are those of the skill's
+    ``algorithm``.
 
     Args:
         model: a zip that Stable-Baselines3 saved, or a model in memory.
@@ -157,12 +203,14 @@ def from_sb3(
         goal: the value of ``Goal()`` in ``sees``; see ``from_onnx``.
         acts: the meaning of the model's actions, ``Acts(...)``; None: they are the environment's.
         every: each action is held for this number of steps.
+        learn: the skill learns on from the model.
 
     Returns:
-        The policy, for a skill's ``policy`` or ``evaluate``.
+        The policy, for a skill's ``policy`` or ``evaluate``; with ``learn=True`` for a skill's
+        ``policy`` or ``start_from``.
 
     Raises:
-        PolicyError: a file is not trusted, or holds no such model.
+        PolicyError: a file is not trusted, or holds no such model, or no model that can learn on.
         RunError: a file does not exist.
         DeclarationError: an argument has a wrong type.
     """
@@ -172,6 +220,8 @@ def from_sb3(
             raise DeclarationError(
                 f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
             )
+        if learn:
+            return _learnable(model, None, normalize, trust, options)
         return SB3Policy(model, mapping=_mapping(model, normalize, trust, options))
     file = Path(model)
     if trust is not True:
@@ -191,7 +241,98 @@ def from_sb3(
             f"{file} could not be opened as Stable-Baselines3's {kind.__name__}: "
             f"{type(error).__name__}: {shortened(str(error))}"
         ) from error
+    if learn:
+        return _learnable(loaded, file, normalize, trust, options)
     return SB3Policy(loaded, file, checksum(content), _mapping(loaded, normalize, trust, options))
+
+
+def _learnable(
+    model: Any, file: Path | None, normalize: Any, trust: bool, options: dict[str, Any]
+) -> Learnable:
+    """Return the networks of a model.
+
+    Raises:
+        PolicyError: its networks are of another kind.
+        DeclarationError: a mapping is given.
+    """
+    kind, policy = type(model).__name__, model.policy
+    name = f"Stable-Baselines3's {kind}" + (f" of {file}" if file else "")
+    given = [k for k, v in options.items() if v is not None and v != 1]
+    if given:
+        raise DeclarationError(
+            f"from_sb3(learn=True): {name} learns on with the environment's own observations and "
+            f"actions: leave out {' and '.join(given)}"
+        )
+    kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
+    spaces = model.observation_space, model.action_space
+    gsde = getattr(policy, "use_sde", False) or getattr(policy, "use_gsde", False)
+    gsde = gsde or getattr(getattr(policy, "actor", None), "use_sde", False)
+    if kind not in kinds or hasattr(policy, "lstm_actor") or gsde:
+        raise PolicyError(
+            f"{name} cannot learn on: only the networks of {', '.join(kinds)} without memory and "
+            "without gSDE are known. Let it act as it is (without learn=True)"
+        )
+    if isinstance(model.action_space, MultiBinary):
+        raise PolicyError(
+            f"{name} cannot learn on: it has one output for each bit of {model.action_space}, and "
+            "networks here have two. Let it act as it is (without learn=True)"
+        )
+    modules = (policy, *policy.children())
+    extractors = (getattr(module, "features_extractor", None) for module in modules)
+    _check_features(next(x for x in extractors if x is not None), name)
+    scaling = None if normalize is None else _moments(normalize, trust, *spaces)
+    common: dict[str, Any] = {
+        "scaling": scaling,
+        "observation_space": spaces[0],
+        "action_space": spaces[1],
+    }
+    if kinds[kind] == "PPO":
+        hidden = policy.mlp_extractor
+        networks = {
+            "actor": layers_of([hidden.policy_net, policy.action_net], name),
+            "critic": layers_of([hidden.value_net, policy.value_net], name),
+        }
+        log_std = getattr(policy, "log_std", None)
+        common["log_std"] = None if log_std is None else array_of(log_std)
+        # The critic's values are in units of reward.
+        settings = PLAIN_PPO | {"normalize_returns": False}
+        return Learnable(name, "PPO", networks, env_units=True, settings=settings, **common)
+    if kind == "DQN":
+        plain = {"dueling": False, "noisy": False, "distributional": False}
+        networks = {"q": layers_of([policy.q_net.q_net], name)}
+        return Learnable(name, "DQN", networks, settings=plain, **common)
+    actor = policy.actor
+    if kind == "SAC":
+        mean, log_std = (layers_of([actor.latent_pi, x], name) for x in (actor.mu, actor.log_std))
+        networks = {"actor": mean.beside(log_std)}
+    else:
+        networks = {"actor": layers_of(list(actor.mu)[:-1], name)}  # tanh follows here, too
+    return Learnable(name, kinds[kind], networks, **common)
+
+
+def _check_features(extractor: Any, name: str) -> None:
+    """Raise a PolicyError where observations pass through more than flattening and joining."""
+    parts = getattr(extractor, "extractors", {"": extractor})
+    kinds = {type(part).__name__ for part in parts.values()}
+    if kinds - {"FlattenExtractor", "Flatten"}:
+        raise PolicyError(
+            f"{name} cannot learn on: its observations pass through {', '.join(sorted(kinds))}, "
+            "and only networks of linear layers are known. Let it act as it is (without learn=True)"
+        )
+
+
+def _moments(
+    normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
+) -> tuple[Array, Array, float]:
+    """Return mean, variance and number of observations, by ``VecNormalize``."""
+    normalize = _opened(normalize, trust, space, action_space)
+    rms: Any = getattr(normalize, "obs_rms", None)
+    if isinstance(rms, dict) or not isinstance(space, Box):
+        raise PolicyError(
+            f"from_sb3(learn=True): normalize scales parts of {short(space, 200)}, and only "
+            "observations of a Box can be scaled further"
+        )
+    return np.ravel(rms.mean), np.ravel(rms.var), float(rms.count)
 
 
 def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
@@ -226,18 +367,24 @@ def _opened_statistics(file: Path, space: Space[Any], action_space: Space[Any]) 
         ) from error
 
 
+def _opened(normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]) -> Any:
+    """Return the ``VecNormalize`` that is given, or that is in the file that is given."""
+    if not isinstance(normalize, str | Path):
+        return normalize
+    file = Path(normalize)
+    if trust is not True:
+        raise PolicyError(
+            f"{file} was not opened: VecNormalize is saved as a pickle, which can run any code "
+            "on your machine. If you trust its author, add trust=True"
+        )
+    return _opened_statistics(file, space, action_space)
+
+
 def _statistics(
     normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
 ) -> dict[str, Scaling]:
     """Return the scaling of observations by ``VecNormalize``, by the name of the input."""
-    if isinstance(normalize, str | Path):
-        file = Path(normalize)
-        if trust is not True:
-            raise PolicyError(
-                f"{file} was not opened: VecNormalize is saved as a pickle, which can run any code "
-                "on your machine. If you trust its author, add trust=True"
-            )
-        normalize = _opened_statistics(file, space, action_space)
+    normalize = _opened(normalize, trust, space, action_space)
     rms: Any = getattr(normalize, "obs_rms", None)
     if not getattr(normalize, "norm_obs", True):
         return {}

@@ -7,7 +7,7 @@ import io
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 import numpy as np
 from gymnasium import Space
@@ -17,6 +17,7 @@ from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import checksum, qualified
+from skillweave.skills.learnable import Learnable, of_module
 from skillweave.skills.mapped import (
     MappedPolicy,
     invoke,
@@ -135,6 +136,33 @@ class TorchPolicy(MappedPolicy):
         return policy
 
 
+@overload
+def from_torch(
+    module: nn.Module | str | Path,
+    *,
+    trust: bool = False,
+    sees: Any = None,
+    goal: Any = None,
+    acts: Any = None,
+    every: int = 1,
+    chunk: int | None = None,
+    state: Any = None,
+    observation_space: Any = None,
+    action_space: Any = None,
+    learn: Literal[False] = False,
+) -> TorchPolicy: ...
+
+
+@overload
+def from_torch(
+    module: nn.Module,
+    *,
+    observation_space: Any = None,
+    action_space: Any = None,
+    learn: Literal[True],
+) -> Learnable: ...
+
+
 @checked_names
 def from_torch(
     module: nn.Module | str | Path,
@@ -148,7 +176,8 @@ def from_torch(
     state: Any = None,
     observation_space: Any = None,
     action_space: Any = None,
-) -> TorchPolicy:
+    learn: bool = False,
+) -> TorchPolicy | Learnable:
     """Return a PyTorch module as a skill's policy; a skill takes the bare module too.
 
     ``forward`` receives observations (n, *obs_shape) of the type of its weights (float32 without
@@ -160,6 +189,10 @@ def from_torch(
 
     Its weights are copied into the run; loading the run replaces the weights of the recipe's module
     by them. A file is recorded by its path and checksum, without a copy.
+
+    With ``learn=True`` the skill is trained by ``PPO``, and begins with the module, a
+    ``Sequential`` of linear layers with one kind of nonlinearity between them; the critic and the
+    deviation of actions start afresh.
 
     Args:
         module: acts in evaluation mode, as a copy made when training starts; or a file of
@@ -175,18 +208,25 @@ def from_torch(
             or a list of shapes, for a tuple of tensors. It starts with zeros.
         observation_space: None: the environment's.
         action_space: None: the environment's.
+        learn: the skill learns on from the module.
 
     Returns:
-        The policy, for a skill's ``policy`` or ``evaluate``.
+        The policy, for a skill's ``policy`` or ``evaluate``; with ``learn=True`` for a skill's
+        ``policy`` or ``start_from``.
 
     Raises:
         DeclarationError: it is not an instance of a module, or an argument is wrong.
-        PolicyError: the file is not trusted, or holds no module.
+        PolicyError: the file is not trusted, or holds no module; or the module cannot learn on.
         RunError: the file does not exist.
     """
     mapping = mapping_of(
         "from_torch()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
     )
+    if learn and (mapping != PolicyMapping() or isinstance(module, str | Path)):
+        raise DeclarationError(
+            "from_torch(learn=True) takes a module made of its class, which learns on with the "
+            "environment's own observations and actions: leave out sees, acts and the like"
+        )
     if isinstance(module, str | Path):
         file = Path(module)
         if trust is not True:
@@ -199,6 +239,8 @@ def from_torch(
         return TorchPolicy(loaded, observation_space, action_space, mapping, file, content)
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
+    if learn:
+        return of_module(module, f"module {type(module).__name__}", observation_space, action_space)
     return TorchPolicy(module, observation_space, action_space, mapping)
 
 

@@ -1,0 +1,280 @@
+"""A policy from elsewhere with ``learn=True``: a skill begins with its networks, and learns on."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import skillweave as sw
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.seeding import Seeds
+
+sb3 = pytest.importorskip("stable_baselines3")
+
+
+class World(gym.Env):
+    """Ten steps of noise; pays the first number of the action, or 1 for action 1."""
+
+    def __init__(self, observation=None, action=None):
+        self.observation_space = observation or gym.spaces.Box(-2, 2, (3,), np.float32)
+        self.action_space = action or gym.spaces.Box(
+            np.array([-1.0, 2.0], np.float32), np.array([3.0, 2.5], np.float32)
+        )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        if seed is not None:
+            self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.t += 1
+        reward = float(np.ravel(action)[0])
+        return self.observation_space.sample(), reward, False, self.t >= 10, {}
+
+
+DISCRETE = gym.spaces.Discrete(3)
+SMALL = {
+    "PPO": sw.PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1),
+    "SAC": sw.SAC(num_envs=2, learning_starts=8, batch_size=8),
+    "TD3": sw.TD3(num_envs=2, learning_starts=8, batch_size=8),
+    "DQN": sw.DQN(num_envs=2, learning_starts=8, batch_size=8),
+}
+LEARNS_BY = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
+
+
+def model_of(kind, env, **settings):
+    torch.manual_seed(1)
+    model = getattr(sb3, kind)("MlpPolicy", env, seed=3, device="cpu", **settings)
+    with torch.no_grad():
+        for weights in model.policy.parameters():
+            weights.mul_(1.3).add_(0.02)
+    return model
+
+
+def agent_of(learnable, config, env):
+    algorithm = make_algorithm(
+        learnable.learning_on(config, "skill 'x'"), env.observation_space, env.action_space
+    )
+    fresh = algorithm.weights(algorithm.init([Seeds(0)]))
+    given = learnable.weights(env.action_space)
+    return AgentPolicy(algorithm, fresh | {k: torch.from_numpy(v) for k, v in given.items()})
+
+
+@pytest.mark.parametrize("kind", LEARNS_BY)
+def test_it_acts_as_the_model_does(kind):
+    env = World(action=DISCRETE if kind in ("DQN", "A2C") else None)
+    model = model_of(kind, env)
+    agent = agent_of(sw.from_sb3(model, learn=True), SMALL[LEARNS_BY[kind]], env)
+    obs = np.stack([env.observation_space.sample() for _ in range(100)])
+    actions, _ = agent.act(agent.start(100), obs)
+    np.testing.assert_allclose(actions, model.predict(obs, deterministic=True)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Discrete(5),
+        gym.spaces.MultiDiscrete([3, 2]),
+        gym.spaces.MultiBinary(4),
+        gym.spaces.Box(-1, 1, (2, 3), np.float32),
+    ],
+    ids=str,
+)
+def test_observations_of_other_kinds(space):
+    env = World(space, gym.spaces.MultiDiscrete([3, 4]))
+    model = model_of("PPO", env)
+    agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
+    obs = np.stack([space.sample() for _ in range(50)])
+    actions, _ = agent.act(agent.start(50), obs)
+    np.testing.assert_array_equal(actions, model.predict(obs, deterministic=True)[0])
+
+
+def test_dict_observations():
+    space = gym.spaces.Dict(
+        {"b": gym.spaces.Box(-1, 1, (2,), np.float32), "a": gym.spaces.Discrete(3)}
+    )
+    env = World(space, DISCRETE)
+    model = sb3.PPO("MultiInputPolicy", env, seed=3, device="cpu")
+    agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
+    rows = [space.sample() for _ in range(50)]
+    obs = {k: np.stack([r[k] for r in rows]) for k in space.spaces}
+    actions, _ = agent.act(agent.start(50), obs)
+    np.testing.assert_array_equal(actions, model.predict(obs, deterministic=True)[0])
+
+
+def test_the_deviation_of_actions_and_the_values_come_along():
+    env = World()
+    model = model_of("PPO", env)
+    agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
+    # The first action spans 4, the second 0.5: in [-1, 1] a deviation is half the span as large.
+    std = np.exp(model.policy.log_std.detach().numpy()) / np.array([2.0, 0.25])
+    np.testing.assert_allclose(np.exp(agent.weights["actor.log_std"][0]), std, rtol=1e-5)
+    obs = torch.randn(20, 3)
+    state = agent.algorithm.init([Seeds(0)])
+    agent.algorithm.set_weights(state, agent.weights)
+    values = agent.algorithm.value(state, obs[None])[0]
+    theirs = model.policy.predict_values(obs)[:, 0]
+    torch.testing.assert_close(values, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_statistics_of_observations_come_along():
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    vec = VecNormalize(DummyVecEnv([World]))
+    vec.reset()
+    for _ in range(20):
+        vec.step([vec.action_space.sample()])
+    model = model_of("PPO", vec)
+    learnable = sw.from_sb3(model, normalize=vec, learn=True)
+    agent = agent_of(learnable, SMALL["PPO"], World())
+    obs = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    theirs = model.predict(vec.normalize_obs(obs), deterministic=True)[0]
+    np.testing.assert_allclose(agent.act({}, obs)[0], theirs, atol=1e-5)
+    assert learnable.steps == pytest.approx(vec.obs_rms.count, abs=1)
+
+
+def test_a_sequential_module():
+    torch.manual_seed(0)
+    module = torch.nn.Sequential(
+        torch.nn.Flatten(),
+        torch.nn.Linear(3, 8),
+        torch.nn.ReLU(),
+        torch.nn.Sequential(torch.nn.Linear(8, 4), torch.nn.ReLU()),
+        torch.nn.Linear(4, 2, bias=False),
+    )
+    env = World()
+    agent = agent_of(sw.from_torch(module, learn=True), SMALL["PPO"], env)
+    obs = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    with torch.no_grad():
+        wanted = module(torch.from_numpy(obs)).numpy()
+    wanted = wanted.clip(env.action_space.low, env.action_space.high)
+    np.testing.assert_allclose(agent.act({}, obs)[0], wanted, atol=1e-5)
+
+
+def skill(policy, **fields):
+    return type("Walk", (sw.Skill,), {"policy": policy, **fields})()
+
+
+def hierarchy(walk, **settings):
+    given = {"algorithm": SMALL["PPO"], "selector": SMALL["PPO"], "steps": 64, "call_steps": 4}
+    return sw.Hierarchy(sw.EnvSpec(World, workers=1), [walk], **(given | settings))
+
+
+def test_a_skill_begins_with_it_and_learns(tmp_path):
+    model = model_of("PPO", World())
+    walk = skill(sw.from_sb3(model, learn=True), steps=32)
+    run = hierarchy(walk, learn="apart").train(tmp_path / "run", quiet=True)
+    entry = run.info()["stages"][0]
+    assert entry["name"] == "walk"
+    assert entry["starts"]["walk"]["run"] is None
+    ours = run.policy.skills.policies[0]
+    first = model.policy.mlp_extractor.policy_net[0].weight.detach().numpy().T
+    moved = np.abs(ours.weights["actor.0.weight"].numpy() - first).max()
+    assert 0 < moved < 0.05  # two updates from the model's weights
+    again = hierarchy(walk, learn="apart").load(tmp_path / "run")
+    obs = np.zeros((4, 3), np.float32)
+    np.testing.assert_array_equal(
+        again.policy.skills.policies[0].act({}, obs)[0], ours.act({}, obs)[0]
+    )
+
+
+@pytest.mark.parametrize("kind", ["SAC", "DQN"])
+def test_off_policy_skills_act_with_it_from_the_start(kind, tmp_path):
+    env = World(action=DISCRETE if kind == "DQN" else None)
+    walk = skill(sw.from_sb3(model_of(kind, env), learn=True), algorithm=SMALL[kind], steps=32)
+    made = sw.Hierarchy(
+        sw.EnvSpec(lambda: World(action=env.action_space), workers=1),
+        [walk],
+        selector=SMALL["PPO"],
+        steps=64,
+        call_steps=4,
+        learn="apart",
+    )
+    run = made.train(tmp_path / "run", quiet=True)
+    assert run.info()["stages"][0]["starts"]["walk"]["steps"] == 0
+
+
+def test_resumed_it_ends_with_the_same_weights(tmp_path):
+    def declared():
+        walk = skill(sw.from_sb3(model_of("PPO", World()), learn=True), steps=64)
+        return hierarchy(walk, learn="apart", steps=96)
+
+    whole = declared().train(tmp_path / "whole", quiet=True)
+
+    def stop(event):
+        if event.steps >= 32:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        declared().train(tmp_path / "cut", quiet=True, callback=stop, checkpoint_every=16)
+    cut = declared().train(tmp_path / "cut", resume=True, quiet=True)
+    for ours, theirs in zip(whole.policy.skills.policies, cut.policy.skills.policies, strict=True):
+        for name, value in ours.weights.items():
+            torch.testing.assert_close(theirs.weights[name], value, rtol=0, atol=0)
+
+
+def test_a_plain_agent_starts_from_it(tmp_path):
+    model = model_of("PPO", World())
+    learnable = sw.from_sb3(model, learn=True)
+    config = learnable.learning_on(SMALL["PPO"], "agent")
+    run = sw.Agent(World, config, 16).train(tmp_path / "run", start_from=learnable, quiet=True)
+    assert "agent" in run.info()["stages"][0]["starts"]
+    with pytest.raises(sw.DeclarationError, match=r"write PPO\(.*normalize_obs=False"):
+        sw.Agent(World, SMALL["PPO"], 16).train(
+            tmp_path / "other", start_from=learnable, quiet=True
+        )
+
+
+class TestRefused:
+    def test_another_algorithm(self, tmp_path):
+        walk = skill(sw.from_sb3(model_of("SAC", World()), learn=True))
+        with pytest.raises(sw.DeclarationError, match=r"'walk'.*SAC learns on by SAC.*is PPO"):
+            hierarchy(walk).train(tmp_path / "run", quiet=True)
+
+    def test_other_spaces(self, tmp_path):
+        env = World(gym.spaces.Box(-2, 2, (5,), np.float32))
+        walk = skill(sw.from_sb3(model_of("PPO", env), learn=True))
+        with pytest.raises(sw.PolicyError, match=r"'walk'.*observation_space"):
+            hierarchy(walk).train(tmp_path / "run", quiet=True)
+
+    def test_a_module_of_another_size(self, tmp_path):
+        walk = skill(sw.from_torch(torch.nn.Linear(5, 2), learn=True))
+        with pytest.raises(sw.PolicyError, match="does not fit 'walk'"):
+            hierarchy(walk).train(tmp_path / "run", quiet=True)
+
+    @pytest.mark.parametrize(
+        "module",
+        [
+            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Dropout(), torch.nn.Linear(4, 2)),
+            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2)),
+            torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh()),
+            torch.nn.LSTM(3, 2),
+        ],
+        ids=lambda m: type(m).__name__,
+    )
+    def test_a_module_of_other_layers(self, module):
+        with pytest.raises(sw.PolicyError, match="cannot learn on"):
+            sw.from_torch(module, learn=True)
+
+    def test_a_mapping(self):
+        model = model_of("PPO", World())
+        with pytest.raises(sw.DeclarationError, match="leave out sees and every"):
+            sw.from_sb3(model, sees=(0, 1, 2), every=2, learn=True)
+        with pytest.raises(sw.DeclarationError, match="leave out sees"):
+            sw.from_torch(torch.nn.Linear(3, 2), every=2, learn=True)
+
+    def test_images_and_gsde(self):
+        space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+        images = sb3.PPO("CnnPolicy", World(space, DISCRETE), device="cpu")
+        with pytest.raises(sw.PolicyError, match=r"cannot learn on.*NatureCNN"):
+            sw.from_sb3(images, learn=True)
+        with pytest.raises(sw.PolicyError, match="gSDE"):
+            sw.from_sb3(model_of("PPO", World(), use_sde=True), learn=True)
+
+    def test_numbers_that_are_not_finite(self):
+        module = torch.nn.Linear(3, 2)
+        module.weight.data[0, 0] = float("nan")
+        with pytest.raises(sw.PolicyError, match="NaN"):
+            sw.from_torch(module, learn=True)
