@@ -143,7 +143,7 @@ ELSEWHERE = {
     "pt": ("models/best.pt", "policy = the torch module with these weights"),
     "weights": ("models/best.safetensors", "start from the run that it was written from"),
     "model": (Model(), r"policy = sw.from_sb3\(model\)"),
-    "module": (module(), r"policy = module; or to .*Network\(encoder=function\)"),
+    "module": (module(), r"policy = module; to train .*learn=True.*Network\(encoder=function\)"),
     "function": (right, "policy = this one"),
 }
 
