@@ -194,7 +194,7 @@ def test_a_zip_of_stable_baselines_acts_as_proposed(tmp_path, monkeypatch):
     model.save("best.zip")
     with pytest.raises(sw.SkillweaveError) as error:
         sw.train_agent("CartPole-v1", SMALL, 16, "run", start_from="best.zip", quiet=True)
-    proposal = str(error.value).partition("skill of a hierarchy: ")[2]
+    proposal = str(error.value).partition("skill of a hierarchy: ")[2].partition("; to train")[0]
     space = {"sw": sw}
     exec(proposal.replace("): policy", "):\n    policy"), space)
     run = declare(space["Ready"]()).train("run", quiet=True)
