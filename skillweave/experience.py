@@ -64,6 +64,7 @@ SCHEMA: dict[str, Column] = {
     # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
     "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
+    "goal": Column(raw=True, rollout=False),  # (T, N, *goal_shape), under the path of a skill
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
     "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
     "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices

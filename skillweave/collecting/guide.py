@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from skillweave.skills.goals import number_of
 from skillweave.types import Array, Memory, Step, prefixed, unprefixed
 
 SMOOTHED = 0.05
@@ -110,7 +111,7 @@ class ActiveGuide:
             skill, after = self.selector.act(
                 own, obs, may[:, ::lengths], deterministic=greedy, rng=rng
             )
-            chances: Array = np.eye(skills, dtype=np.float32)[skill]
+            chances: Array = np.eye(skills, dtype=np.float32)[number_of(skill)]
         else:
             chances, after = self.selector.chances(own, obs, may[:, ::lengths])
         for k, v in after.items():

@@ -157,6 +157,9 @@ class HierarchyCollector(Collector):
             out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
             for level, memory in self.levels.items():
                 out.write(**{level.path + "skill": memory["skill"]})
+                for i, goals in level.player.goals.items():
+                    goal = goals.read(memory[f"goal.{i}"])
+                    out.write(**{f"{level.path}{level.skills[i].name}/goal": goal})
         raw = self.engine.step(action)
         self.kept["age"] += 1
         step = raw.seen(obs, action, self.kept["age"].copy())
@@ -273,11 +276,15 @@ class HierarchyCollector(Collector):
     def _of_skill(self, trace: Trace, level: Level, skill: Skill, acts: Array, end: Array) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
         path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
-        steps = steps_of(trace, skill, acts, elapsed, end)
+        goal, goals = trace.get(f"{path}/goal"), level.player.goals.get(level.skills.index(skill))
+        steps = steps_of(trace, skill, acts, elapsed, end, goal)
         # Elsewhere it is called again at once.
         ends = (end == EPISODE) | timed_out(trace, skill, elapsed)
+        if goal is not None:  # with another goal another trajectory begins
+            other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
+            ends[:-1] |= other
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record)
+        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals)
         if "action" not in batch:
             batch = batch.replace(action=self._no_actions(trace.lead))
         if path not in self._states:

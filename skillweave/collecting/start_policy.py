@@ -99,4 +99,6 @@ class StartPolicy:
         may = self.skills.startable(obs[ids])
         chance = np.where(may, rng.random(may.shape), -1.0)
         some = may.any(axis=1)
-        self._player.begin(self._calls, ids[some], chance[some].argmax(axis=1))
+        choice = chance[some].argmax(axis=1)
+        goals = self._player.drawn_goals(choice, obs[ids[some]], rng)
+        self._player.begin(self._calls, ids[some], choice, goals)

@@ -13,11 +13,14 @@ import gymnasium as gym
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.collecting.guide import ActiveGuide
+from skillweave.errors import PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
-from skillweave.skills.foreign_policy import fitted
+from skillweave.skills.foreign_policy import Foreign, fitted
+from skillweave.skills.goals import goals_of, without_goal
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -77,7 +80,16 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
-    return fitted(policy, role.observation_space, role.action_space, who, role.spec.name)
+    spaces = role.observation_space, role.action_space
+    if (goals := goals_of(role.skill)) is None or not isinstance(policy, Foreign):
+        return fitted(policy, *spaces, who, role.spec.name)
+    if not isinstance(policy, MappedPolicy):
+        raise PolicyError(
+            f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
+            "goal), or a policy from elsewhere with Goal() at its place in sees"
+        )
+    bound = policy.bind(without_goal(spaces[0]), spaces[1], who)
+    return fitted(bound.of_skill_with(goals), *spaces, who, role.spec.name)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Dict
 
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError, SkillError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
+from skillweave.skills.goals import GOAL, blank_choices, number_of
+from skillweave.skills.outputs import as_array
 from skillweave.types import Array, Memory, Step
 
 
@@ -40,6 +45,63 @@ class ReadySelector(Foreign):
         selector.skills = skills
         return selector
 
+    @property
+    def goal_spaces(self) -> dict[str, Space[Any]]:
+        """Return the spaces of goals of the skills that have some, by name, once it is bound."""
+        space = self.action_space
+        goals = space[GOAL] if isinstance(space, Dict) else None
+        return dict(goals.spaces) if isinstance(goals, Dict) else {}
+
+    def with_goals(self, skill: Array, goals: Mapping[str, tuple[Array, Any]], obs: Array) -> Array:
+        """Return choices of skills (n,) with their goals, as a ``Player`` takes them.
+
+        Args:
+            skill: (n,) the chosen skills.
+            goals: by skill, rows (k,) and their goals (k, *goal_shape).
+            obs: (n, …), for messages.
+
+        Raises:
+            SkillError: a skill with goals was chosen without one, or one without goals with one.
+        """
+        spaces = self.goal_spaces
+        lacks = np.ones(len(skill), bool)
+        choices = blank_choices(self.action_space, skill) if spaces else skill
+        for name, (rows, values) in goals.items():
+            if name not in spaces:
+                number = self._number(name, self._who, SkillError)
+                raise SkillError(
+                    f"{self._who} gave a goal for skill {self.skills[number]!r}, which has none: "
+                    "set its goal_space, or leave out the goal"
+                )
+            part, wanted = choices[GOAL][name], tuple(spaces[name].shape or ())
+            given = as_array(values, self._who)
+            if given.shape[1:] != wanted or len(given) != len(rows):
+                raise SkillError(
+                    f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but "
+                    f"{(len(rows), *wanted)} was expected: one goal of {short(spaces[name])} for "
+                    "each environment"
+                )
+            if given.dtype.kind not in ("iub" if part.dtype.kind in "iub" else "iubf"):
+                raise SkillError(
+                    f"{self._who} gave goals of {given.dtype} for skill {name!r}, but goals of "
+                    f"{short(spaces[name])} are {part.dtype}"
+                )
+            part[rows] = given
+            lacks[rows] = False
+        for name in spaces:
+            wrong = np.flatnonzero(lacks & (skill == self.skills.index(name)))
+            if len(wrong):
+                raise SkillError(
+                    f"{self._who} chose skill {name!r} without a goal in observation "
+                    f"{shown_obs(obs[wrong[0]])}, but it has goals of {short(spaces[name])}: "
+                    f"{self._goal_advice(name)}"
+                )
+        return choices
+
+    def _goal_advice(self, name: str) -> str:
+        """Return how a goal is given to skill ``name``, for messages."""
+        return f"write ({name!r}, goal) in place of {name!r}"
+
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
         """Return the probability of each skill where a call is over, (n, S) float32.
 
@@ -47,7 +109,7 @@ class ReadySelector(Foreign):
             The probabilities, and the memory after the choice.
         """
         skill, after = self.act(memory, obs, mask)
-        return np.eye(len(self.skills), dtype=np.float32)[skill], after
+        return np.eye(len(self.skills), dtype=np.float32)[number_of(skill)], after
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""

@@ -262,6 +262,7 @@ def _evaluate(
             starts,
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
+            seed=seed,
         )
         evaluation = replaced(_scored(policy, episodes, moments, watch), threshold=threshold)
         if not pooled and episodes > envs.num_envs:
