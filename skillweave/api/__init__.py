@@ -599,17 +599,27 @@ class Run:
             self._player.reset()
 
     @checked_names
-    def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
+    def player(
+        self,
+        *,
+        skill: str | None = None,
+        goal: Any = None,
+        deterministic: bool = True,
+        seed: int = 0,
+    ) -> Player:
         """Return a player: the policy for one environment, with a memory of its own.
 
         Args:
+            skill: the skill that acts alone; None: the whole policy.
+            goal: of this skill, where it has goals; None: its ``goals()`` draw one.
             deterministic: act greedily, else sample; as in ``evaluate``.
             seed: of what is sampled.
 
         Returns:
             The player; call its ``reset`` where an episode begins.
         """
-        return Player(self.policy, deterministic=deterministic, seed=seed)
+        policy = self._policy(skill)
+        return Player(policy, deterministic=deterministic, seed=seed, goal=goal)
 
     @checked_names
     def export(self, path: str | Path) -> Export:

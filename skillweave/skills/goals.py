@@ -172,6 +172,12 @@ class Goals:
     def _clipped(self, obs: Array, goal: Array, who: str) -> Any:
         return called(lambda seen: self.skill.clip_goal(seen, read_only(goal)), read_only(obs), who)
 
+    def one(self, goal: Any) -> Any:
+        """Return one goal as a batch of one; it is not checked yet."""
+        if isinstance(goal, Mapping | tuple) and self._bytes:
+            return self._pack(self.space, _batch_of_one(self.space, goal))
+        return np.asarray(goal)[None]
+
     def flat(self, goal: Array) -> Array:
         """Return goals as numbers (n, G), for policies that take them so."""
         if not self._bytes:
@@ -301,6 +307,14 @@ def _parts(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     from skillweave.spaces.packing import parts  # needs torch, which declaring does not
 
     return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
+
+
+def _batch_of_one(space: gym.Space[Any], value: Any) -> Any:
+    if isinstance(space, gym.spaces.Dict):
+        return {name: _batch_of_one(part, value[name]) for name, part in space.spaces.items()}
+    if isinstance(space, gym.spaces.Tuple):
+        return tuple(_batch_of_one(p, v) for p, v in zip(space.spaces, value, strict=True))
+    return np.asarray(value)[None]
 
 
 def _part(goal: Array, path: tuple[str, ...]) -> Array:
