@@ -21,7 +21,14 @@ from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
-from skillweave.spaces import ObsCodec, action_codec, obs_codec
+from skillweave.spaces import (
+    ActionCodec,
+    ChoiceSpace,
+    ObsCodec,
+    action_codec,
+    choice_codec,
+    obs_codec,
+)
 from skillweave.types import Array, prefixed
 
 S = TypeVar("S")
@@ -170,7 +177,11 @@ class Algorithm:
         self.observation_space = observation_space
         self.action_space = action_space
         self.obs = read_by(config, observation_space)
-        self.codec = action_codec(action_space)
+        self.codec: ActionCodec = (
+            choice_codec(action_space)
+            if isinstance(action_space, ChoiceSpace)
+            else action_codec(action_space)
+        )
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
     # Methods that an algorithm defines

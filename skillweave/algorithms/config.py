@@ -455,13 +455,15 @@ class Registration:
     """The kinds of action spaces that the algorithm supports."""
     acts: bool = True
     """True if the algorithm can be chosen to act; False if it only serves others."""
+    chooses_goals: bool = False
+    """True if a selector that learns by it can choose goals of skills."""
 
 
 _SPACES = gym.spaces
 _HOME = "skillweave.algorithms"
 _ANY = (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box)
 _REGISTERED: dict[str, Registration] = {
-    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY),
+    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY, chooses_goals=True),
     "SelfImitationPPO": Registration(
         SelfImitationPPO, f"{_HOME}.self_imitation:SelfImitationAlgorithm", _ANY
     ),
@@ -510,6 +512,15 @@ def _not_registered(name: str) -> str:
 
 def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
     """Raise a DeclarationError that names other algorithms if this one cannot act in a space."""
+    if (goal_spaces := getattr(action_space, "goal_spaces", None)) is not None:
+        if not registration_of(config).chooses_goals:
+            able = [k for k, r in _REGISTERED.items() if r.chooses_goals]
+            raise DeclarationError(
+                f"{where}{type(config).__name__} cannot choose goals, but "
+                f"{' and '.join(map(repr, goal_spaces))} have goals (goal_space): let the selector "
+                f"learn by {' or '.join(able)}, or give a ready one that returns (names, goals)"
+            )
+        return
     if not isinstance(action_space, registration_of(config).action_spaces):
         able = [k for k, r in _REGISTERED.items() if r.acts]
         able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]

@@ -16,6 +16,7 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
+from skillweave.spaces import ChoiceSpace, choice_codec
 from skillweave.types import Array
 
 
@@ -42,7 +43,7 @@ class OpenCalls:
             "reward": np.zeros(n),  # Σ γᵏ rₖ
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
-            "action": np.zeros(n, np.int64),  # the choice
+            "action": _no_choice(level, n),  # the choice
         }
         """Of each environment, (N, …); changed in place."""
         if self.memory_size:
@@ -140,8 +141,9 @@ class OpenCalls:
         }
         if cut.any():
             values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
-        if self.level.selector is not None:
-            values["action"] = np.asarray(self.level.selector.acting.to_env(values["action"]))
+        selector = self.level.selector
+        if selector is not None and values["action"].ndim == 1:
+            values["action"] = np.asarray(selector.acting.to_env(values["action"]))
         if "mask" in values:
             values["next_mask"] = self._next_mask(trace, values, row, env)
         if (chances := trace.get(self.level.path + "chances")) is not None:
@@ -222,6 +224,15 @@ class OpenCalls:
                 held = np.zeros(values.shape[1:], values.dtype)
                 self._shaped[self.level.path + name] = held
             held[env] = values[self._decided[env], env]
+
+
+def _no_choice(level: Level, n: int) -> Array:
+    """Return choices of n environments before the first, as the selector stores them."""
+    if level.selector is not None:
+        space = level.selector.action_space
+        if isinstance(space, ChoiceSpace):
+            return np.zeros((n, choice_codec(space).size), np.float32)
+    return np.zeros(n, np.int64)
 
 
 DECIDED_ON = {

@@ -181,6 +181,7 @@ class Level:
             self.selector if isinstance(self.selector, AlgorithmConfig) else None,
             choices=self.choices,
             goal_spaces=self.goal_spaces,
+            skills=self.names,
             row_steps=self._usual_steps,
             greedy=self.selection.greedy_selector is not False,
             guide_kl=None if self.guide is None else self.guide.target_kl,

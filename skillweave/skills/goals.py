@@ -6,7 +6,7 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -44,17 +44,24 @@ SKILL = "skill"
 """The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
 
 
-def choice_space(choices: int, goal_spaces: Mapping[str, gym.Space[Any]]) -> gym.Space[Any]:
+def choice_space(
+    choices: int, goal_spaces: Mapping[str, gym.Space[Any]], skills: Sequence[str]
+) -> gym.Space[Any]:
     """Return the space of a selector's choices: numbers, or numbers and goals.
 
     Args:
         choices: the number of skills, times lengths where these are chosen, too.
         goal_spaces: of the skills that have goals, by their names.
+        skills: the names of all skills, in order.
     """
     if not goal_spaces:
         return gym.spaces.Discrete(choices)
-    goals = gym.spaces.Dict(list(goal_spaces.items()))
-    return gym.spaces.Dict([(SKILL, gym.spaces.Discrete(choices)), (GOAL, goals)])
+    from skillweave.spaces.choices import ChoiceSpace  # needs torch, which declaring does not
+
+    each = choices // len(skills)
+    first = {name: each * skills.index(name) for name in goal_spaces}
+    owners = {name: (start, start + each) for name, start in first.items()}
+    return ChoiceSpace(choices, goal_spaces, owners)
 
 
 def number_of(choice: Array) -> Array:

@@ -33,6 +33,8 @@ class Role:
     environment."""
     goal_spaces: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
     """Of a selector, the spaces of goals that it chooses, by the names of their skills."""
+    skills: tuple[str, ...] = ()
+    """Of a selector, the names of the skills that it chooses from, in order."""
     row_steps: int = 1
     """Approximate environment steps of a row of its experience."""
     greedy: bool = True
@@ -59,7 +61,7 @@ class Role:
     def action_space(self) -> gym.Space[Any]:
         """The space of its actions, or of its choices."""
         if self.choices is not None:
-            return choice_space(self.choices, self.goal_spaces)
+            return choice_space(self.choices, self.goal_spaces, self.skills)
         return self.spec.spaces.action
 
 
