@@ -118,6 +118,22 @@ class ActiveGuide:
             memory[f"guide.{k}"][rows] = v
         return chances.repeat(lengths, axis=1) / np.float32(lengths)
 
+    def choose(
+        self,
+        memory: Memory,
+        rows: Array,
+        obs: Array,
+        may: Array,
+        greedy: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> Array:
+        """Return its choices (k,) with their goals, where it decides; see ``ask``."""
+        own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
+        choice, after = self.selector.act(own, obs, may, deterministic=greedy, rng=rng)
+        for k, v in after.items():
+            memory[f"guide.{k}"][rows] = v
+        return choice
+
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """Return the choices that it leaves, (k, choices) bool, in environments ``rows`` (k,).
 

@@ -357,6 +357,11 @@ class Player:
         """Choose in environments ``rows`` (k,), and start the calls."""
         may, guide = self.skills.mask(obs, None if turn.age is None else turn.age[rows]), self.guide
         greedy = turn.deterministic and self.skills.greedy_selector
+        if guide is not None and guide.decides and self.goals:
+            may = self.skills.startable(obs) if may is None else may
+            choice = guide.choose(memory, rows, obs, may, turn.deterministic, turn.rng)
+            self._begin_with_goals(memory, rows, choice, obs)
+            return
         if guide is not None:
             may = self.skills.startable(obs) if may is None else may
             chances = guide.ask(memory, rows, obs, may, turn.deterministic, turn.rng)
@@ -368,11 +373,18 @@ class Player:
         else:
             how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
-        if self.goals and choice.dtype.fields is not None:
-            number, goals = choice[SKILL], self.goals_in(choice, obs, "the selector")
-            self.begin(memory, rows, number, goals)
+        if self.goals:
+            self._begin_with_goals(memory, rows, choice, obs)
         else:
             self.begin(memory, rows, choice)
+
+    def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:
+        """Start the calls of choices (k,), which have goals if the selector gives some."""
+        if choice.dtype.fields is None:
+            self.begin(memory, rows, choice)
+        else:
+            goals = self.goals_in(choice, obs, "the selector")
+            self.begin(memory, rows, choice[SKILL], goals)
 
     def goals_in(self, choice: Array, obs: Array, who: str) -> dict[int, Array]:
         """Return the goals of choices (k,) of a ``choice_space``, checked, for ``begin``.

@@ -13,14 +13,15 @@ import gymnasium as gym
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.collecting.guide import ActiveGuide
-from skillweave.errors import PolicyError
+from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import Foreign, fitted
-from skillweave.skills.goals import goals_of, without_goal
+from skillweave.skills.goals import goal_part, goals_of, without_goal
 from skillweave.skills.mapped import MappedPolicy
+from skillweave.spaces import obs_codec
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -28,6 +29,8 @@ from skillweave.types import Policy
 
 def check_settings(roles: Roles) -> None:
     """Raise a DeclarationError where algorithms, reflexes or guides do not fit the environment."""
+    for skill in roles.skills.values():
+        goals_of(skill)  # raises if its space is not supported
     for level in roles.levels.values():
         for path in level.skills:
             _check_learner(roles[path], f"skill {path!r}: ")
@@ -51,6 +54,21 @@ def _check_learner(role: Role, where: str) -> None:
     if role.config is not None:
         check_spaces(role.config, role.action_space, where)
         read_by(role.config, role.observation_space, where)
+        if role.skill is not None and role.skill.goal_space is not None:
+            _check_sees_goal(role, where)
+
+
+def _check_sees_goal(role: Role, where: str) -> None:
+    """Raise a DeclarationError where the networks of a skill with goals do not see the goal."""
+    whole = obs_codec(role.observation_space).size
+    first = whole - obs_codec(goal_part(role.observation_space)).size
+    for name in ("network", "critic"):
+        sees = getattr(getattr(role.config, name, None), "sees", None)
+        if sees is not None and first < whole and max(sees) < first:
+            raise DeclarationError(
+                f"{where}{name}.sees leaves out the goal, whose places are {first} to {whole - 1}, "
+                "after those of the observation: add them"
+            )
 
 
 def ready_policies(roles: Roles) -> dict[str, Policy]:
@@ -101,6 +119,11 @@ def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide
     if level.guide is None or (guide := level.ready_guide) is None:
         return None
     choices, who = gym.spaces.Discrete(len(level.skills)), join(level.path, "guide")
+    if guide.gives_goals:
+        raise DeclarationError(
+            f"{who}: it gives a goal, but the selector that it guides chooses goals itself: leave "
+            "out the goal"
+        )
     selector = fitted(guide, observation_space, choices, who, level.spec.name)
     tells = level.guide.target_kl is not None
     return ActiveGuide(cast(ReadySelector, selector), level.guide.restrict, tells)

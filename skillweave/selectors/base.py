@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Dict
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goals import GOAL, blank_choices, number_of
-from skillweave.skills.outputs import as_array
-from skillweave.types import Array, Memory, Step
+from skillweave.skills.outputs import as_array, called
+from skillweave.types import Array, Memory, Step, read_only
 
 
 class ReadySelector(Foreign):
@@ -46,6 +46,11 @@ class ReadySelector(Foreign):
         return selector
 
     @property
+    def gives_goals(self) -> bool:
+        """Return whether it is declared with goals for skills."""
+        return False
+
+    @property
     def goal_spaces(self) -> dict[str, Space[Any]]:
         """Return the spaces of goals of the skills that have some, by name, once it is bound."""
         space = self.action_space
@@ -70,18 +75,19 @@ class ReadySelector(Foreign):
             if name not in spaces:
                 number = self._number(name, self._who, SkillError)
                 raise SkillError(
-                    f"{self._who} gave a goal for skill {self.skills[number]!r}, which has none: "
-                    "set its goal_space, or leave out the goal"
+                    f"{self._who} gave a goal for skill {self.skills[number]!r}, which has no "
+                    "goals: set its goal_space, or leave out the goal"
                 )
             part, wanted = choices[GOAL][name], tuple(spaces[name].shape or ())
-            given = as_array(values, self._who)
+            given = _as_goals(values, spaces[name], self._who)
             if given.shape[1:] != wanted or len(given) != len(rows):
                 raise SkillError(
                     f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but "
                     f"{(len(rows), *wanted)} was expected: one goal of {short(spaces[name])} for "
                     "each environment"
                 )
-            if given.dtype.kind not in ("iub" if part.dtype.kind in "iub" else "iubf"):
+            kinds = "iub" if part.dtype.kind in "iub" else "iubf"
+            if given.dtype.kind not in kinds and given.dtype != part.dtype:
                 raise SkillError(
                     f"{self._who} gave goals of {given.dtype} for skill {name!r}, but goals of "
                     f"{short(spaces[name])} are {part.dtype}"
@@ -97,6 +103,19 @@ class ReadySelector(Foreign):
                     f"{self._goal_advice(name)}"
                 )
         return choices
+
+    def joined_goals(self, name: str, parts: Sequence[tuple[Array, Any]]) -> tuple[Array, Any]:
+        """Return the goals of several rows of skill ``name`` as one array with its rows."""
+        space = self.goal_spaces.get(name)
+        if space is None or len(parts) == 1:
+            return parts[0]
+        arrays = [_as_goals(values, space, self._who) for _, values in parts]
+        try:
+            return np.concatenate([rows for rows, _ in parts]), np.concatenate(arrays)
+        except ValueError as error:
+            raise SkillError(
+                f"{self._who} gave goals of different shapes for skill {name!r}: {error}"
+            ) from error
 
     def _goal_advice(self, name: str) -> str:
         """Return how a goal is given to skill ``name``, for messages."""
@@ -139,6 +158,53 @@ class ReadySelector(Foreign):
                 f"are: {listed(self.skills)}"
             )
         return self.skills.index(skill)
+
+
+def skill_and_goal(value: Any) -> tuple[Any, Any]:
+    """Return the name and the goal of ``(name, goal)``; of anything else itself, and None."""
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
+        name, goal = value
+        if goal is not None and not isinstance(goal, str):
+            return name, goal
+    return value, None
+
+
+def goals_at(goal: Any, space: Space[Any] | None, obs: Array, who: str) -> Any:
+    """Return the goals of ``(name, goal)`` in observations (k, …): fixed, or by a function."""
+    if callable(goal):
+        return called(goal, read_only(obs), who)
+    if isinstance(space, Dict | Tuple):
+        return _repeated(space, goal, len(obs))
+    fixed = as_array(goal, who)
+    return np.broadcast_to(fixed, (len(obs), *fixed.shape))
+
+
+def goal_as_json(goal: Any) -> Any:
+    """Return a goal of ``(name, goal)`` for checksums; of a function its name."""
+    if callable(goal):
+        return {"function": function_name(goal)}
+    return repr(goal.tolist() if isinstance(goal, np.ndarray) else goal)
+
+
+def _as_goals(values: Any, space: Space[Any], who: str) -> Array:
+    """Return goals (k, …) as an array."""
+    if isinstance(values, np.ndarray) or not isinstance(space, Dict | Tuple):
+        return as_array(values, who)
+    from skillweave.spaces import pack  # needs torch, which declaring does not
+
+    try:
+        return pack(space, values)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise SkillError(f"{who} gave {short(values)}, which are no goals of {space}") from error
+
+
+def _repeated(space: Space[Any], goal: Any, n: int) -> Any:
+    """Return one goal of a Dict or Tuple as a batch of n."""
+    if isinstance(space, Dict):
+        return {k: _repeated(part, goal[k], n) for k, part in space.spaces.items()}
+    if isinstance(space, Tuple):
+        return tuple(_repeated(p, g, n) for p, g in zip(space.spaces, goal, strict=True))
+    return np.broadcast_to(goal, (n, *np.shape(goal)))
 
 
 def listed(names: tuple[str, ...]) -> str:

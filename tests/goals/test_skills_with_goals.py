@@ -1,0 +1,92 @@
+"""One contract: a skill with goals learns by every algorithm, with goals of every kind."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from small_runs import assert_same, reports_every, stopped_run
+from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
+
+import skillweave as sw
+from skillweave.envs.make import EnvSpec
+
+often = reports_every(40)
+OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+ALGORITHMS = {
+    "PPO": (ON, False),
+    "PPO, discrete": (ON, True),
+    "PPO, recurrent": (
+        sw.PPO(
+            num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.RNN("gru", 6))
+        ),
+        False,
+    ),
+    "DQN": (sw.DQN(**OFF, train_freq=2, network=SMALL), True),
+    "Rainbow": (sw.DQN.rainbow(**OFF, train_freq=2, network=SMALL), True),
+    "SAC": (sw.SAC(**OFF, network=SMALL), False),
+    "SAC, discrete": (sw.SAC(**OFF, network=SMALL), True),
+    "TD3": (sw.TD3(**OFF, network=SMALL), False),
+}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_learns_with_goals(name, tmp_path):
+    algorithm, discrete = ALGORITHMS[name]
+    env = functools.partial(Point, discrete=discrete)
+    run = declared(env=env, algorithm=algorithm).train(tmp_path / "run", quiet=True)
+    alone = run.evaluate(3, skill="go_to")
+    assert alone.skills["go_to"].calls == 3
+    whole = run.evaluate(3)
+    assert whole.skills["go_to"].steps == sum(whole.lengths)
+    again = declared(env=env, algorithm=algorithm)
+    loaded = again.load_weights(run.save_weights(tmp_path / "weights.safetensors"))
+    assert loaded.evaluate(3).returns == whole.returns
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_goals_of_every_space(space, as_dict, tmp_path):
+    env = functools.partial(Point, as_dict=as_dict)
+    hierarchy = declared([go_to(space), Rest()], env=env, selector=rest, steps=130)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    report = run.evaluate(4, skill="go_to")
+    assert report.skills["go_to"].calls == 4
+    assert run.policy.skills.policies[0].observation_space["goal"] == SPACES[space]
+
+
+def rest(obs):
+    return np.full(len(obs), "rest")
+
+
+@pytest.mark.parametrize("name", ["PPO", "PPO, recurrent", "DQN", "SAC", "TD3"])
+def test_an_interrupted_run_ends_with_the_same_weights(name, tmp_path):
+    algorithm, discrete = ALGORITHMS[name]
+
+    def hierarchy():
+        env = functools.partial(Point, discrete=discrete)
+        return declared(env=env, algorithm=algorithm, steps=400, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+def test_a_dict_of_goals_is_resumed(tmp_path):
+    def hierarchy():
+        return declared([go_to("dict"), Rest()], selector=rest, steps=400, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+@pytest.mark.slow
+def test_goals_in_processes(tmp_path):
+    spec = EnvSpec(Point, engine="sync", workers=2)
+    run = declared(env=spec).train(tmp_path / "run", quiet=True)
+    assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2
