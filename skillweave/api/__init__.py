@@ -71,6 +71,7 @@ from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goals import shown_goal
 from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -881,8 +882,8 @@ def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
 
 def _labels_of(
     policy: Policy, roles: Roles | None, alone: str | None
-) -> Callable[[Memory], tuple[str, RGB]]:
-    """Return a function from a policy's memory to the acting skill's name and colour.
+) -> Callable[[Memory], tuple[str, RGB, str]]:
+    """Return a function from a policy's memory to the acting skill's name, colour and goal.
 
     Args:
         roles: of the hierarchy that acts; None: a plain agent acts.
@@ -891,16 +892,17 @@ def _labels_of(
     skills = {} if roles is None else roles.skills
     colors = {path: color_of(i, s.color) for i, (path, s) in enumerate(skills.items())}
 
-    def label(memory: Memory) -> tuple[str, RGB]:
+    def label(memory: Memory) -> tuple[str, RGB, str]:
         if roles is None:
-            return AGENT, color_of(0, None)
+            return AGENT, color_of(0, None), ""
         acting = policy.policy if isinstance(policy, SkillAlone) else policy
         below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
         name = join(alone or "", below or "")
         known = name
         while known not in colors:  # a run that is a ready skill has skills of its own
             known = level_of(known)
-        return name, colors[known]
+        goal = policy.goal_now(memory) if isinstance(policy, HierarchyPolicy | SkillAlone) else None
+        return name, colors[known], "" if goal is None else shown_goal(goal)
 
     return label
 

@@ -16,6 +16,7 @@ from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.skills import Skill
+from skillweave.skills.goal_read import check_reads_goal, is_unchecked
 from skillweave.skills.goals import Goals
 from skillweave.skills.info_words import missing_key
 from skillweave.types import Array, Step
@@ -44,6 +45,11 @@ def steps_of(
     Returns:
         ``reward``, ``terminated`` and ``truncated``, 0 in other rows; ``valid`` is ``acts``.
     """
+    if goal is not None and skill is not None and acts.any() and is_unchecked(skill):
+        t = int(acts.any(axis=1).argmax())
+        ids = np.flatnonzero(acts[t])
+        step = seen_by(skill, _alone(trace, t, elapsed), elapsed[t, ids], ids, goal[t, ids])
+        check_reads_goal(skill, step)
     over = acts & (end != RUNNING)
     terminated = acts & (trace["env_terminated"] | (end == OWN))
     # The end of an episode hides the skill's own termination, so it is asked again there.

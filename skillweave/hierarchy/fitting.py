@@ -18,7 +18,7 @@ from skillweave.hierarchy.roles import Level, Roles
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
-from skillweave.skills.foreign_policy import Foreign, fitted
+from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
 from skillweave.skills.goals import goal_part, goals_of, without_goal
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.spaces import obs_codec
@@ -106,8 +106,8 @@ def _fitted(policy: Policy, role: Role, who: str) -> Policy:
             f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
             "goal), or a policy from elsewhere with Goal() at its place in sees"
         )
-    bound = policy.bind(without_goal(spaces[0]), spaces[1], who)
-    return fitted(bound.of_skill_with(goals), *spaces, who, role.spec.name)
+    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
+    return checked_fit(bound, *spaces, who, role.spec.name)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:

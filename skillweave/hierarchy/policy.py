@@ -100,6 +100,15 @@ class HierarchyPolicy:
         """Return the running skills in a ``memory``, (n,) int64."""
         return memory["skill"]
 
+    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
+        """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none."""
+        i = int(memory["skill"][row])
+        policy = self.skills.policies[i]
+        if isinstance(policy, HierarchyPolicy):
+            return policy.goal_now(unprefixed(str(i), memory), row)
+        goal = self.player.goal_of(memory, i, np.array([row]))
+        return None if goal is None else goal[0]
+
     def acts(self, memory: Memory, row: int = 0) -> str:
         """Return the path of the skill that acts in ``row`` of the ``memory``: ``inner/skill``."""
         i = int(memory["skill"][row])
@@ -154,6 +163,14 @@ class SkillAlone:
             return self.policy.observe(memory, step)
         own = {k: v for k, v in memory.items() if k != "goal"}
         return self.policy.observe(own, step) | {"goal": memory["goal"]}
+
+    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
+        """Return its goal in ``row`` of the ``memory``; None: it has none."""
+        if self.goals is not None:
+            goal: Array = self.goals.read(memory["goal"])[row]
+            return goal
+        below = self.policy
+        return below.goal_now(memory, row) if isinstance(below, HierarchyPolicy) else None
 
     def choose_goals(self, memory: Memory, rows: Array, obs: Array, rngs: Sequence[Any]) -> None:
         """Draw a goal for each episode that starts in ``rows`` (k,), by ``Skill.goals``.

@@ -233,6 +233,20 @@ class Goals:
         return goals.astype(self.dtype)
 
 
+MOST_SHOWN = 6
+"""The most numbers of a goal that captions show."""
+
+
+def shown_goal(goal: Array) -> str:
+    """Return one goal as short text for captions: ``(0.3, -1)``."""
+    if goal.dtype.names:
+        return "(" + ", ".join(f"{k} {shown_goal(goal[k])}" for k in goal.dtype.names) + ")"
+    values = [f"{x:.3g}" for x in np.asarray(goal).reshape(-1)[:MOST_SHOWN].tolist()]
+    if goal.size > MOST_SHOWN:
+        return f"({goal.size} numbers)"
+    return f"({', '.join(values)})" if goal.ndim else values[0]
+
+
 def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
     """Draw n elements of a space as one batch: uniformly where it is bounded."""
     from skillweave.spaces.packing import obs_dtype  # needs torch, which declaring does not

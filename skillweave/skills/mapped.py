@@ -92,19 +92,23 @@ class MappedPolicy(Foreign):
         """Return whether the goal of a skill is an input of it."""
         return self.mapping.takes_goal
 
-    def of_skill_with(self, goals: Goals) -> Self:
-        """Return a bound policy as that of a skill with goals; it observes ``with_goal``.
+    def bind_with_goals(
+        self, observation_space: Space[Any], action_space: Space[Any], who: str, goals: Goals
+    ) -> Self:
+        """Return a copy as of ``bind``, as the policy of a skill that has goals.
+
+        It observes ``with_goal``.
 
         Raises:
-            PolicyError: the goal is no input of it.
+            PolicyError: the goal is no input of it, or its mapping does not fit.
         """
+        bound = super().bind(observation_space, action_space, who)
         if not self.takes_goal:
-            raise PolicyError(f"{self._who} takes no goal, but its skill has goals: {self.advice}")
-        policy = copy.copy(self)
-        policy._goals = goals
-        policy.observation_space = with_goal(self.observation_space, goals.space)
-        policy.fit_mapping()
-        return policy
+            raise PolicyError(f"{bound._who} takes no goal, but its skill has goals: {self.advice}")
+        bound._goals = goals
+        bound.observation_space = with_goal(bound.observation_space, goals.space)
+        bound.fit_mapping()
+        return bound
 
     advice = "write Goal() at its place in sees"
     """How the policy is given the goal, for messages."""

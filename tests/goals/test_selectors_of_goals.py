@@ -192,8 +192,8 @@ def test_what_goals_are_not_for_yet():
 def test_spaces_of_goals():
     with pytest.raises(DeclarationError, match="goal_space is 3; it must be a Gymnasium space"):
         declared([type("GoTo", (sw.Skill,), {"goal_space": 3})()])
-    with pytest.raises(DeclarationError, match="has clip_goal.., but no goals: set goal_space"):
+    with pytest.raises(DeclarationError, match=r"has clip_goal.., but no goals: set goal_space"):
         declared([type("GoTo", (sw.Skill,), {"clip_goal": lambda self, obs, goal: goal})()])
     graph = gym.spaces.Graph(gym.spaces.Discrete(2), None)
-    with pytest.raises(DeclarationError, match="goal_space Graph.* is not supported"):
+    with pytest.raises(DeclarationError, match=r"goal_space Graph.* is not supported"):
         declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()
