@@ -16,7 +16,7 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
-from skillweave.spaces import ChoiceSpace, choice_codec
+from skillweave.spaces import ChoiceCodec, ChoiceSpace
 from skillweave.types import Array
 
 
@@ -49,7 +49,17 @@ class OpenCalls:
         if self.memory_size:
             self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
         if player.restricts or player.guide is not None:
-            self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
+            allowed = np.ones((n, player.skills.choices), bool)
+            if level.selector is not None:
+                allowed = level.selector.acting.widened(allowed)
+            self.kept["allowed"] = allowed  # when it decided
+
+    @property
+    def choices(self) -> int:
+        """Return the number of the selector's discrete choices."""
+        if self.level.selector is None:
+            return self.level.player.skills.choices
+        return self.level.selector.acting.stacks[0][0].codec.size
 
     def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
         """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
@@ -142,7 +152,7 @@ class OpenCalls:
         if cut.any():
             values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
         selector = self.level.selector
-        if selector is not None and values["action"].ndim == 1:
+        if selector is not None and not isinstance(selector.action_space, ChoiceSpace):
             values["action"] = np.asarray(selector.acting.to_env(values["action"]))
         if "mask" in values:
             values["next_mask"] = self._next_mask(trace, values, row, env)
@@ -189,7 +199,8 @@ class OpenCalls:
             may = level.player.skills.startable(values["next_obs"][on])
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
-            mask[on] = may | ~may.any(axis=1, keepdims=True)
+            may = may | ~may.any(axis=1, keepdims=True)
+            mask[on] = may if level.selector is None else level.selector.acting.widened(may)
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:
@@ -229,9 +240,9 @@ class OpenCalls:
 def _no_choice(level: Level, n: int) -> Array:
     """Return choices of n environments before the first, as the selector stores them."""
     if level.selector is not None:
-        space = level.selector.action_space
-        if isinstance(space, ChoiceSpace):
-            return np.zeros((n, choice_codec(space).size), np.float32)
+        codec = level.selector.acting.stacks[0][0].codec
+        if isinstance(codec, ChoiceCodec):
+            return np.zeros((n, codec.size), np.float32)
     return np.zeros(n, np.int64)
 
 

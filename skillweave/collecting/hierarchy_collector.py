@@ -99,7 +99,7 @@ class HierarchyCollector(Collector):
                 self._open[level.path] = calls
                 self._keep_after_request(level.path, calls.kept)
                 if calls.kept["action"].ndim == 1:
-                    self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
+                    self.ranges[f"{level.path}action"] = range(calls.choices)
         self._recurrent = {
             level.path + level.skills[i].name: memory[f"{i}.rnn"]
             for level, memory in self.levels.items()

@@ -118,7 +118,7 @@ class LearnerActor:
     watches = False
 
     def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
-        self.acting = acting
+        self.acting, self._decides = acting, decides
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
         self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
@@ -136,6 +136,8 @@ class LearnerActor:
     def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
         """Return actions (k, …) in the environment's units, as the latest request says."""
         before = memory["rnn"][rows] if "rnn" in memory else None
+        if self._decides:
+            mask = self.acting.widened(mask)
         acted = self.acting.some(rows, obs, mask, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state

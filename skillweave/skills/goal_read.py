@@ -24,7 +24,7 @@ class _Watched(Step):
 
     reads = False
 
-    @property  # type: ignore[override]
+    @property
     def goal(self) -> Any:
         """Return the goal, and note that it was read."""
         self.reads = True

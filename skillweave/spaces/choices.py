@@ -7,6 +7,7 @@ only the goal of the chosen skill counts. In one array it is ``choice["skill"]``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 from torch import Tensor
 
+from skillweave.errors import EnvError
 from skillweave.spaces.action_codec import ActionCodec, action_codec
 from skillweave.spaces.packing import obs_dtype
 from skillweave.types import Array
@@ -77,7 +79,8 @@ class ChoiceCodec(ActionCodec):
     @cached_property
     def size(self) -> int:
         """Return the numbers of a choice in policy units."""
-        return self.columns[-1].stop
+        last: int = self.columns[-1].stop
+        return last
 
     def units(self, action: Any, at: int) -> Any:
         """Return the goals ``at`` of choices (…, size) as their own codec has them."""
@@ -127,9 +130,96 @@ def choice_codec(space: ChoiceSpace) -> ChoiceCodec:
     return ChoiceCodec(space, (), goals=goals)
 
 
+MOST = 10_000
+"""The most skills with goals, each a number, that a selector with values chooses from."""
+
+
+@dataclass(frozen=True)
+class NumberedChoiceCodec(ActionCodec):
+    """A converter of choices whose goals are discrete: each skill with each goal has a number."""
+
+    goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
+    """As of ``ChoiceCodec``."""
+
+    @cached_property
+    def table(self) -> Array:
+        """Return the choice of each number, (size,)."""
+        space = self.space
+        assert isinstance(space, ChoiceSpace)
+        rows = []
+        for number in range(space.choices):
+            own = [x for x in self.goals if x[2][0] <= number < x[2][1]]
+            goals = _all_goals(own[0][1]) if own else [None]
+            for goal in goals:
+                choice = np.zeros((), obs_dtype(space))
+                choice[SKILL] = number
+                for name, codec, _ in self.goals:
+                    first = _all_goals(codec)[0]
+                    mine = own and own[0][0] == name
+                    choice[GOAL][name] = goal if mine else first
+                rows.append(choice)
+        return np.stack(rows)
+
+    @cached_property
+    def number_of_choice(self) -> Array:
+        """Return the choice without goal that each number has, (size,) int64: of masks."""
+        found: Array = self.table[SKILL]
+        return found
+
+    def to_env(self, action: Array) -> Array:
+        """Convert numbers (n,) to choices (n,)."""
+        found: Array = self.table[action]
+        return found
+
+    def from_env(self, action: Array) -> Array:
+        """Convert choices (n,) to numbers (n,) int64."""
+        keys = {self._key(choice): i for i, choice in enumerate(self.table)}
+        return np.array([keys[self._key(choice)] for choice in action], np.int64)
+
+    def _key(self, choice: Any) -> tuple[Any, ...]:
+        number = int(choice[SKILL])
+        goals = [choice[GOAL][name] for name, _, (a, b) in self.goals if a <= number < b]
+        return (number, *(np.asarray(goal).tobytes() for goal in goals))
+
+
+def _all_goals(codec: ActionCodec) -> list[Array]:
+    """Return all goals of a discrete space."""
+    units = np.indices(codec.parts).reshape(len(codec.parts), -1).T
+    return list(codec.to_env(units if codec.multi else units[:, 0]))
+
+
+def numbered_choice_codec(space: ChoiceSpace) -> NumberedChoiceCodec:
+    """Return the codec of a selector's choices as numbers, where all goals are discrete.
+
+    Raises:
+        EnvError: there are too many; the message says how many.
+    """
+    goals = tuple(
+        (name, action_codec(part), space.owners[name]) for name, part in space.goal_spaces.items()
+    )
+    size = space.choices
+    for _, codec, (first, last) in goals:
+        size += (last - first) * (math.prod(codec.parts) - 1)
+    if size > MOST:
+        raise EnvError(
+            f"the selector would choose among {size:,} skills with goals, but one with values "
+            f"takes at most {MOST:,}: let it learn by PPO, or give goal_space fewer goals"
+        )
+    return NumberedChoiceCodec(space, (size,), goals=goals)
+
+
 def chosen(choice: Tensor, owner: tuple[int, int]) -> Tensor:
     """Return where the numbers ``choice`` (…) are of a skill, (…) bool."""
     return (choice >= owner[0]) & (choice < owner[1])
 
 
-__all__ = ["GOAL", "SKILL", "ChoiceCodec", "ChoiceSpace", "choice_codec", "chosen"]
+__all__ = [
+    "GOAL",
+    "SKILL",
+    "ChoiceCodec",
+    "ChoiceSpace",
+    "NumberedChoiceCodec",
+    "choice_codec",
+    "chosen",
+    "numbered_choice_codec",
+]

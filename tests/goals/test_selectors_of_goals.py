@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -118,10 +116,49 @@ def test_chosen_lengths_and_goals(tmp_path):
     run.evaluate(3, deterministic=False)
 
 
-def test_other_algorithms_say_that_they_cannot_choose_goals():
-    discrete = functools.partial(Point, discrete=True)
-    with pytest.raises(DeclarationError, match="selector: DQN cannot choose goals, but 'go_to'"):
-        declared(env=discrete, algorithm=ON, selector=sw.DQN()).check_spaces()
+OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+
+
+@pytest.mark.parametrize("space", ["number", "numbers", "bits"])
+@pytest.mark.parametrize(
+    "selector",
+    [
+        sw.DQN(**OFF, train_freq=2, network=SMALL),
+        sw.DQN.rainbow(**OFF, train_freq=2, network=SMALL),
+        sw.SAC(**OFF, network=SMALL),
+    ],
+    ids=["DQN", "Rainbow", "SAC"],
+)
+def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path):
+    class Sometimes(Rest):
+        def initiation(self, obs):
+            return obs[:, 0] > 0
+
+    def hierarchy(learn="apart"):
+        skills = [Sometimes(), go_to(space)]
+        return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
+    stopped_run(hierarchy(), tmp_path / "cut", 4)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    hierarchy("together").train(tmp_path / "together", seed=3, quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("selector", "space", "says"),
+    [
+        (sw.DQN(), "box", r"selector: DQN cannot choose goals of Box.*'go_to' needs them"),
+        (sw.SAC(), "box", "selector: SAC cannot choose goals of Box"),
+        (sw.TD3(), "number", "selector: TD3 cannot choose goals, but"),
+        (sw.PPO(), "dict", "selector: PPO cannot choose goals of Dict"),
+        (sw.PPO(), "picture", "selector: PPO cannot choose goals of Box"),
+    ],
+)
+def test_algorithms_say_which_goals_they_cannot_choose(selector, space, says):
+    with pytest.raises(DeclarationError, match=says):
+        declared([go_to(space)], algorithm=ON, selector=selector).check_spaces()
 
 
 @pytest.mark.parametrize(
