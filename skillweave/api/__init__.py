@@ -71,7 +71,7 @@ from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
-from skillweave.skills.goals import shown_goal
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate

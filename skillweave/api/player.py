@@ -66,6 +66,9 @@ class Player:
 
         Args:
             goal: as of ``Player``; None: as before.
+
+        Raises:
+            DeclarationError: a goal is given to a policy that takes none.
         """
         self._goal = self._goal if goal is None else goal
         goals = getattr(self.policy, "goals", None)

@@ -16,7 +16,7 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
-from skillweave.spaces import ChoiceCodec, ChoiceSpace
+from skillweave.spaces import ChoiceCodec
 from skillweave.types import Array
 
 
@@ -49,17 +49,16 @@ class OpenCalls:
         if self.memory_size:
             self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
         if player.restricts or player.guide is not None:
-            allowed = np.ones((n, player.skills.choices), bool)
-            if level.selector is not None:
-                allowed = level.selector.acting.widened(allowed)
-            self.kept["allowed"] = allowed  # when it decided
+            every = np.ones((n, player.skills.choices), bool)
+            self.kept["allowed"] = player.widened(every)  # when it decided
 
     @property
     def choices(self) -> int:
         """Return the number of the selector's discrete choices."""
-        if self.level.selector is None:
-            return self.level.player.skills.choices
-        return self.level.selector.acting.stacks[0][0].codec.size
+        every = np.ones((1, self.level.player.skills.choices), bool)
+        widened = self.level.player.widened(every)
+        assert widened is not None
+        return widened.shape[1]
 
     def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
         """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
@@ -152,7 +151,7 @@ class OpenCalls:
         if cut.any():
             values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
         selector = self.level.selector
-        if selector is not None and not isinstance(selector.action_space, ChoiceSpace):
+        if selector is not None and not self.level.player.goals:
             values["action"] = np.asarray(selector.acting.to_env(values["action"]))
         if "mask" in values:
             values["next_mask"] = self._next_mask(trace, values, row, env)
@@ -200,7 +199,7 @@ class OpenCalls:
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
             may = may | ~may.any(axis=1, keepdims=True)
-            mask[on] = may if level.selector is None else level.selector.acting.widened(may)
+            mask[on] = level.player.widened(may)
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:
@@ -239,7 +238,7 @@ class OpenCalls:
 
 def _no_choice(level: Level, n: int) -> Array:
     """Return choices of n environments before the first, as the selector stores them."""
-    if level.selector is not None:
+    if level.selector is not None and level.player.goals:
         codec = level.selector.acting.stacks[0][0].codec
         if isinstance(codec, ChoiceCodec):
             return np.zeros((n, codec.size), np.float32)

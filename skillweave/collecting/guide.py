@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from skillweave.skills.goals import number_of
+from skillweave.skills.goal_spaces import number_of
 from skillweave.types import Array, Memory, Step, prefixed, unprefixed
 
 SMOOTHED = 0.05

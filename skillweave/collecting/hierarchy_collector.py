@@ -18,7 +18,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.levels import Level, with_learners
 from skillweave.collecting.player import LearnerActor, Player, Turn
-from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.restored import ranges_of, stored_goals
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.views import rewards_of, rows_of, steps_of, timed_out
 from skillweave.collecting.writer import TraceWriter
@@ -80,6 +80,7 @@ class HierarchyCollector(Collector):
         """The player's, (N, …) each; changed in place."""
         self.kept |= prefixed("player", self.memory)
         self.ranges |= prefixed("player", ranges_of(self.player))
+        self.goals |= prefixed("player", stored_goals(self.player))
         self.root = Level(self.player, self.learners)
         self.levels = {
             level: self.memory

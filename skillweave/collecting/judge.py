@@ -14,7 +14,8 @@ from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
-from skillweave.skills.goals import GOAL, OBSERVATION, goals_of
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION
+from skillweave.skills.goals import goals_of
 from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
 from skillweave.types import Array, Step

@@ -31,7 +31,8 @@ from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
-from skillweave.skills.goals import GOAL, SKILL, Goals, goals_of
+from skillweave.skills.goal_spaces import GOAL, SKILL
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
 
@@ -118,7 +119,7 @@ class LearnerActor:
     watches = False
 
     def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
-        self.acting, self._decides = acting, decides
+        self.acting = acting
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
         self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
@@ -136,8 +137,6 @@ class LearnerActor:
     def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
         """Return actions (k, …) in the environment's units, as the latest request says."""
         before = memory["rnn"][rows] if "rnn" in memory else None
-        if self._decides:
-            mask = self.acting.widened(mask)
         acted = self.acting.some(rows, obs, mask, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
@@ -183,6 +182,8 @@ class Player:
         every = ((i, goals_of(skill)) for i, skill in enumerate(skills.skills))
         self.goals: dict[int, Goals] = {i: goals for i, goals in every if goals is not None}
         """The goals of skills that have some, by their place in the list."""
+        learns = isinstance(selector, LearnerActor) and bool(self.goals)
+        self._widen = selector.acting.widened if learns else None
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -374,11 +375,19 @@ class Player:
             choice = may.argmax(axis=1)  # the guide has left one
         else:
             how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
+            may = self.widened(may)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
         if self.goals:
             self._begin_with_goals(memory, rows, choice, obs)
         else:
             self.begin(memory, rows, choice)
+
+    def widened(self, may: Array | None) -> Array | None:
+        """Return a mask of choices (k, choices) as one of what the selector that learns chooses.
+
+        To one that learns values, a skill with each of its goals is a choice.
+        """
+        return may if self._widen is None or may is None else self._widen(may)
 
     def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:
         """Start the calls of choices (k,), which have goals if the selector gives some."""

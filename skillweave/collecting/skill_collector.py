@@ -82,6 +82,7 @@ class SkillCollector(Collector):
         self._goals = goals_of(skill)
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
+            self.goals["goal"] = self._goals
             self.kept["needs_goal"] = np.zeros(n, bool)  # a call of the skill starts
         self._asks = self._searches or (skill is not None and skill.defines("termination"))
         """Something is asked about each step while it is made."""
@@ -93,6 +94,7 @@ class SkillCollector(Collector):
             self._starters = StartPolicy(starters, n, engine.action_space)
             self.kept |= self._starters.kept
             self.ranges |= self._starters.ranges
+            self.goals |= self._starters.goals
 
     @property
     def memory(self) -> Array | None:

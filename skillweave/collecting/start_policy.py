@@ -14,9 +14,10 @@ import numpy as np
 from skillweave.collecting.call_end import RUNNING
 from skillweave.collecting.judge import seen_by
 from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.restored import ranges_of, stored_goals
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.infos import allowed_rows, random_actions
+from skillweave.skills.goals import Goals
 from skillweave.types import Array, Memory, Step, prefixed
 
 
@@ -40,11 +41,14 @@ class StartPolicy:
         """Its state in each environment, (N, …) each; changed in place."""
         self.ranges: dict[str, range] = {}
         """As of ``Collector``."""
+        self.goals: dict[str, Goals] = {}
+        """As of ``Collector``."""
         if self.skills is not None:
             self._player = Player(self.skills)
             self._calls: Memory = self._player.start(num_envs)
             self.kept = prefixed("starters", self._calls)
             self.ranges = prefixed("starters", ranges_of(self._player))
+            self.goals = prefixed("starters", stored_goals(self._player))
 
     def act(self, ids: Array, obs: Array, mask: Array | None, rng: np.random.Generator) -> Array:
         """Return actions (k, …) in environments ``ids`` (k,); obs and mask are of all N."""

@@ -19,7 +19,8 @@ from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
-from skillweave.skills.goals import goal_part, goals_of, without_goal
+from skillweave.skills.goal_spaces import goal_part, without_goal
+from skillweave.skills.goals import goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.spaces import obs_codec
 from skillweave.training.checks import check_rollout

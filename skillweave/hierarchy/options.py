@@ -16,7 +16,7 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
-from skillweave.skills.goals import SKILL, choice_space
+from skillweave.skills.goal_spaces import SKILL, choice_space
 from skillweave.spaces import pack, unpack
 from skillweave.types import Array
 

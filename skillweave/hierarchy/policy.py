@@ -16,7 +16,8 @@ from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
-from skillweave.skills.goals import goals_of, without_goal
+from skillweave.skills.goal_spaces import without_goal
+from skillweave.skills.goals import goals_of
 from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
 
@@ -101,7 +102,7 @@ class HierarchyPolicy:
         return memory["skill"]
 
     def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
-        """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none."""
+        """Return the goal (*goal_shape) of the skill that acts in ``row`` of ``memory``, or None."""
         i = int(memory["skill"][row])
         policy = self.skills.policies[i]
         if isinstance(policy, HierarchyPolicy):

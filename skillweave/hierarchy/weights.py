@@ -26,7 +26,7 @@ from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
-from skillweave.skills.goals import goal_part, with_goal, without_goal
+from skillweave.skills.goal_spaces import goal_part, with_goal, without_goal
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 

@@ -170,7 +170,7 @@ class Automaton(ReadySelector):
                 who = f"{self._who}: state {short(state)}: the goal of {name!r}"
                 values = goals_at(goal, self.goal_spaces.get(name), obs[rows], who)
                 found.setdefault(name, []).append((rows, values))
-        return {name: self.joined_goals(name, parts) for name, parts in found.items()}
+        return {name: self._joined_goals(name, parts) for name, parts in found.items()}
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
         """Return equal probabilities of all skills of the state that may start, (n, S).

@@ -14,7 +14,7 @@ from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goals import GOAL, blank_choices, number_of
+from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of
 from skillweave.skills.outputs import as_array, called
 from skillweave.types import Array, Memory, Step, read_only
 
@@ -104,7 +104,7 @@ class ReadySelector(Foreign):
                 )
         return choices
 
-    def joined_goals(self, name: str, parts: Sequence[tuple[Array, Any]]) -> tuple[Array, Any]:
+    def _joined_goals(self, name: str, parts: Sequence[tuple[Array, Any]]) -> tuple[Array, Any]:
         """Return the goals of several rows of skill ``name`` as one array with its rows."""
         space = self.goal_spaces.get(name)
         if space is None or len(parts) == 1:

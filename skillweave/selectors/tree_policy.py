@@ -118,7 +118,7 @@ class TreeSelector(ReadySelector):
                 who = f"{self._who}: the goal of {name!r}"
                 values = goals_at(goal, self.goal_spaces.get(name), obs[rows], who)
                 found.setdefault(name, []).append((rows, values))
-        return {name: self.joined_goals(name, parts) for name, parts in found.items()}
+        return {name: self._joined_goals(name, parts) for name, parts in found.items()}
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Store whether the running call has succeeded.

@@ -17,6 +17,7 @@ from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
+from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
 from skillweave.skills.spelling import misspelt
@@ -141,15 +142,17 @@ class Skill:
             obs: (n, *obs_shape), where the calls start.
             rng: the only source of chance.
         """
-        from skillweave.skills.goals import draw_from  # needs torch, which declaring does not
-
         assert self.goal_space is not None
         return draw_from(self.goal_space, len(obs), rng)
 
     def clip_goal(self, obs: Array, goal: Array) -> Array:
-        """Return goals (n, *goal_shape) in reach of ``obs``, for those that a selector chose.
+        """Return goals in reach of ``obs`` (n, *obs_shape), in place of those that were chosen.
 
         Default: they stay as they are, and one that is not in ``goal_space`` is an error.
+
+        Args:
+            obs: where the calls start.
+            goal: (n, *goal_shape), as it was chosen.
         """
         return goal
 

@@ -14,7 +14,8 @@ from gymnasium import Space
 
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goals import GOAL, OBSERVATION, Goals, with_goal, without_goal
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal, without_goal
+from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
 from skillweave.skills.plan import Plan, Shapes
 from skillweave.types import Array, Memory

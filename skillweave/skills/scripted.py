@@ -12,7 +12,7 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import qualified
-from skillweave.skills.goals import GOAL, OBSERVATION
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION
 from skillweave.skills.mapped import (
     MappedPolicy,
     invoke,

@@ -211,15 +211,3 @@ def numbered_choice_codec(space: ChoiceSpace) -> NumberedChoiceCodec:
 def chosen(choice: Tensor, owner: tuple[int, int]) -> Tensor:
     """Return where the numbers ``choice`` (…) are of a skill, (…) bool."""
     return (choice >= owner[0]) & (choice < owner[1])
-
-
-__all__ = [
-    "GOAL",
-    "SKILL",
-    "ChoiceCodec",
-    "ChoiceSpace",
-    "NumberedChoiceCodec",
-    "choice_codec",
-    "chosen",
-    "numbered_choice_codec",
-]

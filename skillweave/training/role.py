@@ -12,7 +12,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
-from skillweave.skills.goals import choice_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, with_goal
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import skillweave as sw
 from skillweave.collecting.judge import JudgedBy
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.experience import Batch
-from skillweave.skills.goals import Goals, draw_from, goals_of, shown_goal, with_goal
+from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype
 
 
