@@ -102,7 +102,11 @@ class HierarchyPolicy:
         return memory["skill"]
 
     def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
-        """Return the goal (*goal_shape) of the skill that acts in ``row`` of ``memory``, or None."""
+        """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none.
+
+        Returns:
+            (*goal_shape), or None.
+        """
         i = int(memory["skill"][row])
         policy = self.skills.policies[i]
         if isinstance(policy, HierarchyPolicy):
