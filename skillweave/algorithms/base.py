@@ -366,7 +366,7 @@ class Algorithm:
         )
 
     def widened(self, mask: Array | None) -> Array | None:
-        """Return a ``mask`` of skills (n, choices) as one of actions (n, A), which may have goals."""
+        """Return a ``mask`` of skills (n, choices) as one of actions (n, A) with their goals."""
         if mask is None or not isinstance(self.codec, NumberedChoiceCodec):
             return mask
         widened: Array = mask[:, self.codec.number_of_choice]

@@ -105,7 +105,7 @@ class HierarchyPolicy:
         """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none.
 
         Returns:
-            (*goal_shape), or None.
+            (…) an element of ``goal_space``, or None.
         """
         i = int(memory["skill"][row])
         policy = self.skills.policies[i]
