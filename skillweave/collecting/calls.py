@@ -16,7 +16,6 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
-from skillweave.spaces import ChoiceCodec
 from skillweave.types import Array
 
 
@@ -43,22 +42,14 @@ class OpenCalls:
             "reward": np.zeros(n),  # Σ γᵏ rₖ
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
-            "action": _no_choice(level, n),  # the choice
         }
         """Of each environment, (N, …); changed in place."""
+        if not player.goals:  # else its shape is that of the selector's choices
+            self.kept["action"] = np.zeros(n, np.int64)  # the choice
         if self.memory_size:
             self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
         if player.restricts or player.guide is not None:
-            every = np.ones((n, player.skills.choices), bool)
-            self.kept["allowed"] = player.widened(every)  # when it decided
-
-    @property
-    def choices(self) -> int:
-        """Return the number of the selector's discrete choices."""
-        every = np.ones((1, self.level.player.skills.choices), bool)
-        widened = self.level.player.widened(every)
-        assert widened is not None
-        return widened.shape[1]
+            self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
 
     def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
         """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
@@ -157,6 +148,8 @@ class OpenCalls:
             values["next_mask"] = self._next_mask(trace, values, row, env)
         if (chances := trace.get(self.level.path + "chances")) is not None:
             values["guide"] = as_logits(chances[row, env], values["mask"])
+        if selector is not None and selector.widen is not None and "mask" in values:
+            values |= {name: selector.widen(values[name]) for name in ("mask", "next_mask")}
         if self.keep_rewards:
             values["rewards"] = ends["rewards"]
         return self._laid_out(values, env)
@@ -199,7 +192,7 @@ class OpenCalls:
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
             may = may | ~may.any(axis=1, keepdims=True)
-            mask[on] = level.player.widened(may)
+            mask[on] = may
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:
@@ -234,15 +227,6 @@ class OpenCalls:
                 held = np.zeros(values.shape[1:], values.dtype)
                 self._shaped[self.level.path + name] = held
             held[env] = values[self._decided[env], env]
-
-
-def _no_choice(level: Level, n: int) -> Array:
-    """Return choices of n environments before the first, as the selector stores them."""
-    if level.selector is not None and level.player.goals:
-        codec = level.selector.acting.stacks[0][0].codec
-        if isinstance(codec, ChoiceCodec):
-            return np.zeros((n, codec.size), np.float32)
-    return np.zeros(n, np.int64)
 
 
 DECIDED_ON = {

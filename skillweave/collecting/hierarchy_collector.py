@@ -99,8 +99,8 @@ class HierarchyCollector(Collector):
                 calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
                 self._open[level.path] = calls
                 self._keep_after_request(level.path, calls.kept)
-                if calls.kept["action"].ndim == 1:
-                    self.ranges[f"{level.path}action"] = range(calls.choices)
+                if "action" in calls.kept:
+                    self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
         self._recurrent = {
             level.path + level.skills[i].name: memory[f"{i}.rnn"]
             for level, memory in self.levels.items()

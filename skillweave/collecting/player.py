@@ -15,7 +15,7 @@ are named as follows; a hierarchy that is skill ``i`` has the same names under `
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -120,6 +120,8 @@ class LearnerActor:
 
     def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
         self.acting = acting
+        self.widen: Callable[[Array | None], Array | None] | None = None
+        """Makes of a mask of skills one of what is chosen, where goals are part of it."""
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
         self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
@@ -137,7 +139,8 @@ class LearnerActor:
     def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
         """Return actions (k, …) in the environment's units, as the latest request says."""
         before = memory["rnn"][rows] if "rnn" in memory else None
-        acted = self.acting.some(rows, obs, mask, before)
+        allowed = mask if self.widen is None else self.widen(mask)
+        acted = self.acting.some(rows, obs, allowed, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
         if turn.trace is not None:
@@ -182,8 +185,8 @@ class Player:
         every = ((i, goals_of(skill)) for i, skill in enumerate(skills.skills))
         self.goals: dict[int, Goals] = {i: goals for i, goals in every if goals is not None}
         """The goals of skills that have some, by their place in the list."""
-        learns = isinstance(selector, LearnerActor) and bool(self.goals)
-        self._widen = selector.acting.widened if learns else None
+        if isinstance(selector, LearnerActor) and self.goals:
+            selector.widen = selector.acting.widened
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -375,19 +378,11 @@ class Player:
             choice = may.argmax(axis=1)  # the guide has left one
         else:
             how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
-            may = self.widened(may)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
         if self.goals:
             self._begin_with_goals(memory, rows, choice, obs)
         else:
             self.begin(memory, rows, choice)
-
-    def widened(self, may: Array | None) -> Array | None:
-        """Return a mask of choices (k, choices) as one of what the selector that learns chooses.
-
-        To one that learns values, a skill with each of its goals is a choice.
-        """
-        return may if self._widen is None or may is None else self._widen(may)
 
     def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:
         """Start the calls of choices (k,), which have goals if the selector gives some."""

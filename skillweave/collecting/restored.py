@@ -87,6 +87,11 @@ def opened(
             is_open = kept[join(level_of(name), "open")]
             codec.check(to_tensor(found[name][is_open]))
             continue
+        if name_of(name) == "action" and value.dtype == np.int64 and value.shape == obs.shape[:1]:
+            found[name] = value.copy()  # the numbers of skills with their goals
+            if (value < 0).any():
+                raise ValueError(f"{name!r} of open calls is {value.min()}, which is no choice")
+            continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:
             raise ValueError(f"{name!r} of open calls is {value.dtype} {value.shape}")
         found[name] = known(value)

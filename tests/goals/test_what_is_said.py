@@ -192,10 +192,20 @@ def test_exports_of_hierarchies_with_goals_are_refused(tmp_path):
         run.export(tmp_path / "export")
 
 
-def test_evolution_with_goals(tmp_path):
+SELECTORS = {
+    "PPO": sw.PPO(num_envs=4, n_steps=32, batch_size=16, network=SMALL),
+    "DQN": sw.DQN(num_envs=4, batch_size=16, learning_starts=20, buffer_size=500, network=SMALL),
+}
+
+
+@pytest.mark.parametrize(
+    ("stage", "learns_by"), [("go_to", "PPO"), ("selector", "PPO"), ("selector", "DQN")]
+)
+def test_evolution_with_goals(stage, learns_by, tmp_path):
     evolution = sw.Evolution(population=2, generations=2, episodes=1)
-    run = declared(algorithm=ON, steps=400).train(
-        tmp_path / "run", evolve={"go_to": evolution}, quiet=True
+    late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
+    how = {"selector": SELECTORS[learns_by], "steps": 900}
+    run = declared([go_to("number"), late], **how).train(
+        tmp_path / "run", evolve={stage: evolution}, eval_every=300, quiet=True
     )
     assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2
-    assert SMALL is not None
