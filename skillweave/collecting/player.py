@@ -120,7 +120,7 @@ class LearnerActor:
 
     def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
         self.acting = acting
-        self.widen: Callable[[Array | None], Array | None] | None = None
+        self.widen: Callable[[Array | None], Any] | None = None
         """Makes of a mask of skills one of what is chosen, where goals are part of it."""
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
         self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
