@@ -64,7 +64,7 @@ def holds(run, goal, seed):
 def main():
     """Train the skill, and fly to a grid of goals."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=2_000_000)
+    parser.add_argument("--steps", type=int, default=1_500_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--grid", type=int, default=len(GRID), help="goals to fly to")
     parser.add_argument("--out", default=None)

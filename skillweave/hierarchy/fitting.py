@@ -22,7 +22,7 @@ from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
 from skillweave.skills.goal_spaces import goal_part, without_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.mapped import MappedPolicy
-from skillweave.spaces import obs_codec
+from skillweave.spaces import obs_codec, same_space
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -100,7 +100,9 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
     spaces = role.observation_space, role.action_space
-    if (goals := goals_of(role.skill)) is None or not isinstance(policy, Foreign):
+    goals, seen = goals_of(role.skill), policy.observation_space
+    sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
+    if goals is None or sees_goal or not isinstance(policy, Foreign):
         return fitted(policy, *spaces, who, role.spec.name)
     if not isinstance(policy, MappedPolicy):
         raise PolicyError(

@@ -190,6 +190,13 @@ def test_exports_of_hierarchies_with_goals_are_refused(tmp_path):
     run = declared(algorithm=ON).train(tmp_path / "run", quiet=True)
     with pytest.raises(PolicyError, match="'go_to' has goals, and hierarchies with goals cannot"):
         run.export(tmp_path / "export")
+    pytest.importorskip("onnxruntime")
+    sw.save_policy(run.policy.skills.policies[0], tmp_path / "policy")
+    loaded = go_to(policy=sw.load_policy(tmp_path / "policy"))
+    other = declared([loaded]).train(tmp_path / "other", quiet=True)
+    obs = np.float32([0.3, -0.2])
+    mine, theirs = (r.player(skill="go_to", goal=(0.5, 0.5)).act(obs) for r in (run, other))
+    assert np.allclose(mine, theirs, atol=1e-5)
 
 
 SELECTORS = {
