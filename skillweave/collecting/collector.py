@@ -233,6 +233,8 @@ class Collector:
         for name, kept in self.kept.items():
             if name not in self.after_request:
                 kept[ids] = 0
+        for name, goals in self.goals.items():  # zero may be no goal
+            self.kept[name][ids] = goals.start(len(ids))
 
     def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
         """Keep arrays (N, …) that change when the steps of a request are judged."""

@@ -283,7 +283,6 @@ class SkillCollector(Collector):
         counted = {k: self.kept[k][ids] for k in ("searched", "found") if self._searches}
         super()._forget(ids)
         if self._goals is not None:
-            self.kept["goal"][ids] = self._goals.start(len(ids))
             self.kept["needs_goal"][ids] = True
         if self._searches:
             for name, value in counted.items():  # they count on from episode to episode

@@ -102,8 +102,13 @@ def _fitted(policy: Policy, role: Role, who: str) -> Policy:
     spaces = role.observation_space, role.action_space
     goals, seen = goals_of(role.skill), policy.observation_space
     sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
-    if goals is None or sees_goal or not isinstance(policy, Foreign):
+    if goals is None or sees_goal:
         return fitted(policy, *spaces, who, role.spec.name)
+    if not isinstance(policy, Foreign):
+        raise PolicyError(
+            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
+            f"as {spaces[0]}"
+        )
     if not isinstance(policy, MappedPolicy):
         raise PolicyError(
             f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "

@@ -67,9 +67,13 @@ class FunctionSelector(ReadySelector):
             value = called(function, read_only(obs), self._who)
             arguments = obs
         goals = None
-        pair = isinstance(value, tuple) and len(value) == 2 and bool(self.goal_spaces)
-        if pair and (isinstance(value[1], Mapping) or np.ndim(value[1]) > 0):
+        if isinstance(value, tuple) and len(value) == 2 and _are_goals(value[1]):
             value, goals = value
+            if not self.goal_spaces:
+                raise SkillError(
+                    f"{self._who} returned skills and goals, but no skill that it selects has "
+                    "goals: set goal_space in the skill's class, or return the skills alone"
+                )
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
             numbers = [self._number(name, self._who, SkillError) for name in chosen.tolist()]
@@ -137,3 +141,10 @@ class FunctionSelector(ReadySelector):
                 f"{shown_obs(obs[row])}, but its initiation() is False there; choose a skill that "
                 f"may start there: {listed(may)}"
             )
+
+
+def _are_goals(value: Any) -> bool:
+    """Return whether the second of two values is goals: arrays, or a dict of them."""
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return isinstance(value, Mapping | list)

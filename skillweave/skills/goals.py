@@ -157,6 +157,7 @@ class Goals:
 
     def _as_goals(self, goal: Any, n: int, who: str, kind: type[SkillweaveError]) -> Array:
         wanted = (n, *self.shape)
+        gave = f"{who} returned" if who.endswith(")") else f"{who} gave goals of"
         if goal is None:
             raise kind(
                 f"{who} returned None, but goals {wanted} were expected: is a return missing?"
@@ -172,7 +173,7 @@ class Goals:
             goals = as_array(goal, who, kind)
         if goals.shape != wanted:
             raise kind(
-                f"{who} returned shape {goals.shape}, but {wanted} was expected: one goal of "
+                f"{gave} shape {goals.shape}, but {wanted} was expected: one goal of "
                 f"{short(self.space)} for each of the {n} environments"
             )
         if goals.dtype == self.dtype:
@@ -181,9 +182,7 @@ class Goals:
         if self._bytes or goals.dtype.kind not in ("iub" if whole else "iubf"):
             numbers = "whole numbers" if whole else "numbers"
             wanted_type = self.dtype if self._bytes else numbers
-            raise kind(
-                f"{who} returned {goals.dtype}, but goals of {short(self.space)} are {wanted_type}"
-            )
+            raise kind(f"{gave} {goals.dtype}, but goals of {short(self.space)} are {wanted_type}")
         if whole and goals.size:
             limits = (0, 1) if self.dtype == bool else limits_of(self.dtype)
             if (goals < limits[0]).any() or (goals > limits[1]).any():

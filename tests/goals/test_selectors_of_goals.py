@@ -9,7 +9,7 @@ from small_runs import assert_same, stopped_run
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
-from skillweave.errors import DeclarationError, SkillError
+from skillweave.errors import DeclarationError, PolicyError, SkillError
 from skillweave.hierarchy.options import OptionsEnv
 
 SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
@@ -89,7 +89,7 @@ def test_a_selector_learns_skill_and_goal(space, learn, tmp_path):
 
 
 @pytest.mark.parametrize("learn", ["apart", "together"])
-@pytest.mark.parametrize("space", ["box", "numbers"])
+@pytest.mark.parametrize("space", ["box", "number", "numbers"])
 def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
     def hierarchy():
         return declared(
@@ -102,12 +102,20 @@ def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
     assert_same(tmp_path / "cut", whole.path)
 
 
-def test_skills_with_goals_inside(tmp_path):
-    inner = declared([Rest(), go_to()], selector=SELECTOR, name="inner")
-    still = type("Still", (Rest,), {})()
-    hierarchy = declared([inner, still], selector=SELECTOR, steps=1500)
-    run = hierarchy.train(tmp_path / "run", quiet=True)
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_skills_with_goals_inside(learn, tmp_path):
+    def hierarchy():
+        how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN}
+        inner = declared([Rest(), go_to("number")], name="inner", **how)
+        still = type("Still", (Rest,), {})()
+        return declared([inner, still], steps=1500, **how)
+
+    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
     assert "inner/go_to" in run.evaluate(3).skills
+    assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
+    stopped_run(hierarchy(), tmp_path / "cut", 5)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", run.path)
 
 
 def test_chosen_lengths_and_goals(tmp_path):
@@ -180,6 +188,15 @@ def test_a_goal_that_is_not_right(selector, says, tmp_path):
         declared([go_to(), Rest()], selector=selector).train(tmp_path / "run", quiet=True).evaluate(
             2
         )
+
+
+def test_goals_for_skills_without_goals(tmp_path):
+    rule = lambda obs: (np.full(len(obs), "rest"), obs)  # noqa: E731
+    with pytest.raises(SkillError, match="returned skills and goals, but no skill"):
+        declared([Rest()], selector=rule).check_spaces()
+    agent = sw.train_agent(Point, ON, 200, tmp_path / "agent", quiet=True)
+    with pytest.raises(PolicyError, match="has goals, but its policy observes Box"):
+        declared([go_to(policy=agent.policy)]).check_spaces()
 
 
 def test_a_goal_out_of_reach_is_clipped(tmp_path):
