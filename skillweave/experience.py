@@ -64,6 +64,7 @@ SCHEMA: dict[str, Column] = {
     # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
     "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
+    "goal": Column(raw=True, rollout=False),  # (T, N, *goal_shape), under the path of a skill
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
     "call_limit": Column(raw=True, rollout=False),  # (T, N) int64, the length that was chosen
     "call_succeeded": Column(raw=True, rollout=False),  # (T, N) bool, where calls ended

@@ -64,7 +64,8 @@ class Step:
     Its arrays are read-only, because they are shared.
 
     ``elapsed`` counts the steps of the current episode or call, this one included (so it is 1
-    on the first). ``timed_out`` is True where the skill's ``max_steps`` ended the call.
+    on the first). ``timed_out`` is True where the skill's ``max_steps`` ended the call. ``goal`` is
+    what the call is for, where the skill has goals (``Skill.goal_space``).
     """
 
     obs: Array  # (N, *obs_shape)
@@ -76,6 +77,7 @@ class Step:
     timed_out: Array  # (N,) bool, the skill's time limit
     elapsed: Array  # (N,) int64, steps
     info: Mapping[str, Any]  # the environment's, arrays over N
+    goal: Any = None  # (N, *goal_shape), the same in all steps of a call; None: a skill without
 
     def __post_init__(self) -> None:
         # Runs in every step of training: a loop over the names takes three times as long.
@@ -83,6 +85,8 @@ class Step:
         self.action, self.reward = read_only(self.action), read_only(self.reward)
         self.terminated, self.truncated = read_only(self.terminated), read_only(self.truncated)
         self.timed_out, self.elapsed = read_only(self.timed_out), read_only(self.elapsed)
+        if self.goal is not None:
+            self.goal = read_only(self.goal)
 
 
 class Policy(Protocol):

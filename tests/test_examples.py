@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-COUNT = 13
+COUNT = 14
 """Change it with ``examples/``: an example that nobody runs is not noticed to be broken."""
 BRIEFLY = """
 import runpy, sys
@@ -29,6 +29,7 @@ SMALL = {
     "bridge.py": ("--steps", "3000", "--out", "{folder}/run"),
     "doorkey.py": ("--steps", "3000", "--episodes", "5", "--out", "{folder}/run"),
     "foreign_skills.py": ("--steps", "3000"),
+    "go_to.py": ("--steps", "3000", "--grid", "1", "--out", "{folder}/run"),
     "four_rooms.py": ("--steps", "3000"),
     "nested.py": ("--steps", "5000", "--out", "{folder}/run"),
     "new_mission.py": ("left then land", "--steps", "3000", "--episodes", "1"),
@@ -43,6 +44,7 @@ NEEDS = {
     "doorkey.py": ("minigrid",),
     "key_door.py": ("PIL",),
     "foreign_skills.py": ("stable_baselines3", "onnx", "onnxruntime"),
+    "go_to.py": ("Box2D",),
     "new_mission.py": ("Box2D",),
     "sb3_selector.py": ("stable_baselines3",),
     "tutorial.py": ("Box2D", "PIL"),
@@ -51,6 +53,7 @@ SAYS = {
     "bridge.py": "solved: ",
     "doorkey.py": "solved: ",
     "foreign_skills.py": "skills under the selector: ",
+    "go_to.py": "goals reached and held",
     "four_rooms.py": "steps from the corner to the goal: ",
     "key_door.py": "over 100 episodes",
     "nested.py": "both errands done: ",

@@ -15,13 +15,22 @@ from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.experience import Report
-from skillweave.networks.heads import ActionHead
+from skillweave.networks.heads import ActionHead, ChoiceHead
 from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
-from skillweave.spaces import ObsCodec, action_codec, obs_codec
+from skillweave.spaces import (
+    ActionCodec,
+    ChoiceSpace,
+    NumberedChoiceCodec,
+    ObsCodec,
+    action_codec,
+    choice_codec,
+    numbered_choice_codec,
+    obs_codec,
+)
 from skillweave.types import Array, prefixed
 
 S = TypeVar("S")
@@ -153,7 +162,7 @@ class Algorithm:
     config: Any
     layout: Layout
     acting: Layout
-    head: ActionHead
+    head: ActionHead | ChoiceHead
     memory_size: int = 0
     """M, the size of an environment's recurrent state; 0: the networks have none."""
 
@@ -170,7 +179,13 @@ class Algorithm:
         self.observation_space = observation_space
         self.action_space = action_space
         self.obs = read_by(config, observation_space)
-        self.codec = action_codec(action_space)
+        self.codec: ActionCodec
+        if not isinstance(action_space, ChoiceSpace):
+            self.codec = action_codec(action_space)
+        elif self.store == "replay":  # it learns a value of each choice
+            self.codec = numbered_choice_codec(action_space)
+        else:
+            self.codec = choice_codec(action_space)
         self.normalize_obs = config.normalize_obs and self.obs.scaled
 
     # Methods that an algorithm defines
@@ -349,6 +364,13 @@ class Algorithm:
         state.return_mean, state.return_var, state.return_count = merge_moments(
             *moments, returns[..., None], valid
         )
+
+    def widened(self, mask: Array | None) -> Array | None:
+        """Return a ``mask`` of skills (n, choices) as one of actions (n, A) with their goals."""
+        if mask is None or not isinstance(self.codec, NumberedChoiceCodec):
+            return mask
+        widened: Array = mask[:, self.codec.number_of_choice]
+        return widened
 
     def to_env(self, action: Array) -> Array:
         """Convert an ``action`` (n, …) from policy units to the environment's."""

@@ -6,6 +6,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -455,22 +456,28 @@ class Registration:
     """The kinds of action spaces that the algorithm supports."""
     acts: bool = True
     """True if the algorithm can be chosen to act; False if it only serves others."""
+    chooses_goals: Literal["no", "discrete", "all"] = "no"
+    """The goals of skills that a selector which learns by it can choose."""
 
 
 _SPACES = gym.spaces
 _HOME = "skillweave.algorithms"
 _ANY = (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box)
 _REGISTERED: dict[str, Registration] = {
-    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY),
+    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY, chooses_goals="all"),
     "SelfImitationPPO": Registration(
         SelfImitationPPO, f"{_HOME}.self_imitation:SelfImitationAlgorithm", _ANY
     ),
     "SkillCritic": Registration(
         SkillCritic, f"{_HOME}.skill_critic:SkillCriticAlgorithm", (_SPACES.Discrete,), acts=False
     ),
-    "DQN": Registration(DQN, f"{_HOME}.dqn:DQNAlgorithm", (_SPACES.Discrete,)),
+    "DQN": Registration(
+        DQN, f"{_HOME}.dqn:DQNAlgorithm", (_SPACES.Discrete,), chooses_goals="discrete"
+    ),
     "TD3": Registration(TD3, f"{_HOME}.td3:TD3Algorithm", (_SPACES.Box,)),
-    "SAC": Registration(SAC, f"{_HOME}.sac:SACAlgorithm", (_SPACES.Box, _SPACES.Discrete)),
+    "SAC": Registration(
+        SAC, f"{_HOME}.sac:SACAlgorithm", (_SPACES.Box, _SPACES.Discrete), chooses_goals="discrete"
+    ),
 }
 BUILT_IN = tuple(_REGISTERED)
 """Names of the algorithms of this library."""
@@ -510,6 +517,9 @@ def _not_registered(name: str) -> str:
 
 def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> None:
     """Raise a DeclarationError that names other algorithms if this one cannot act in a space."""
+    if (goal_spaces := getattr(action_space, "goal_spaces", None)) is not None:
+        _check_goals(config, goal_spaces, where)
+        return
     if not isinstance(action_space, registration_of(config).action_spaces):
         able = [k for k, r in _REGISTERED.items() if r.acts]
         able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]
@@ -517,6 +527,31 @@ def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> 
             f"{where}{type(config).__name__} cannot act in {action_space}; "
             + (f"{', '.join(able)} can" if able else "no algorithm here can")
         )
+
+
+def _check_goals(config: Any, spaces: Mapping[str, gym.Space[Any]], where: str) -> None:
+    """Raise a DeclarationError where a selector cannot choose goals of these spaces, by skill."""
+    able = registration_of(config).chooses_goals
+    choices = _SPACES.Discrete | _SPACES.MultiDiscrete | _SPACES.MultiBinary
+    wrong = [name for name, space in spaces.items() if not isinstance(space, choices)]
+    if able == "discrete" and not wrong:
+        return
+    if able == "all":
+        for name, space in spaces.items():
+            real = isinstance(space, _SPACES.Box) and space.dtype.kind == "f"
+            if not real and not isinstance(space, choices):
+                raise DeclarationError(
+                    f"{where}{type(config).__name__} cannot choose goals of {space}, which {name!r}"
+                    " has (goal_space): give it goals of Box with real numbers, Discrete, "
+                    "MultiDiscrete or MultiBinary, or a ready selector that returns (names, goals)"
+                )
+        return
+    kind = "goals" if able == "no" else f"goals of {spaces[wrong[0]]}"
+    raise DeclarationError(
+        f"{where}{type(config).__name__} cannot choose {kind}, but "
+        f"{' and '.join(map(repr, wrong or spaces))} needs them (goal_space): let the selector "
+        "learn by PPO, or give a ready one that returns (names, goals)"
+    )
 
 
 def named_config(name: str, where: str) -> AlgorithmConfig:

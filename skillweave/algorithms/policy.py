@@ -59,6 +59,7 @@ class AgentPolicy(Memoryless):
             rng = rng or np.random.default_rng()
             generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
             noise = self.algorithm.noise([generator], 1, len(obs))[0]
+        mask = self.algorithm.widened(mask)
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
         before = torch.from_numpy(memory["rnn"])[None] if memory else None

@@ -23,7 +23,7 @@ from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_n
 from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Report, Rollout
-from skillweave.networks.heads import ActionHead
+from skillweave.networks.heads import head_of
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
@@ -33,6 +33,7 @@ from skillweave.ops.moments import explained_variance, masked_mean, normalise
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
+from skillweave.spaces import ChoiceSpace
 from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
@@ -72,15 +73,15 @@ class PPOAlgorithm(Algorithm):
     ) -> None:
         super().__init__(config, observation_space, action_space)
         if max(config.epsilon, config.epsilon_final or 0.0) and not isinstance(
-            action_space, gym.spaces.Discrete
+            action_space, gym.spaces.Discrete | ChoiceSpace
         ):
             raise DeclarationError(f"epsilon needs discrete actions, but they are {action_space}")
-        self.head = ActionHead(self.codec, config.action_std, config.squash_actions)
+        self.head = head_of(self.codec, config.action_std, config.squash_actions)
         self.actor_net = Net("actor", self.obs, config.network, self.head.width)
         self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)
         acting = dict(self.actor_net.shapes)
-        if not self.head.discrete and not self.head.std_in_head:
-            acting["actor.log_std"] = (1, self.codec.size)
+        if self.head.log_std_size:
+            acting["actor.log_std"] = (1, self.head.log_std_size)
         self.layout = Layout(acting | self.critic_net.shapes)
         self.memory_size = self.actor_net.memory_size + self.critic_net.memory_size
         # A recurrent critic runs while acting, too, because learning needs its recurrent state.
@@ -95,10 +96,11 @@ class PPOAlgorithm(Algorithm):
         # All values begin at 0. Until the first reward, a random critic's errors would be the only
         # advantages, and they could lead the policy away from that reward.
         self.critic_net.init_(views, 0.0, generators)
-        if self.head.std_in_head:
+        if columns := self.head.std_columns:
             bias = views[f"{self.actor_net.head}.bias"]
-            bias[..., self.codec.size :].fill_(self.config.action_std_init).log_()
-        elif not self.head.discrete:
+            std = torch.full_like(bias[..., columns], self.config.action_std_init)
+            bias[..., columns] = std.log_()
+        if self.head.log_std_size:
             views["actor.log_std"].fill_(self.config.action_std_init).log_()
         return State(**self.fresh_fields(params))
 
@@ -125,12 +127,17 @@ class PPOAlgorithm(Algorithm):
             dist_params, actor = self.actor_net.step(views, inputs, actor)
             _, critic = self.critic_net.step(views, inputs, critic)
             memory = torch.cat([actor, critic], dim=-1)
-        if self.head.discrete:
+        if choices := self.head.choices:
             epsilon = params.extra.get("epsilon")
+            logits = dist_params if self.head.discrete else dist_params[..., :choices]
             if epsilon is None:
-                dist_params = mask_logits(dist_params, mask)
+                logits = mask_logits(logits, mask)
             else:
-                dist_params = with_epsilon(dist_params, mask, epsilon)
+                logits = with_epsilon(logits, mask, epsilon)
+            if self.head.discrete:
+                dist_params = logits
+            else:  # goals of skills follow
+                dist_params = torch.cat([logits, dist_params[..., choices:]], dim=-1)
         action = self.head.act(dist_params, views.get("actor.log_std"), noise)
         return action, dist_params, memory
 

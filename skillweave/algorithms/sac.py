@@ -56,6 +56,7 @@ class SACAlgorithm(ActorCriticAlgorithm):
     state_type = State
     member_hyperparameters = ("learning_rate", "gamma", "tau", "max_grad_norm", "ent_coef")
     between = True
+    head: ActionHead
 
     def __init__(
         self, config: SAC, observation_space: gym.Space[Any], action_space: gym.Space[Any]

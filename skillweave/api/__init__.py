@@ -76,6 +76,7 @@ from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.learnable import Learnable
 from skillweave.terminal import printable
 from skillweave.training.callback import Callback
@@ -638,17 +639,27 @@ class Run:
             self._player.reset()
 
     @checked_names
-    def player(self, *, deterministic: bool = True, seed: int = 0) -> Player:
+    def player(
+        self,
+        *,
+        skill: str | None = None,
+        goal: Any = None,
+        deterministic: bool = True,
+        seed: int = 0,
+    ) -> Player:
         """Return a player: the policy for one environment, with a memory of its own.
 
         Args:
+            skill: the skill that acts alone; None: the whole policy.
+            goal: of this skill, where it has goals; None: its ``goals()`` draw one.
             deterministic: act greedily, else sample; as in ``evaluate``.
             seed: of what is sampled.
 
         Returns:
             The player; call its ``reset`` where an episode begins.
         """
-        return Player(self.policy, deterministic=deterministic, seed=seed)
+        policy = self._policy(skill)
+        return Player(policy, deterministic=deterministic, seed=seed, goal=goal)
 
     @checked_names
     def export(self, path: str | Path) -> Export:
@@ -1074,8 +1085,8 @@ def run_of(trained: Trained[Hierarchy | Agent]) -> Run:
 
 def _labels_of(
     policy: Policy, roles: Roles | None, alone: str | None
-) -> Callable[[Memory], tuple[str, RGB]]:
-    """Return a function from a policy's memory to the acting skill's name and colour.
+) -> Callable[[Memory], tuple[str, RGB, str]]:
+    """Return a function from a policy's memory to the acting skill's name, colour and goal.
 
     Args:
         roles: of the hierarchy that acts; None: a plain agent acts.
@@ -1084,16 +1095,17 @@ def _labels_of(
     skills = {} if roles is None else roles.skills
     colors = {path: color_of(i, s.color) for i, (path, s) in enumerate(skills.items())}
 
-    def label(memory: Memory) -> tuple[str, RGB]:
+    def label(memory: Memory) -> tuple[str, RGB, str]:
         if roles is None:
-            return AGENT, color_of(0, None)
+            return AGENT, color_of(0, None), ""
         acting = policy.policy if isinstance(policy, SkillAlone) else policy
         below = acting.acts(memory) if isinstance(acting, HierarchyPolicy) else None
         name = join(alone or "", below or "")
         known = name
         while known not in colors:  # a run that is a ready skill has skills of its own
             known = level_of(known)
-        return name, colors[known]
+        goal = policy.goal_now(memory) if isinstance(policy, HierarchyPolicy | SkillAlone) else None
+        return name, colors[known], "" if goal is None else shown_goal(goal)
 
     return label
 

@@ -10,6 +10,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.errors import DeclarationError
+from skillweave.messages import short
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, Step
 
@@ -41,18 +42,42 @@ class Player:
         policy: the policy that acts.
         deterministic: act greedily, else sample.
         seed: the seed of sampled actions.
+        goal: of a skill with goals that acts alone (``run.player(skill="go_to", goal=...)``), until
+            ``reset`` sets another; None: its ``goals()`` draw one in each episode.
+
+    Raises:
+        DeclarationError: a goal is given to a policy that takes none.
+        SkillError: the goal is out of the skill's ``goal_space``.
     """
 
-    def __init__(self, policy: Policy, *, deterministic: bool = True, seed: int = 0) -> None:
+    def __init__(
+        self, policy: Policy, *, deterministic: bool = True, seed: int = 0, goal: Any = None
+    ) -> None:
         self.policy, self._deterministic = policy, deterministic
         self._space = policy.observation_space
         self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
         self._seed = seed
         self._rng = np.random.default_rng(seed)
-        self.reset()
+        self._goal: Any = None
+        self.reset(goal=goal)
 
-    def reset(self) -> None:
-        """Start a new episode with an empty memory."""
+    def reset(self, *, goal: Any = None) -> None:
+        """Start a new episode with an empty memory.
+
+        Args:
+            goal: as of ``Player``; None: as before.
+
+        Raises:
+            DeclarationError: a goal is given to a policy that takes none.
+        """
+        self._goal = self._goal if goal is None else goal
+        goals = getattr(self.policy, "goals", None)
+        if self._goal is not None and goals is None:
+            raise DeclarationError(
+                f"the goal {short(self._goal)} is given to a policy that takes none: name a skill "
+                'with goals, run.player(skill="go_to", goal=...)'
+            )
+        self._needs_goal = goals is not None
         self.memory: Memory = self.policy.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
@@ -88,11 +113,23 @@ class Player:
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
+        if self._needs_goal:
+            self._choose_goal(seen)
         action, self.memory = self.policy.act(
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
         return action[0]
+
+    def _choose_goal(self, seen: Array) -> None:
+        """Set the goal of the episode that starts with an observation (1, …)."""
+        alone: Any = self.policy
+        self._needs_goal = False
+        if self._goal is None:
+            alone.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
+            return
+        goal = alone.goals.one(self._goal)
+        self.memory["goal"] = alone.goals.stored(alone.goals.fitted(seen, goal, "the player"))
 
     def _allowed(self, mask: Any) -> Array:
         """Return a mask as a batch of one."""

@@ -91,6 +91,7 @@ class Acting:
         self.each = num_envs // self.members  # B
         first = stacks[0][0]
         self.to_env, self.memory_size = first.to_env, first.memory_size
+        self.widened = first.widened
         self.keeps_head = first.store == "rollout"
         self._span: _Span | None = None
 

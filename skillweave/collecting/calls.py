@@ -42,9 +42,10 @@ class OpenCalls:
             "reward": np.zeros(n),  # Σ γᵏ rₖ
             "discount": np.zeros(n),  # γ^τ
             "tau": np.zeros(n, np.int64),
-            "action": np.zeros(n, np.int64),  # the choice
         }
         """Of each environment, (N, …); changed in place."""
+        if not player.goals:  # else its shape is that of the selector's choices
+            self.kept["action"] = np.zeros(n, np.int64)  # the choice
         if self.memory_size:
             self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
         if player.restricts or player.guide is not None:
@@ -140,12 +141,15 @@ class OpenCalls:
         }
         if cut.any():
             values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
-        if self.level.selector is not None:
-            values["action"] = np.asarray(self.level.selector.acting.to_env(values["action"]))
+        selector = self.level.selector
+        if selector is not None and not self.level.player.goals:
+            values["action"] = np.asarray(selector.acting.to_env(values["action"]))
         if "mask" in values:
             values["next_mask"] = self._next_mask(trace, values, row, env)
         if (chances := trace.get(self.level.path + "chances")) is not None:
             values["guide"] = as_logits(chances[row, env], values["mask"])
+        if selector is not None and selector.widen is not None and "mask" in values:
+            values |= {name: selector.widen(values[name]) for name in ("mask", "next_mask")}
         if self.keep_rewards:
             values["rewards"] = ends["rewards"]
         return self._laid_out(values, env)
@@ -187,7 +191,8 @@ class OpenCalls:
             may = level.player.skills.startable(values["next_obs"][on])
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
-            mask[on] = may | ~may.any(axis=1, keepdims=True)
+            may = may | ~may.any(axis=1, keepdims=True)
+            mask[on] = may
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:

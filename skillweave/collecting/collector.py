@@ -17,6 +17,7 @@ from skillweave.envs.infos import info_numbers
 from skillweave.errors import RunError
 from skillweave.experience import Batch, Trace, padded_last_axis, side_by_side
 from skillweave.seeding import Seeds, seed_global_generators
+from skillweave.skills.goals import Goals
 from skillweave.skills.info_words import info_keys
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -69,6 +70,8 @@ class Collector:
         """What is kept of each environment, (N, …) each; changed in place."""
         self.ranges: dict[str, range] = {}
         """By names of these, what numbers that choose among something may be."""
+        self.goals: dict[str, Goals] = {}
+        """By names of these, the skills whose goals they are."""
         self.open: dict[str, Array] = {}
         """The same of what has a shape that is known only when it begins."""
         self.after_request = {"sums"}
@@ -172,7 +175,7 @@ class Collector:
                     f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
                 )
             own[:] = found
-        check_numbers(self.kept, self.ranges)
+        check_numbers(self.kept, self.ranges, self.goals)
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
         space = self.engine.observation_space
@@ -239,6 +242,8 @@ class Collector:
         for name, kept in self.kept.items():
             if name not in self.after_request:
                 kept[ids] = 0
+        for name, goals in self.goals.items():  # zero may be no goal
+            self.kept[name][ids] = goals.start(len(ids))
 
     def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
         """Keep arrays (N, …) that change when the steps of a request are judged."""

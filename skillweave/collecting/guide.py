@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from skillweave.skills.goal_spaces import number_of
 from skillweave.types import Array, Memory, Step, prefixed, unprefixed
 
 SMOOTHED = 0.05
@@ -112,12 +113,28 @@ class ActiveGuide:
             choice, after = self.selector.act(
                 own, obs, may[:, ::lengths], deterministic=greedy, rng=rng
             )
-            chances: Array = np.eye(choices, dtype=np.float32)[choice]
+            chances: Array = np.eye(choices, dtype=np.float32)[number_of(choice)]
         else:
             chances, after = self.selector.chances(own, obs, may[:, ::lengths])
         for k, v in after.items():
             memory[f"guide.{k}"][rows] = v
         return chances.repeat(lengths, axis=1) / np.float32(lengths)
+
+    def choose(
+        self,
+        memory: Memory,
+        rows: Array,
+        obs: Array,
+        may: Array,
+        greedy: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> Array:
+        """Return its choices (k,) with their goals, where it decides; see ``ask``."""
+        own = {k: v[rows] for k, v in unprefixed("guide", memory).items()}
+        choice, after = self.selector.act(own, obs, may, deterministic=greedy, rng=rng)
+        for k, v in after.items():
+            memory[f"guide.{k}"][rows] = v
+        return choice
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """Return the choices that it leaves, (k, choices) bool, in environments ``rows`` (k,).

@@ -18,7 +18,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.levels import Level, with_learners
 from skillweave.collecting.player import LearnerActor, Player, Turn
-from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.restored import ranges_of, stored_goals
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.views import (
     call_successes,
@@ -102,6 +102,7 @@ class HierarchyCollector(Collector):
         """The player's, (N, …) each; changed in place."""
         self.kept |= prefixed("player", self.memory)
         self.ranges |= prefixed("player", ranges_of(self.player))
+        self.goals |= prefixed("player", stored_goals(self.player))
         self.root = Level(self.player, self.learners)
         self.levels = {
             level: self.memory
@@ -120,7 +121,8 @@ class HierarchyCollector(Collector):
                 calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
                 self._open[level.path] = calls
                 self._keep_after_request(level.path, calls.kept)
-                self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
+                if "action" in calls.kept:
+                    self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
         self._recurrent = {
             level.path + level.skills[i].name: memory[f"{i}.rnn"]
             for level, memory in self.levels.items()
@@ -182,6 +184,9 @@ class HierarchyCollector(Collector):
             out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
             for level, memory in self.levels.items():
                 out.write(**{level.path + "skill": memory["skill"]})
+                for i, goals in level.player.goals.items():
+                    goal = goals.read(memory[f"goal.{i}"])
+                    out.write(**{f"{level.path}{level.skills[i].name}/goal": goal})
         raw = self.engine.step(action)
         self.kept["age"] += 1
         step = raw.seen(obs, action, self.kept["age"].copy())
@@ -311,11 +316,15 @@ class HierarchyCollector(Collector):
     def _of_skill(self, trace: Trace, level: Level, skill: Skill, acts: Array, end: Array) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
         path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
-        steps = steps_of(trace, skill, acts, elapsed, end)
+        goal, goals = trace.get(f"{path}/goal"), level.player.goals.get(level.skills.index(skill))
+        steps = steps_of(trace, skill, acts, elapsed, end, goal)
         # Elsewhere it is called again at once.
         ends = (end == EPISODE) | timed_out(trace, skill, elapsed)
+        if goal is not None:  # with another goal another trajectory begins
+            other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
+            ends[:-1] |= other
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record)
+        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals)
         if "action" not in batch:
             batch = batch.replace(action=self._no_actions(trace.lead))
         if path not in self._states:

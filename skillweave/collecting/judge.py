@@ -14,6 +14,8 @@ from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION
+from skillweave.skills.goals import goals_of
 from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
 from skillweave.types import Array, Step
@@ -83,7 +85,10 @@ def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
             f"skill {path_of(skill)!r}: its reward changes for the same step (reward_changes), so "
             "steps cannot be judged by it again: let its reward depend on the step alone"
         )
-    return JudgedBy(skill, info_keys_read(skill, sample_step(spec)))
+    step = sample_step(spec)
+    if (goals := goals_of(skill)) is not None:
+        step = seen_by(skill, step, step.elapsed, goal=goals.start(1))
+    return JudgedBy(skill, info_keys_read(skill, step))
 
 
 @global_generators(Seeds(0) / "sample")
@@ -117,10 +122,13 @@ class JudgedBy:
         """Return the rows, any lead axes, with the skill's reward and ends."""
         lead = rows["reward"].shape
         flat = {k: v.reshape(-1, *v.shape[len(lead) :]) for k, v in rows.items()}
+        obs, next_obs, goal = flat["obs"], flat["next_obs"], None
+        if self._skill.goal_space is not None:  # stored as its networks see them
+            goal, obs, next_obs = obs[GOAL], obs[OBSERVATION], next_obs[OBSERVATION]
         step = Step(
-            obs=flat["obs"],
+            obs=obs,
             action=flat["env_action"],
-            next_obs=flat["next_obs"],
+            next_obs=next_obs,
             reward=flat["env_reward"],
             terminated=flat["env_terminated"],
             truncated=flat["env_truncated"],
@@ -128,7 +136,7 @@ class JudgedBy:
             elapsed=flat["call_elapsed"],
             info=StoredInfo({key: flat[INFO + key] for key in self._info}),
         )
-        outcome = judge(self._skill, seen_by(self._skill, step, step.elapsed))
+        outcome = judge(self._skill, seen_by(self._skill, step, step.elapsed, goal=goal))
         return rows.replace(
             reward=outcome.reward.reshape(lead),
             terminated=outcome.terminated.reshape(lead),
@@ -136,7 +144,13 @@ class JudgedBy:
         )
 
 
-def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None = None) -> Step:
+def seen_by(
+    skill: Skill | None,
+    step: Step,
+    elapsed: Array,
+    rows: Array | None = None,
+    goal: Array | None = None,
+) -> Step:
     """Return a step as a skill sees it, whose calls have their own time and limit.
 
     Where the environment is scored by a task, a skill sees the environment's own reward.
@@ -145,6 +159,7 @@ def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None 
         skill: None: there is no limit, and the reward is the task's.
         elapsed: (m,) steps of its calls so far, this one included.
         rows: (m,) ascending, some rows of the step; None: all.
+        goal: (m, *goal_shape) of its calls; None: it has no goals.
     """
     step = step if skill is None else own_step(step)
     every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
@@ -164,4 +179,5 @@ def seen_by(skill: Skill | None, step: Step, elapsed: Array, rows: Array | None 
         timed_out=timed_out,
         elapsed=elapsed,
         info=info,
+        goal=goal,
     )

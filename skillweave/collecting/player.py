@@ -7,6 +7,7 @@ are named as follows; a hierarchy that is skill ``i`` has the same names under `
 - ``skill``: the running one, −1 where no call has started in the episode;
 - ``elapsed``: steps of its call; ``limit``: the length that was chosen, where one is;
 - ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
+- ``goal.i``: the goal of the latest call of skill ``i``, where it has goals;
 - ``i.<key>``: what the policy of skill ``i`` remembers;
 - ``selector.<key>``, ``guide.<key>``: the same of the selector and its guide; ``chances``: how
   likely the guide's latest choices were.
@@ -14,6 +15,7 @@ are named as follows; a hierarchy that is skill ``i`` has the same names under `
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,8 +29,10 @@ from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.infos import allowed_rows
-from skillweave.errors import PolicyError
+from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
+from skillweave.skills.goal_spaces import GOAL, SKILL
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
 
@@ -116,6 +120,8 @@ class LearnerActor:
 
     def __init__(self, acting: Acting, path: str, *, decides: bool = False) -> None:
         self.acting = acting
+        self.widen: Callable[[Array | None], Any] | None = None
+        """Makes of a mask of skills one of what is chosen, where goals are part of it."""
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
         self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
 
@@ -133,7 +139,8 @@ class LearnerActor:
     def act(self, memory: Memory, rows: Array, obs: Array, mask: Array | None, turn: Turn) -> Array:
         """Return actions (k, …) in the environment's units, as the latest request says."""
         before = memory["rnn"][rows] if "rnn" in memory else None
-        acted = self.acting.some(rows, obs, mask, before)
+        allowed = mask if self.widen is None else self.widen(mask)
+        acted = self.acting.some(rows, obs, allowed, before)
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
         if turn.trace is not None:
@@ -175,6 +182,11 @@ class Player:
         self._limits = tuple(skills.limit(i) for i in range(len(self.actors)))
         self._stops = tuple(skill.defines("termination") for skill in skills.skills)
         self.restricts = skills.restricts
+        every = ((i, goals_of(skill)) for i, skill in enumerate(skills.skills))
+        self.goals: dict[int, Goals] = {i: goals for i, goals in every if goals is not None}
+        """The goals of skills that have some, by their place in the list."""
+        if isinstance(selector, LearnerActor) and self.goals:
+            selector.widen = selector.acting.widened
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -196,6 +208,7 @@ class Player:
         }
         if self.skills.lengths:
             memory["limit"] = np.zeros(n, np.int64)
+        memory |= {f"goal.{i}": goals.start(n) for i, goals in self.goals.items()}
         for i, actor in enumerate(self.actors):
             memory |= {f"{i}.{k}": v for k, v in actor.start(n).items()}
         if self.selector is not None:
@@ -241,10 +254,11 @@ class Player:
             if not len(mine):
                 continue
             if len(mine) == len(rows):
-                actions = actor.act(self.of_skill(memory, i), rows, obs, mask, own)
+                seen = self._seen(memory, i, rows, obs)
+                actions = actor.act(self.of_skill(memory, i), rows, seen, mask, own)
                 break
-            allowed = allowed_rows(mask, mine)
-            some = actor.act(self.of_skill(memory, i), rows[mine], obs[mine], allowed, own)
+            allowed, seen = allowed_rows(mask, mine), self._seen(memory, i, rows[mine], obs[mine])
+            some = actor.act(self.of_skill(memory, i), rows[mine], seen, allowed, own)
             if actions is None:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
@@ -256,13 +270,37 @@ class Player:
                 turn.overridden[rows] |= holds
         return actions
 
-    def begin(self, memory: Memory, rows: Array, choice: Array) -> None:
+    def begin(
+        self,
+        memory: Memory,
+        rows: Array,
+        choice: Array,
+        goals: Mapping[int, Array] | None = None,
+    ) -> None:
         """Start the calls of ``choice`` (k,) in environments ``rows`` (k,).
 
         A skill that is called again at once, in the same episode, goes on with its memory; after
         another skill's call, or in a new episode, it starts with a fresh one.
+
+        Args:
+            goals: by the places of skills that have goals, (k, *goal_shape), checked; they count
+                where the skill is chosen. None: no chosen skill has goals.
+
+        Raises:
+            SkillError: a chosen skill has goals, and there is none for it.
         """
         skill, lengths = self.skills.skill_of(choice), self.skills.lengths
+        for i, own in self.goals.items():
+            mine = np.flatnonzero(skill == i)
+            if not len(mine):
+                continue
+            if goals is None or i not in goals:
+                raise SkillError(
+                    f"skill {path_of(self.skills.skills[i])!r} has goals (goal_space), but was "
+                    f"called without one: choose it with a goal, ({self.skills.skills[i].name!r}, "
+                    "goal)"
+                )
+            memory[f"goal.{i}"][rows[mine]] = own.stored(goals[i][mine])
         if lengths:
             memory["limit"][rows] = np.array(lengths)[choice % len(lengths)]
         changed = memory["skill"][rows] != skill
@@ -325,6 +363,11 @@ class Player:
         """Choose in environments ``rows`` (k,), and start the calls."""
         may, guide = self.skills.mask(obs, None if turn.age is None else turn.age[rows]), self.guide
         greedy = turn.deterministic and self.skills.greedy_selector
+        if guide is not None and guide.decides and self.goals:
+            may = self.skills.startable(obs) if may is None else may
+            choice = guide.choose(memory, rows, obs, may, turn.deterministic, turn.rng)
+            self._begin_with_goals(memory, rows, choice, obs)
+            return
         if guide is not None:
             may = self.skills.startable(obs) if may is None else may
             chances = guide.ask(memory, rows, obs, may, turn.deterministic, turn.rng)
@@ -336,7 +379,38 @@ class Player:
         else:
             how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
             choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
-        self.begin(memory, rows, choice)
+        if self.goals:
+            self._begin_with_goals(memory, rows, choice, obs)
+        else:
+            self.begin(memory, rows, choice)
+
+    def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:
+        """Start the calls of choices (k,), which have goals if the selector gives some."""
+        if choice.dtype.fields is None:
+            self.begin(memory, rows, choice)
+        else:
+            goals = self.goals_in(choice, obs, "the selector")
+            self.begin(memory, rows, choice[SKILL], goals)
+
+    def goals_in(self, choice: Array, obs: Array, who: str) -> dict[int, Array]:
+        """Return the goals of choices (k,) of a ``choice_space``, checked, for ``begin``.
+
+        Args:
+            obs: (k, …), where the calls start.
+            who: whose choices they are, for messages.
+
+        Raises:
+            SkillError: a goal is out of its space.
+        """
+        skill, found = self.skills.skill_of(choice[SKILL]), dict[int, Array]()
+        for i, goals in self.goals.items():
+            mine = np.flatnonzero(skill == i)
+            if not len(mine):
+                continue
+            given = np.array(choice[GOAL][self.skills.skills[i].name])
+            given[mine] = goals.fitted(obs[mine], given[mine], who)
+            found[i] = given
+        return found
 
     def _observe_skill(
         self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step,
@@ -344,7 +418,7 @@ class Player:
     ) -> None:  # fmt: skip
         """Let skill ``i`` notice a step in ``rows[mine]``; where its call ends, set ``end``."""
         skill, actor = self.skills.skills[i], self.actors[i]
-        part = seen_by(skill, step, elapsed, mine)
+        part = seen_by(skill, step, elapsed, mine, self.goal_of(memory, i, rows[mine]))
         if actor.watches:
             below = self.of_skill(memory, i)
             actor.observe(below, rows[mine], part)
@@ -379,7 +453,8 @@ class Player:
         """Show a step to a guide and to a ready selector, and how the last calls ended."""
         if self.guide is None and self._ready is None:
             return
-        last = LastCall(running, end, self.succeeded(rows, step, running, elapsed, end))
+        succeeded = self.succeeded(rows, step, running, elapsed, end, memory)
+        last = LastCall(running, end, succeeded)
         if self.guide is not None:
             self.guide.watch(memory, rows, step, last)
         if self._ready is not None:
@@ -388,11 +463,20 @@ class Player:
             _put(below, rows, self._ready.watch(before, step, last))
 
     def succeeded(
-        self, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
+        self,
+        rows: Array,
+        step: Step,
+        running: Array,
+        elapsed: Array,
+        end: Array,
+        memory: Memory | None = None,
     ) -> Array:
         """(k,) bool: the calls that are over have succeeded.
 
         By the skill's ``success``; of a skill without one, if its own termination ended the call.
+
+        Args:
+            memory: of all environments; None: no skill has goals.
         """
         found: Array = end == OWN
         for i, skill in enumerate(self.skills.skills):
@@ -400,9 +484,32 @@ class Player:
                 continue
             over = np.flatnonzero((running == i) & (end != RUNNING))
             if len(over):
-                part = seen_by(skill, step, elapsed[over], over)
+                goal = None if memory is None else self.goal_of(memory, i, rows[over])
+                part = seen_by(skill, step, elapsed[over], over, goal)
                 found[over] = judge(skill, part, rows[over]).success
         return found
+
+    def drawn_goals(self, choice: Array, obs: Array, rng: np.random.Generator) -> dict[int, Array]:
+        """Return goals to practise in calls of ``choice`` (k,) in ``obs`` (k, …), for ``begin``."""
+        skill, found = self.skills.skill_of(choice), dict[int, Array]()
+        for i, goals in self.goals.items():
+            mine = np.flatnonzero(skill == i)
+            if len(mine):
+                found[i] = goals.read(goals.start(len(choice))).copy()
+                found[i][mine] = goals.draw(obs[mine], rng)
+        return found
+
+    def goal_of(self, memory: Memory, i: int, rows: Array) -> Array | None:
+        """Return the goals of skill ``i`` in ``rows`` (k,); None: it has none."""
+        goals = self.goals.get(i)
+        return None if goals is None else goals.read(memory[f"goal.{i}"][rows])
+
+    def _seen(self, memory: Memory, i: int, rows: Array, obs: Array) -> Array:
+        """Return what skill ``i`` observes in ``rows`` (k,): ``obs`` (k, …), perhaps and a goal."""
+        goals = self.goals.get(i)
+        if goals is None:
+            return obs
+        return goals.join(obs, goals.read(memory[f"goal.{i}"][rows]))
 
     def _named(self, i: int) -> tuple[str, ...]:
         """The names of what skill ``i``'s policy remembers, checked."""

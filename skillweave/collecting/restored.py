@@ -11,6 +11,7 @@ import numpy as np
 from skillweave.collecting.call_end import RUNNING, CallEnd
 from skillweave.collecting.player import Player
 from skillweave.paths import join, level_of, name_of
+from skillweave.skills.goals import Goals
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
 
@@ -27,14 +28,25 @@ def known(x: Array) -> Array:
     return np.where(np.isnan(x), np.float32(0), x)
 
 
-def check_numbers(kept: Mapping[str, Array], ranges: Mapping[str, range]) -> None:
+def check_numbers(
+    kept: Mapping[str, Array],
+    ranges: Mapping[str, range],
+    goals: Mapping[str, Goals] | None = None,
+) -> None:
     """Raise a ValueError where numbers are none that a collector keeps.
 
     Args:
         kept: of each environment, (N, …) each.
         ranges: by name, what numbers that choose among something may be.
+        goals: by name, of the skills whose goals they are.
     """
-    own = {name: x for name, x in kept.items() if not name.startswith(OF_OTHERS)}
+    goals = goals or {}
+    for name, of_skill in goals.items():
+        if not of_skill.contains(kept[name]):
+            raise ValueError(f"{name!r} of an open call is no goal of its skill")
+    own = {
+        name: x for name, x in kept.items() if not name.startswith(OF_OTHERS) and name not in goals
+    }
     counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
     for name, those in (counts | dict(ranges)).items():
         wrong = kept[name][(kept[name] < those[0]) | (kept[name] > those[-1])]
@@ -75,6 +87,11 @@ def opened(
             is_open = kept[join(level_of(name), "open")]
             codec.check(to_tensor(found[name][is_open]))
             continue
+        if name_of(name) == "action" and value.dtype == np.int64 and value.shape == obs.shape[:1]:
+            found[name] = value.copy()  # the numbers of skills with their goals
+            if (value < 0).any():
+                raise ValueError(f"{name!r} of open calls is {value.min()}, which is no choice")
+            continue
         if value.ndim != 2 or len(value) != len(obs) or value.dtype != np.float32:
             raise ValueError(f"{name!r} of open calls is {value.dtype} {value.shape}")
         found[name] = known(value)
@@ -83,6 +100,14 @@ def opened(
     running = kept.get("player.end", np.ones(1, np.int8)) == RUNNING
     if "tau" in kept and running.any() and "obs" not in found:
         raise ValueError("it does not say where open calls began")
+    return found
+
+
+def stored_goals(player: Player) -> dict[str, Goals]:
+    """Return the goals in a player's memory by name; for checkpoints."""
+    found = {f"goal.{i}": goals for i, goals in player.goals.items()}
+    for i, below in player.below.items():
+        found |= prefixed(str(i), stored_goals(below))
     return found
 
 

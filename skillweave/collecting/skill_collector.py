@@ -21,6 +21,7 @@ from skillweave.errors import TrainingError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
+from skillweave.skills.goals import goals_of
 from skillweave.types import Array, Step
 
 PATIENCE = 5_000
@@ -40,6 +41,8 @@ class SkillCollector(Collector):
     ``max_steps`` truncates it (its value goes on). Where the skill may not start, skills that can
     act already are called until it may, while other environments go on; these rows are not valid.
     A number of such calls may also come first where it may start at once.
+
+    A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
 
     Args:
         engine: the environments.
@@ -86,6 +89,11 @@ class SkillCollector(Collector):
         self._draws = self._start_calls > 0 or bool(self._start_after)
         """Whether calls come first is drawn for each episode."""
         self._searches = self._restricted or self._draws
+        self._goals = goals_of(skill)
+        if self._goals is not None:
+            self.kept["goal"] = self._goals.start(n)
+            self.goals["goal"] = self._goals
+            self.kept["needs_goal"] = np.zeros(n, bool)  # a call of the skill starts
         self._asks = self._searches or (skill is not None and skill.defines("termination"))
         """Something is asked about each step while it is made."""
         if self._searches:
@@ -99,6 +107,7 @@ class SkillCollector(Collector):
             self._starters = StartPolicy(starters, n, engine.action_space, self._start_after)
             self.kept |= self._starters.kept
             self.ranges |= self._starters.ranges
+            self.goals |= self._starters.goals
 
     @property
     def memory(self) -> Array | None:
@@ -114,6 +123,7 @@ class SkillCollector(Collector):
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
         self._rng, self._record = (request.seeds / "search").numpy(), request.record
+        self._goal_rng = None if self._goals is None else (request.seeds / "goals").numpy()
         self._before = None if self.memory is None else self.memory.copy()
         self._starts = self.kept["elapsed"] == 0
 
@@ -127,7 +137,11 @@ class SkillCollector(Collector):
         if self._draws:
             self._draw_calls()
         obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
-        acted = self.acting.all(obs, mask, memory)
+        seen, goal = obs, None
+        if self._goals is not None:
+            goal = self._choose_goals(playing)
+            seen = self._goals.join(obs, goal)
+        acted = self.acting.all(seen, mask, memory)
         action, overridden = self._actions(obs, acted.action, mask, playing)
         out.write(
             obs=obs,
@@ -137,12 +151,13 @@ class SkillCollector(Collector):
             mask=mask,
             dist_params=acted.dist_params,
             overridden=overridden,
+            goal=goal,
         )
         raw = self.engine.step(action)
         self.kept["age"] += 1
         self.kept["elapsed"] += 1 if playing is None else playing
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
-        end = self._ends(raw, step, playing)
+        end = self._ends(raw, step, playing, goal)
         out.write(
             next_obs=raw.next_obs,
             next_mask=self.engine.mask(),
@@ -232,7 +247,20 @@ class SkillCollector(Collector):
                 "its calls have no limit. Give it max_steps, or leave it out of start_calls"
             )
 
-    def _ends(self, raw: RawStep, step: Step | None, playing: Array | None) -> Array:
+    def _choose_goals(self, playing: Array | None) -> Array:
+        """Return the goals of all environments, (N, *goal_shape), after those of new calls."""
+        assert self._goals is not None
+        assert self._goal_rng is not None
+        needs, kept = self.kept["needs_goal"], self.kept["goal"]
+        ids = np.flatnonzero(needs if playing is None else needs & playing)
+        if len(ids):
+            kept[ids] = self._goals.stored(self._goals.draw(self.obs[ids], self._goal_rng))
+            needs[ids] = False
+        return self._goals.read(kept)
+
+    def _ends(
+        self, raw: RawStep, step: Step | None, playing: Array | None, goal: Array | None
+    ) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
         end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
         if skill is not None and skill.max_steps is not None:
@@ -240,7 +268,9 @@ class SkillCollector(Collector):
         if skill is not None and step is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
             if len(rows):
-                part = seen_by(skill, step, elapsed[rows], rows)
+                part = seen_by(
+                    skill, step, elapsed[rows], rows, None if goal is None else goal[rows]
+                )
                 end[rows[judge(skill, part, rows).stops]] = OWN
         end[raw.terminated | raw.truncated] = EPISODE
         if playing is not None:
@@ -249,18 +279,19 @@ class SkillCollector(Collector):
 
     def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
         acts, elapsed = trace.valid_rows, trace["call_elapsed"]
-        steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"])
+        goal = trace.get("goal")
+        steps = steps_of(trace, self.skill, acts, elapsed, trace["call_end"], goal)
         each = np.empty((*trace.lead, 3))
         each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
         found = self._count(each)
         if self.skill is not None and self.skill.defines("success"):
-            success = successes_of(trace, self.skill, acts, elapsed)
+            success = successes_of(trace, self.skill, acts, elapsed, goal)
             for row, ids, episodes in found:
                 episodes[:, SUCCESS] = success[row, ids]
         return steps.replace(valid=trace.get("valid")), found
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        batch = rows_of(trace, steps, "", trace["call_elapsed"], self._record)
+        batch = rows_of(trace, steps, "", trace["call_elapsed"], self._record, self._goals)
         if self._before is None:
             return {"": batch}
         starts = np.concatenate([self._starts[None], batch.ended[:-1]])
@@ -299,6 +330,8 @@ class SkillCollector(Collector):
         keys = ("searched", "found", "sought")
         counted = {k: self.kept[k][ids] for k in keys if k in self.kept}
         super()._forget(ids)
+        if self._goals is not None:
+            self.kept["needs_goal"][ids] = True
         if self._searches:
             for name, value in counted.items():  # they count on from episode to episode
                 self.kept[name][ids] = value

@@ -15,9 +15,10 @@ import numpy as np
 from skillweave.collecting.call_end import RUNNING
 from skillweave.collecting.judge import seen_by
 from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.restored import ranges_of
+from skillweave.collecting.restored import ranges_of, stored_goals
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.infos import allowed_rows, random_actions
+from skillweave.skills.goals import Goals
 from skillweave.types import Array, Memory, Step, prefixed
 
 
@@ -51,11 +52,14 @@ class StartPolicy:
         """Its state in each environment, (N, …) each; changed in place."""
         self.ranges: dict[str, range] = {}
         """As of ``Collector``."""
+        self.goals: dict[str, Goals] = {}
+        """As of ``Collector``."""
         if self.skills is not None:
             self._player = Player(self.skills)
             self._calls: Memory = self._player.start(num_envs)
             self.kept = prefixed("starters", self._calls)
             self.ranges = prefixed("starters", ranges_of(self._player))
+            self.goals = prefixed("starters", stored_goals(self._player))
 
     def act(
         self,
@@ -132,4 +136,6 @@ class StartPolicy:
             may = np.where(restricted[:, None], may & is_named, may)
         chance = np.where(may, rng.random(may.shape), -1.0)
         some = may.any(axis=1)
-        self._player.begin(self._calls, ids[some], chance[some].argmax(axis=1))
+        choice = chance[some].argmax(axis=1)
+        goals = self._player.drawn_goals(choice, obs[ids[some]], rng)
+        self._player.begin(self._calls, ids[some], choice, goals)

@@ -17,6 +17,8 @@ from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import short
 from skillweave.skills import Skill
+from skillweave.skills.goal_read import check_reads_goal, is_unchecked
+from skillweave.skills.goals import Goals
 from skillweave.skills.info_words import missing_key
 from skillweave.types import Array, Step
 
@@ -24,7 +26,14 @@ AT_ONCE = 1 << 26
 """Bytes of observations that a skill judges at once."""
 
 
-def steps_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array, end: Array) -> Batch:
+def steps_of(
+    trace: Trace,
+    skill: Skill | None,
+    acts: Array,
+    elapsed: Array,
+    end: Array,
+    goal: Array | None = None,
+) -> Batch:
     """Return the rows in which a skill acted, judged by its own reward and ends.
 
     Args:
@@ -32,31 +41,41 @@ def steps_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array, end
         acts: (T, N) bool, the skill acts.
         elapsed: (T, N) int64, steps of its call so far.
         end: (T, N) int8, ``CallEnd`` of its call after the step.
+        goal: (T, N, *goal_shape) of its calls; None: it has no goals.
 
     Returns:
         ``reward``, ``terminated`` and ``truncated``, 0 in other rows; ``valid`` is ``acts``.
     """
+    if goal is not None and skill is not None and acts.any() and is_unchecked(skill):
+        t = int(acts.any(axis=1).argmax())
+        ids = np.flatnonzero(acts[t])
+        step = seen_by(skill, _alone(trace, t, elapsed), elapsed[t, ids], ids, goal[t, ids])
+        check_reads_goal(skill, step)
     over = acts & (end != RUNNING)
     terminated = acts & (trace["env_terminated"] | (end == OWN))
     # The end of an episode hides the skill's own termination, so it is asked again there.
     if skill is not None and skill.defines("termination"):
         hidden = (end == EPISODE) & over & ~terminated
-        terminated[hidden] = judged(trace, skill, "stops", hidden, elapsed)
-    reward = rewards_of(trace, skill, acts, elapsed)
+        terminated[hidden] = judged(trace, skill, "stops", hidden, elapsed, goal)
+    reward = rewards_of(trace, skill, acts, elapsed, goal)
     truncated = over & ~terminated
     return Batch(reward=reward, terminated=terminated, truncated=truncated, valid=acts)
 
 
-def rewards_of(trace: Trace, skill: Skill | None, acts: Array, elapsed: Array) -> Array:
+def rewards_of(
+    trace: Trace, skill: Skill | None, acts: Array, elapsed: Array, goal: Array | None = None
+) -> Array:
     """Return a skill's rewards, (T, N) float32; 0 where it does not act; see ``steps_of``."""
     if skill is None:
         return trace["env_reward"] if acts.all() else np.where(acts, trace["env_reward"], 0)
-    return _spread(acts, judged(trace, skill, "reward", acts, elapsed), np.float32)
+    return _spread(acts, judged(trace, skill, "reward", acts, elapsed, goal), np.float32)
 
 
-def successes_of(trace: Trace, skill: Skill, acts: Array, elapsed: Array) -> Array:
+def successes_of(
+    trace: Trace, skill: Skill, acts: Array, elapsed: Array, goal: Array | None = None
+) -> Array:
     """Return where a skill has succeeded, (T, N) bool; see ``steps_of``."""
-    return _spread(acts, judged(trace, skill, "success", acts, elapsed), np.bool_)
+    return _spread(acts, judged(trace, skill, "success", acts, elapsed, goal), np.bool_)
 
 
 def call_successes(trace: Trace, skills: Sequence[Skill], path: str, over: Array) -> Array:
@@ -93,6 +112,7 @@ def judged(
     what: Literal["reward", "stops", "success"],
     acts: Array,
     elapsed: Array,
+    goal: Array | None = None,
 ) -> Array:
     """Return a property of a skill's ``Outcome`` in the K rows where it acts, (K,), by time.
 
@@ -105,19 +125,25 @@ def judged(
     alone = what == "reward" and skill.reward_changes
     most = 1 if alone else max(1, AT_ONCE // max(1, trace["obs"][0].nbytes))
     if len(acts) <= most:
-        return _judged(trace, skill, what, acts, elapsed)
-    parts = [slice(first, first + most) for first in range(0, len(acts), most)]
-    found = [_judged(trace.rows(part), skill, what, acts[part], elapsed[part]) for part in parts]
+        return _judged(trace, skill, what, acts, elapsed, goal)
+    found = []
+    for first in range(0, len(acts), most):
+        part = slice(first, first + most)
+        goals = None if goal is None else goal[part]
+        found.append(_judged(trace.rows(part), skill, what, acts[part], elapsed[part], goals))
     return np.concatenate(found)
 
 
-def _judged(trace: Trace, skill: Skill, what: str, acts: Array, elapsed: Array) -> Array:
+def _judged(
+    trace: Trace, skill: Skill, what: str, acts: Array, elapsed: Array, goal: Array | None
+) -> Array:
     steps = np.flatnonzero(acts.any(axis=1))
     if len(steps) > 1:
         step = _together(trace, steps, acts, elapsed)
         ids = np.nonzero(acts)[1]
+        seen = seen_by(skill, step, step.elapsed, goal=None if goal is None else goal[acts])
         try:
-            found: Array = getattr(judge(skill, seen_by(skill, step, step.elapsed), ids), what)
+            found: Array = getattr(judge(skill, seen, ids), what)
         except SkillweaveError:
             pass  # it is raised below, by the step that it is of
         else:
@@ -126,18 +152,27 @@ def _judged(trace: Trace, skill: Skill, what: str, acts: Array, elapsed: Array) 
     each: list[Array] = [np.zeros(0, np.float32 if what == "reward" else np.bool_)]
     for t in steps.tolist():
         ids = np.flatnonzero(acts[t])
-        step = seen_by(skill, _alone(trace, t, elapsed), elapsed[t, ids], ids)
+        own = None if goal is None else goal[t, ids]
+        step = seen_by(skill, _alone(trace, t, elapsed), elapsed[t, ids], ids, own)
         each.append(getattr(judge(skill, step, ids), what))
     return np.concatenate(each)
 
 
-def rows_of(trace: Trace, steps: Batch, path: str, elapsed: Array, record: Sequence[str]) -> Batch:
+def rows_of(
+    trace: Trace,
+    steps: Batch,
+    path: str,
+    elapsed: Array,
+    record: Sequence[str],
+    goals: Goals | None = None,
+) -> Batch:
     """Return the steps of a learner with all that it may learn from.
 
     Args:
         path: before the names of the learner's own columns: empty, or ``inner/up/``.
         elapsed: (T, N) int64, steps of its calls so far.
         record: names of raw columns.
+        goals: of the learner's skill: it observes them, too.
 
     Raises:
         EnvError: no environment gives a key of ``info`` that is wanted.
@@ -147,6 +182,9 @@ def rows_of(trace: Trace, steps: Batch, path: str, elapsed: Array, record: Seque
     found = {k: _info_column(trace, k) if k.startswith(INFO) else trace.get(k) for k in names}
     if "call_elapsed" in record:
         found["call_elapsed"] = elapsed
+    if goals is not None:
+        goal = trace[path + "goal"]
+        found |= {k: goals.join(trace[k], goal) for k in ("obs", "next_obs")}
     found |= {k: trace.get(path + k) for k in own} | {"steps": np.ones(trace.lead, np.int64)}
     return steps.replace(**found)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.experience import Rollout, Sample
+from skillweave.networks.heads import ActionHead
 
 
 def returns_of(
@@ -63,6 +64,7 @@ def rollout_of(
     log_std = algorithm.layout.views(state.params).get("actor.log_std")
     log_std = None if log_std is None else log_std[:, None].clone()
     log_probs = _tensor(log_prob, np.float32).view(lead)
+    assert isinstance(algorithm.head, ActionHead)  # of an agent, not of a selector
     dist_params = algorithm.head.with_log_prob(actions, log_probs, log_std)
     rewards = rewards.view(lead)
     return Rollout(

@@ -82,6 +82,13 @@ class States:
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills = policy.skills
+        for skill in skills.skills:
+            if skill.goal_space is not None:
+                raise PolicyError(
+                    f"skill {prefix + skill.name!r} has goals, and hierarchies with goals cannot "
+                    "be exported yet; the skill's own policy can, as one that sees the observation "
+                    "and the goal: save_policy(run.policy.skills.policies[i], path)"
+                )
         cuts = policy.skills.interruption
         selector = policy.selector
         samples = sampled or not skills.greedy_selector

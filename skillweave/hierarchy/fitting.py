@@ -13,12 +13,17 @@ import gymnasium as gym
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.collecting.guide import ActiveGuide
+from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
-from skillweave.skills.foreign_policy import fitted
+from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
+from skillweave.skills.goal_spaces import goal_part, without_goal
+from skillweave.skills.goals import goals_of
 from skillweave.skills.learnable import Learnable
+from skillweave.skills.mapped import MappedPolicy
+from skillweave.spaces import obs_codec, same_space
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -26,6 +31,8 @@ from skillweave.types import Policy
 
 def check_settings(roles: Roles) -> None:
     """Raise a DeclarationError where algorithms, reflexes or guides do not fit the environment."""
+    for skill in roles.skills.values():
+        goals_of(skill)  # raises if its space is not supported
     for level in roles.levels.values():
         for path in level.skills:
             _check_learner(roles[path], f"skill {path!r}: ")
@@ -49,9 +56,24 @@ def _check_learner(role: Role, where: str) -> None:
     if role.config is not None:
         check_spaces(role.config, role.action_space, where)
         read_by(role.config, role.observation_space, where)
+        if role.skill is not None and role.skill.goal_space is not None:
+            _check_sees_goal(role, where)
     if role.skill is not None and isinstance(role.skill.policy, Learnable):
         who = f"skill {role.path!r}"
         role.skill.policy.check(role.observation_space, role.action_space, who)
+
+
+def _check_sees_goal(role: Role, where: str) -> None:
+    """Raise a DeclarationError where the networks of a skill with goals do not see the goal."""
+    whole = obs_codec(role.observation_space).size
+    first = whole - obs_codec(goal_part(role.observation_space)).size
+    for name in ("network", "critic"):
+        sees = getattr(getattr(role.config, name, None), "sees", None)
+        if sees is not None and first < whole and max(sees) < first:
+            raise DeclarationError(
+                f"{where}{name}.sees leaves out the goal, whose places are {first} to {whole - 1}, "
+                "after those of the observation: add them"
+            )
 
 
 def ready_policies(roles: Roles) -> dict[str, Policy]:
@@ -81,7 +103,23 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
-    return fitted(policy, role.observation_space, role.action_space, who, role.spec.name)
+    spaces = role.observation_space, role.action_space
+    goals, seen = goals_of(role.skill), policy.observation_space
+    sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
+    if goals is None or sees_goal:
+        return fitted(policy, *spaces, who, role.spec.name)
+    if not isinstance(policy, Foreign):
+        raise PolicyError(
+            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
+            f"as {spaces[0]}"
+        )
+    if not isinstance(policy, MappedPolicy):
+        raise PolicyError(
+            f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
+            "goal), or a policy from elsewhere with Goal() at its place in sees"
+        )
+    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
+    return checked_fit(bound, *spaces, who, role.spec.name)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:
@@ -94,6 +132,11 @@ def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide
         return None
     choices = gym.spaces.Discrete(len(level.skills) * max(1, len(guide.lengths)))
     who = join(level.path, "guide")
+    if guide.gives_goals:
+        raise DeclarationError(
+            f"{who}: it gives a goal, but the selector that it guides chooses goals itself: leave "
+            "out the goal"
+        )
     selector = fitted(guide, observation_space, choices, who, level.spec.name)
     tells = level.guide.target_kl is not None
     return ActiveGuide(cast(ReadySelector, selector), level.guide.restrict, tells)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -17,7 +16,8 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
-from skillweave.spaces import unpack
+from skillweave.skills.goal_spaces import SKILL, choice_space
+from skillweave.spaces import pack, unpack
 from skillweave.types import Array
 
 
@@ -50,7 +50,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.skills = skills
         self.num_envs = engine.num_envs
         self.single_observation_space = engine.observation_space
-        self.single_action_space = gym.spaces.Discrete(skills.choices)
+        names = tuple(skill.name for skill in skills.skills)
+        spaces = {skill.name: skill.goal_space for skill in skills.skills}
+        goal_spaces = {name: space for name, space in spaces.items() if space is not None}
+        self.single_action_space = choice_space(skills.choices, goal_spaces, names)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)
@@ -88,7 +91,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         """Run one call in each environment.
 
         Args:
-            actions: (N,) int64, a skill for each environment.
+            actions: (N,) int64, a skill for each environment. Where skills have goals, a dict of
+                arrays: ``skill`` (N,), and ``goal``, a dict of goals (N, *goal_shape) by skill.
 
         Returns:
             Observations (N, *obs_shape); rewards, terminated, truncated (N,); ``info``, see above.
@@ -97,9 +101,14 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             DeclarationError: an action is no skill, or the skill may not start there.
         """
         n = self.num_envs
-        skill = np.asarray(actions).reshape(n)
-        self._check(skill)
-        self._player.begin(self._memory, np.arange(n), skill)
+        goals = None
+        if self._player.goals:
+            choice = pack(self.single_action_space, actions)
+            self._check(skill := choice[SKILL])
+            goals = self._player.goals_in(choice, self._obs, "OptionsEnv.step")
+        else:
+            self._check(skill := np.asarray(actions).reshape(n))
+        self._player.begin(self._memory, np.arange(n), skill, goals)
         turn = Turn(rng=(Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
         obs = self._obs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -15,6 +16,8 @@ from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
+from skillweave.skills.goal_spaces import without_goal
+from skillweave.skills.goals import goals_of
 from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
 
@@ -98,6 +101,19 @@ class HierarchyPolicy:
         """Return the running skills in a ``memory``, (n,) int64."""
         return memory["skill"]
 
+    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
+        """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none.
+
+        Returns:
+            (…) an element of ``goal_space``, or None.
+        """
+        i = int(memory["skill"][row])
+        policy = self.skills.policies[i]
+        if isinstance(policy, HierarchyPolicy):
+            return policy.goal_now(unprefixed(str(i), memory), row)
+        goal = self.player.goal_of(memory, i, np.array([row]))
+        return None if goal is None else goal[0]
+
     def acts(self, memory: Memory, row: int = 0) -> str:
         """Return the path of the skill that acts in ``row`` of the ``memory``: ``inner/skill``."""
         i = int(memory["skill"][row])
@@ -117,7 +133,8 @@ class SkillAlone:
     """Policy of one skill without a selector, with the reflexes in force.
 
     It acts from an episode's start to its end, whatever its initiation set and ends. Its memory is
-    the memory of the skill's policy.
+    the memory of the skill's policy. A skill that has goals is given one in each episode, by
+    ``choose_goals``.
 
     Args:
         skills: the skill and those beside it.
@@ -131,13 +148,47 @@ class SkillAlone:
         self.path = path or name
         self.policy = skills.policies[at]
         self.reflexes = skills.reflexes
+        self.goals = goals_of(self.skill)
         self.observation_space = self.policy.observation_space
+        if self.goals is not None:
+            self.observation_space = without_goal(self.observation_space)
         self.action_space = self.policy.action_space
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
-        self.start = self.policy.start
-        self.observe = self.policy.observe
         self.acting = self.policy.acting
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of ``n`` environments whose episodes start."""
+        memory = self.policy.start(n)
+        return memory if self.goals is None else memory | {"goal": self.goals.start(n)}
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Return the ``memory`` after a ``step``."""
+        if self.goals is None:
+            return self.policy.observe(memory, step)
+        own = {k: v for k, v in memory.items() if k != "goal"}
+        return self.policy.observe(own, step) | {"goal": memory["goal"]}
+
+    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
+        """Return its goal in ``row`` of the ``memory``; None: it has none."""
+        if self.goals is not None:
+            goal: Array = self.goals.read(memory["goal"])[row]
+            return goal
+        below = self.policy
+        return below.goal_now(memory, row) if isinstance(below, HierarchyPolicy) else None
+
+    def choose_goals(self, memory: Memory, rows: Array, obs: Array, rngs: Sequence[Any]) -> None:
+        """Draw a goal for each episode that starts in ``rows`` (k,), by ``Skill.goals``.
+
+        Args:
+            memory: of all environments, changed in place.
+            obs: (k, …).
+            rngs: the source of chance of each episode.
+        """
+        if self.goals is not None:
+            for i, rng in enumerate(rngs):
+                drawn = self.goals.stored(self.goals.draw(obs[i : i + 1], rng))
+                memory["goal"][rows[i]] = drawn[0]
 
     def act(
         self,
@@ -149,6 +200,14 @@ class SkillAlone:
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """Return the skill's actions, or a reflex's action where its condition holds."""
-        action, memory = self.policy.act(memory, obs, mask, deterministic=deterministic, rng=rng)
+        how: Any = {"deterministic": deterministic, "rng": rng}
+        if self.goals is None:
+            action, memory = self.policy.act(memory, obs, mask, **how)
+        else:
+            goal = memory["goal"]
+            own = {k: v for k, v in memory.items() if k != "goal"}
+            seen = self.goals.join(obs, self.goals.read(goal))
+            action, memory = self.policy.act(own, seen, mask, **how)
+            memory = memory | {"goal": goal}
         action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
         return action, memory

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeVar, cast
 
+from gymnasium import Space
+
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
@@ -122,6 +124,12 @@ class Level:
         """The names of its skills, without its path."""
         return tuple(map(name_of, self.skills))
 
+    @property
+    def goal_spaces(self) -> dict[str, Space[Any]]:
+        """The spaces of goals of its skills that have some, by their names."""
+        every = {name_of(path): skill.goal_space for path, skill in self.skills.items()}
+        return {name: space for name, space in every.items() if space is not None}
+
     @cached_property
     def ready_selector(self) -> ReadySelector | None:
         """The ready selector; None: the selector is trained."""
@@ -177,6 +185,8 @@ class Level:
             spec,
             self.selector if isinstance(self.selector, AlgorithmConfig) else None,
             choices=self.choices,
+            goal_spaces=self.goal_spaces,
+            skills=self.names,
             row_steps=self._usual_steps,
             greedy=self.selection.greedy_selector is not False,
             guide_kl=None if self.guide is None else self.guide.target_kl,

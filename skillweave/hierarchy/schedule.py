@@ -183,12 +183,17 @@ def _beside_selector(roles: Roles, level: Level) -> dict[str, AlgorithmConfig]:
 
 
 def _task_weights(roles: Roles, level: Level) -> dict[str, float]:
-    """Return the task's weight of skills that set one, or are in a hierarchy that does, by path."""
+    """Return the task's weight of skills that set one, or are in a hierarchy that does, by path.
+
+    A skill with goals follows its own reward alone, as the critic of skills does not see goals.
+    """
     weights: dict[str, float] = {}
     for role in roles.below(level.path):
         if role.kind == "skill" and role.config is not None:
             way = reversed(roles.skills_to(role.path, level.path))
             weight = next((s.task_weight for s in way if s.task_weight is not None), None)
+            if role.skill is not None and role.skill.goal_space is not None:
+                weight = 0.0
             if weight is not None:
                 weights[role.path] = weight
     return weights

@@ -26,6 +26,7 @@ from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
+from skillweave.skills.goal_spaces import goal_part, with_goal, without_goal
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 
@@ -277,12 +278,17 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
     is not needed.
     """
     first = policy.skills.policies[0]
+    seen = first.observation_space
+    if next(iter(roles.skills.values())).goal_space is not None:
+        seen = without_goal(seen)
     for path, part in parts_of(roles, policy).items():
         role = roles.by_path.get(path)
         if role is None or role.kind == "critic":
             continue
         action_space = first.action_space if role.choices is None else role.action_space
-        spaces = {"observation_space": first.observation_space, "action_space": action_space}
+        goal_space = None if role.skill is None else role.skill.goal_space
+        own = seen if goal_space is None else with_goal(seen, goal_space)
+        spaces = {"observation_space": own, "action_space": action_space}
         for kind, space in spaces.items():
             actual = getattr(part, kind)
             if not same_space(actual, space):
@@ -290,3 +296,12 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
                     f"{where}: the policy in the place of {path!r} has {kind} "
                     f"{shown(actual)}, but {shown(space)} belongs there"
                 )
+        if goal_space is None:
+            continue
+        recorded = goal_part(part.observation_space)
+        if recorded != goal_space:
+            raise RunError(
+                f"{where}: skill {path!r} was trained for goals of "
+                f"{shown(recorded)}, but now its goal_space is "
+                f"{shown(goal_space)}: declare goal_space as it was, or train again"
+            )

@@ -21,7 +21,8 @@ from skillweave.ops.distributions import (
     normal_stats,
     tanh_log_det,
 )
-from skillweave.spaces import ActionCodec
+from skillweave.spaces import ActionCodec, ChoiceCodec
+from skillweave.spaces.choices import chosen
 from skillweave.types import Array
 
 LOG_STD = (-5.0, 2.0)
@@ -74,6 +75,21 @@ class ActionHead:
     def discrete(self) -> bool:
         """Return whether actions are discrete."""
         return self.codec.discrete
+
+    @property
+    def choices(self) -> int:
+        """Return the number of logits of choices at the front, which a mask is for; 0: none."""
+        return self.codec.size if self.discrete else 0
+
+    @property
+    def log_std_size(self) -> int:
+        """Return the numbers of a log deviation that is a parameter; 0: there is none."""
+        return 0 if self.discrete or self.std_in_head else self.codec.size
+
+    @property
+    def std_columns(self) -> list[int]:
+        """Return the outputs of the network that are log deviations."""
+        return list(range(self.codec.size, self.width)) if self.std_in_head else []
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
         """Draw noise for calls of ``act``.
@@ -238,3 +254,155 @@ class ActionHead:
     def _spread(self, x: Tensor) -> Tensor:
         """Spread (..., ΣN) to (..., K, widest), the last entry of short parts repeated."""
         return x[..., self._columns.on(x.device)]
+
+
+class ChoiceHead:
+    """The distribution of a skill and its goal: log π(k, g) = log π(k) + log π(g | k).
+
+    A network computes the logits of the choices, then the parameters of each skill's goal. The
+    goals of skills that are not chosen are drawn, but count for nothing; of the entropy that of the
+    chosen skill's goal counts. Its methods are those of ``ActionHead``; actions are (..., W) float
+    in policy units: the number of the choice, then all goals.
+
+    Args:
+        codec: the codec of the choices.
+        std: "parameter": deviations are parameters; "state": the network computes them.
+        squash: apply tanh to goals of a Box.
+    """
+
+    discrete = False
+    std_in_head = False
+
+    def __init__(
+        self,
+        codec: ChoiceCodec,
+        std: Literal["parameter", "state"] = "parameter",
+        squash: bool = False,
+    ) -> None:
+        self.codec = codec
+        self.choices = codec.choices
+        self.goals = tuple(ActionHead(part, std, squash) for _, part, _ in codec.goals)
+        self._owners = tuple(owner for _, _, owner in codec.goals)
+        self.width = self.choices + sum(head.width for head in self.goals)
+        self.log_std_size = sum(head.log_std_size for head in self.goals)
+        self.std_columns = [
+            first + column
+            for first, head in zip(
+                self._starts([h.width for h in self.goals]), self.goals, strict=True
+            )
+            for column in head.std_columns
+        ]
+
+    def _starts(self, widths: Sequence[int]) -> list[int]:
+        """Return the first column of each goal, after the logits of the choices."""
+        return [self.choices + sum(widths[:i]) for i in range(len(widths))]
+
+    def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
+        """Draw noise for calls of ``act``; see ``ActionHead``."""
+        shape = (steps, batch, self.choices)
+        drawn = [gumbel(torch.rand(shape, generator=g, **FLOAT)) for g in generators]
+        parts = [torch.stack(drawn, dim=1)]
+        parts += [head.noise(generators, steps, batch) for head in self.goals]
+        return torch.cat(parts, dim=-1)
+
+    def act(self, dist_params: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
+        """Return greedy or sampled choices with goals, (..., W)."""
+        logits, goals = self._split(dist_params, log_std)
+        drawn = self._split_noise(noise)
+        if drawn is None:
+            number = logits.argmax(-1)
+        else:
+            number = categorical_sample(logits, drawn[0])
+        parts = [number[..., None].to(dist_params.dtype)]
+        for i, (head, params, std) in enumerate(goals):
+            action = head.act(params, std, None if drawn is None else drawn[1 + i])
+            action = action if not head.discrete or head.codec.multi else action[..., None]
+            parts.append(action.to(dist_params.dtype))
+        return torch.cat(parts, dim=-1)
+
+    def stats(
+        self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute log-probabilities of choices and the entropy; see ``ActionHead``."""
+        logits, goals = self._split(dist_params, log_std)
+        number = action[..., 0]
+        log_prob, entropy = categorical_stats(mask_logits(logits, mask), number.long())
+        for i, (head, params, std) in enumerate(goals):
+            one, spread = head.stats(params, std, None, self.codec.units(action, i))
+            counts = chosen(number, self._owners[i])
+            log_prob = log_prob + torch.where(counts, one, 0.0)
+            entropy = entropy + torch.where(counts, spread, 0.0)
+        return log_prob, entropy
+
+    def surplus(self, dist_params: Tensor, log_std: Tensor | None) -> Tensor | None:
+        """Compute the cost of too much entropy of goals; see ``ActionHead``."""
+        _, goals = self._split(dist_params, log_std)
+        found = [head.surplus(params, std) for head, params, std in goals]
+        costs = [cost for cost in found if cost is not None]
+        return sum(costs[1:], costs[0]) if costs else None
+
+    def kl(
+        self,
+        dist_params: Tensor,
+        log_std: Tensor | None,
+        other: Tensor,
+        other_log_std: Tensor | None,
+        mask: Tensor | None,
+    ) -> Tensor:
+        """Compute KL(p ‖ q): of the skill, and of each goal as often as its skill is chosen.
+
+        A guide is q by its choices alone: ``other`` (..., choices) has no goals.
+        """
+        logits, goals = self._split(dist_params, log_std)
+        masked = mask_logits(logits, mask)
+        of_choices = categorical_kl(masked, mask_logits(other[..., : self.choices], mask))
+        if other.shape[-1] == self.choices:
+            return of_choices
+        share, total = masked.softmax(-1), of_choices
+        for owner, mine, theirs in zip(
+            self._owners, goals, self._split(other, other_log_std)[1], strict=True
+        ):
+            head, params, std = mine
+            divergence = head.kl(params, std, theirs[1], theirs[2], None)
+            total = total + share[..., owner[0] : owner[1]].sum(-1) * divergence
+        return total
+
+    def to_env(self, action: Array) -> Array:
+        """Convert an ``action`` (n, W) from policy units to choices (n,)."""
+        if not any(head.squash for head in self.goals):
+            return self.codec.to_env(action)
+        action = action.copy()
+        for head, columns in zip(self.goals, self.codec.columns, strict=True):
+            if head.squash:
+                action[:, columns] = torch.from_numpy(action[:, columns]).tanh().numpy()
+        return self.codec.to_env(action)
+
+    def _split(
+        self, dist_params: Tensor, log_std: Tensor | None
+    ) -> tuple[Tensor, list[tuple[ActionHead, Tensor, Tensor | None]]]:
+        """Return the logits of choices; and the head, parameters and deviation of each goal."""
+        goals, start, first = [], self.choices, 0
+        for head in self.goals:
+            params = dist_params[..., start : start + head.width]
+            std = None
+            if head.log_std_size:
+                assert log_std is not None
+                std = log_std[..., first : first + head.log_std_size]
+            goals.append((head, params, std))
+            start, first = start + head.width, first + head.log_std_size
+        return dist_params[..., : self.choices], goals
+
+    def _split_noise(self, noise: Tensor | None) -> list[Tensor] | None:
+        if noise is None:
+            return None
+        sizes = [self.choices, *(head.codec.size for head in self.goals)]
+        return list(noise.split(sizes, dim=-1))
+
+
+def head_of(
+    codec: ActionCodec, std: Literal["parameter", "state"] = "parameter", squash: bool = False
+) -> ActionHead | ChoiceHead:
+    """Return the head of an action space, or of a selector's choices with goals."""
+    if isinstance(codec, ChoiceCodec):
+        return ChoiceHead(codec, std, squash)
+    return ActionHead(codec, std, squash)

@@ -38,7 +38,7 @@ LARGEST = 50_000_000
 """Bytes of a film that a notebook shows: it keeps a copy inside."""
 
 
-Label = Callable[[Memory], tuple[str, RGB]] | None
+Label = Callable[[Memory], tuple[str, RGB, str]] | None
 
 
 @without_screen()
@@ -118,14 +118,14 @@ class _Film:
     def _begin(self) -> None:
         self._elapsed = 0
         self._total = 0.0
-        self._skill = ""
+        self._skill = self._goal = ""
         self._color = BLACK
         self._skills = Counter[str]()
 
     def before_step(self, memory: Memory) -> None:
         """Show what the policy is about to do."""
         if self.label is not None:
-            self._skill, self._color = self.label(memory)
+            self._skill, self._color, self._goal = self.label(memory)
             self._skills[self._skill] += 1
         if self._elapsed % self.every == 0:
             self._show("return")
@@ -148,7 +148,8 @@ class _Film:
 
     def _show(self, word: str, seconds: float | None = None) -> None:
         text = f"step {self._elapsed}   {word} {self._total:+.1f}"
-        self.video.add(caption(frame_of(self.env), self._skill, self._color, text), seconds)
+        skill = f"{self._skill} {self._goal}" if self._goal else self._skill
+        self.video.add(caption(frame_of(self.env), skill, self._color, text), seconds)
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:

@@ -17,14 +17,22 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
-from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
+from skillweave.selectors.base import (
+    ReadySelector,
+    function_name,
+    goal_as_json,
+    goals_at,
+    listed,
+    shown_obs,
+    skill_and_goal,
+)
 from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, Step
 
 Event = Callable[[Step], Any] | str
 """The event of a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
-Choices = str | Sequence[str] | set[str] | frozenset[str]
+Choices = str | tuple[str, Any] | Sequence[Any] | set[Any] | frozenset[Any]
 """The skills of a state."""
 ENDS = ("success", "failure")
 
@@ -53,11 +61,16 @@ class Automaton(ReadySelector):
     it ended without success. A transition does not end a call: the skills of the new state are
     called when the running call is over. Every episode starts in ``start``.
 
+    A skill that has goals stands in a state with its goal, ``("go_to", (0.5, 1.0))``: an element of
+    its ``goal_space``, or a function of observations (n, *obs_shape) that returns goals
+    (n, *goal_shape).
+
     Among several skills that may start, greedy selection calls the first (in the order of a list;
     in the hierarchy's order of a set), else one uniformly at random.
 
     Args:
-        states: a skill's name, or several, by the state's name.
+        states: a skill's name, or several, by the state's name; ``(name, goal)`` where a skill has
+            goals.
         transitions: the event by (from, to).
         start: the first state; None: the first in ``states``.
 
@@ -80,7 +93,11 @@ class Automaton(ReadySelector):
                 f"an Automaton's states are {short(states)}; give at least one, with its skills: "
                 "states={'search': 'explore'}"
             )
-        self.states = {_name(name): _skills(name, skills) for name, skills in states.items()}
+        self.goals: dict[tuple[str, str], Any] = {}
+        """The goals by state and skill, where skills have some."""
+        self.states = {
+            _name(name): _skills(name, skills, self.goals) for name, skills in states.items()
+        }
         self.state_names = tuple(self.states)
         self.start_state = self.state_names[0] if start is None else start
         self._number_of_state(self.start_state, "start")
@@ -110,6 +127,11 @@ class Automaton(ReadySelector):
         """Return the range of state numbers."""
         return {"state": range(len(self.state_names))}
 
+    @property
+    def gives_goals(self) -> bool:
+        """Return whether a state gives its skill a goal."""
+        return bool(self.goals)
+
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments in the first state."""
         return {"state": np.full(n, self.state_names.index(self.start_state))}
@@ -133,7 +155,22 @@ class Automaton(ReadySelector):
         score = self.ranks[memory["state"]]
         if not deterministic:
             score = (rng or np.random.default_rng()).random(allowed.shape)
-        return np.where(allowed, score, -1).argmax(axis=1), memory
+        skill = np.where(allowed, score, -1).argmax(axis=1)
+        if not self.goals and not self.goal_spaces:
+            return skill, memory
+        return self.with_goals(skill, self._goals_of(memory, skill, obs), obs), memory
+
+    def _goals_of(self, memory: Memory, skill: Array, obs: Array) -> dict[str, tuple[Array, Any]]:
+        """Return the goals of the chosen skills, with their rows, by skill."""
+        found: dict[str, list[tuple[Array, Any]]] = {}
+        for (state, name), goal in self.goals.items():
+            here = memory["state"] == self.state_names.index(state)
+            rows = np.flatnonzero(here & (skill == self.skills.index(name)))
+            if len(rows):
+                who = f"{self._who}: state {short(state)}: the goal of {name!r}"
+                values = goals_at(goal, self.goal_spaces.get(name), obs[rows], who)
+                found.setdefault(name, []).append((rows, values))
+        return {name: self._joined_goals(name, parts) for name, parts in found.items()}
 
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
         """Return equal probabilities of all skills of the state that may start, (n, S).
@@ -170,7 +207,8 @@ class Automaton(ReadySelector):
             [name, sorted(skills) if isinstance(skills, frozenset) else ["in order", *skills]]
             for name, skills in self.states.items()
         ]
-        whole = json.dumps([self.start_state, states, arrows])
+        goals = [[*pair, goal_as_json(goal)] for pair, goal in self.goals.items()]
+        whole = json.dumps([self.start_state, states, arrows, *([goals] if goals else [])])
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
     def _startable(self, memory: Memory, obs: Array, mask: Array | None) -> Array:
@@ -230,8 +268,16 @@ def _name(state: Any) -> str:
     return state
 
 
-def _skills(state: str, skills: Any) -> tuple[str, ...] | frozenset[str]:
-    """Return the names of a state's skills: in order, or as a set."""
+def _skills(
+    state: str, skills: Any, goals: dict[tuple[str, str], Any]
+) -> tuple[str, ...] | frozenset[str]:
+    """Return the names of a state's skills: in order, or as a set; set their ``goals``."""
+    if skill_and_goal(skills)[1] is not None:
+        skills = [skills]
+    if isinstance(skills, list | tuple | set | frozenset):
+        pairs = [skill_and_goal(skill) for skill in skills]
+        goals |= {(state, name): goal for name, goal in pairs if goal is not None}
+        skills = type(skills)(name for name, _ in pairs)
     if isinstance(skills, str):
         return (skills,)
     where = f"automaton: state {short(state)}"

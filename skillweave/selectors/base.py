@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.collecting.guide import LastCall
-from skillweave.errors import DeclarationError, SkillweaveError
+from skillweave.errors import DeclarationError, SkillError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.types import Array, Memory, Step
+from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of
+from skillweave.skills.outputs import as_array, called
+from skillweave.types import Array, Memory, Step, read_only
 
 
 class ReadySelector(Foreign):
@@ -43,6 +48,82 @@ class ReadySelector(Foreign):
         selector.skills = skills
         return selector
 
+    @property
+    def gives_goals(self) -> bool:
+        """Return whether it is declared with goals for skills."""
+        return False
+
+    @property
+    def goal_spaces(self) -> dict[str, Space[Any]]:
+        """Return the spaces of goals of the skills that have some, by name, once it is bound."""
+        space = self.action_space
+        goals = space[GOAL] if isinstance(space, Dict) else None
+        return dict(goals.spaces) if isinstance(goals, Dict) else {}
+
+    def with_goals(self, skill: Array, goals: Mapping[str, tuple[Array, Any]], obs: Array) -> Array:
+        """Return choices of skills (n,) with their goals, as a ``Player`` takes them.
+
+        Args:
+            skill: (n,) the chosen skills.
+            goals: by skill, rows (k,) and their goals (k, *goal_shape).
+            obs: (n, …), for messages.
+
+        Raises:
+            SkillError: a skill with goals was chosen without one, or one without goals with one.
+        """
+        spaces = self.goal_spaces
+        lacks = np.ones(len(skill), bool)
+        choices = blank_choices(self.action_space, skill) if spaces else skill
+        for name, (rows, values) in goals.items():
+            if name not in spaces:
+                number = self._number(name, self._who, SkillError)
+                raise SkillError(
+                    f"{self._who} gave a goal for skill {self.skills[number]!r}, which has no "
+                    "goals: set its goal_space, or leave out the goal"
+                )
+            part, wanted = choices[GOAL][name], tuple(spaces[name].shape or ())
+            given = _as_goals(values, spaces[name], self._who)
+            if given.shape[1:] != wanted or len(given) != len(rows):
+                raise SkillError(
+                    f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but "
+                    f"{(len(rows), *wanted)} was expected: one goal of {short(spaces[name])} for "
+                    "each environment"
+                )
+            kinds = "iub" if part.dtype.kind in "iub" else "iubf"
+            if given.dtype.kind not in kinds and given.dtype != part.dtype:
+                raise SkillError(
+                    f"{self._who} gave goals of {given.dtype} for skill {name!r}, but goals of "
+                    f"{short(spaces[name])} are {part.dtype}"
+                )
+            part[rows] = given
+            lacks[rows] = False
+        for name in spaces:
+            wrong = np.flatnonzero(lacks & (skill == self.skills.index(name)))
+            if len(wrong):
+                raise SkillError(
+                    f"{self._who} chose skill {name!r} without a goal in observation "
+                    f"{shown_obs(obs[wrong[0]])}, but it has goals of {short(spaces[name])}: "
+                    f"{self._goal_advice(name)}"
+                )
+        return choices
+
+    def _joined_goals(self, name: str, parts: Sequence[tuple[Array, Any]]) -> tuple[Array, Any]:
+        """Return the goals of several rows of skill ``name`` as one array with its rows."""
+        space = self.goal_spaces.get(name)
+        if space is None or len(parts) == 1:
+            return parts[0]
+        arrays = [_as_goals(values, space, self._who) for _, values in parts]
+        try:
+            return np.concatenate([rows for rows, _ in parts]), np.concatenate(arrays)
+        except ValueError as error:
+            raise SkillError(
+                f"{self._who} gave goals of different shapes for skill {name!r}: {error}"
+            ) from error
+
+    def _goal_advice(self, name: str) -> str:
+        """Return how a goal is given to skill ``name``, for messages."""
+        return f"write ({name!r}, goal) in place of {name!r}"
+
     def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
         """Return the probability of each choice where a call is over, (n, choices) float32.
 
@@ -51,7 +132,7 @@ class ReadySelector(Foreign):
         """
         choice, after = self.act(memory, obs, mask)
         choices = len(self.skills) * max(1, len(self.lengths))
-        return np.eye(choices, dtype=np.float32)[choice], after
+        return np.eye(choices, dtype=np.float32)[number_of(choice)], after
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
@@ -81,6 +162,53 @@ class ReadySelector(Foreign):
                 f"are: {listed(self.skills)}"
             )
         return self.skills.index(skill)
+
+
+def skill_and_goal(value: Any) -> tuple[Any, Any]:
+    """Return the name and the goal of ``(name, goal)``; of anything else itself, and None."""
+    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
+        name, goal = value
+        if goal is not None and not isinstance(goal, str):
+            return name, goal
+    return value, None
+
+
+def goals_at(goal: Any, space: Space[Any] | None, obs: Array, who: str) -> Any:
+    """Return the goals of ``(name, goal)`` in observations (k, …): fixed, or by a function."""
+    if callable(goal):
+        return called(goal, read_only(obs), who)
+    if isinstance(space, Dict | Tuple):
+        return _repeated(space, goal, len(obs))
+    fixed = as_array(goal, who)
+    return np.broadcast_to(fixed, (len(obs), *fixed.shape))
+
+
+def goal_as_json(goal: Any) -> Any:
+    """Return a goal of ``(name, goal)`` for checksums; of a function its name."""
+    if callable(goal):
+        return {"function": function_name(goal)}
+    return repr(goal.tolist() if isinstance(goal, np.ndarray) else goal)
+
+
+def _as_goals(values: Any, space: Space[Any], who: str) -> Array:
+    """Return goals (k, …) as an array."""
+    if isinstance(values, np.ndarray) or not isinstance(space, Dict | Tuple):
+        return as_array(values, who)
+    from skillweave.spaces import pack  # needs torch, which declaring does not
+
+    try:
+        return pack(space, values)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise SkillError(f"{who} gave {short(values)}, which are no goals of {space}") from error
+
+
+def _repeated(space: Space[Any], goal: Any, n: int) -> Any:
+    """Return one goal of a Dict or Tuple as a batch of n."""
+    if isinstance(space, Dict):
+        return {k: _repeated(part, goal[k], n) for k, part in space.spaces.items()}
+    if isinstance(space, Tuple):
+        return tuple(_repeated(p, g, n) for p, g in zip(space.spaces, goal, strict=True))
+    return np.broadcast_to(goal, (n, *np.shape(goal)))
 
 
 def listed(names: tuple[str, ...]) -> str:

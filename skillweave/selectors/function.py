@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,16 @@ from skillweave.selectors.base import ReadySelector, function_name, listed, show
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
-from skillweave.skills.ready import required_arguments
+from skillweave.skills.scripted import required_arguments
 from skillweave.types import Array, Memory, Step, read_only
 
 
 class FunctionSelector(ReadySelector):
     """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
 
-    If it needs a second argument, that is the ``LastCall``.
+    If it needs a second argument, that is the ``LastCall``. Where skills have goals, it returns
+    skills and goals: ``(names, goals)``, the goals (n, *goal_shape), or a dict of such arrays by
+    skill where several have goals. They count where the skill is chosen.
 
     Raises:
         SkillError: when it acts: the function failed, or chose an unknown skill, or a skill that
@@ -55,7 +57,7 @@ class FunctionSelector(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Return the function's choices, (n,), checked."""
+        """Return the function's choices, (n,), checked; with their goals where skills have some."""
         function = self.function
         if self.takes_last_call:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
@@ -64,15 +66,54 @@ class FunctionSelector(ReadySelector):
         else:
             value = called(function, read_only(obs), self._who)
             arguments = obs
+        goals = None
+        if isinstance(value, tuple) and len(value) == 2 and _are_goals(value[1]):
+            value, goals = value
+            if not self.goal_spaces:
+                raise SkillError(
+                    f"{self._who} returned skills and goals, but no skill that it selects has "
+                    "goals: set goal_space in the skill's class, or return the skills alone"
+                )
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
             numbers = [self._number(name, self._who, SkillError) for name in chosen.tolist()]
             chosen = np.array(numbers, int)
         choices = Discrete(len(self.skills))
         chosen = checked_actions(chosen, len(obs), choices, self._who, SkillError)
-        probe(function, arguments, len(obs), self._who)
+        if goals is None:
+            probe(function, arguments, len(obs), self._who)
         self._check_starts(chosen, obs, mask)
-        return chosen, memory
+        if not self.goal_spaces:
+            return chosen, memory
+        return self.with_goals(chosen, self._goals(chosen, goals), obs), memory
+
+    def _goals(self, chosen: Array, goals: Any) -> dict[str, tuple[Array, Array]]:
+        """Return the goals of the chosen skills, with their rows, by skill."""
+        names = list(self.goal_spaces)
+        if goals is None:
+            return {}
+        if not isinstance(goals, Mapping):
+            if len(names) > 1:
+                raise SkillError(
+                    f"{self._who} returned one array of goals, but {listed(tuple(names))} have "
+                    "goals: return (names, {skill: goals})"
+                )
+            goals = {names[0]: goals}
+        found = {}
+        for name, values in goals.items():
+            number = self._number(name, self._who, SkillError)
+            given = as_array(values, self._who)
+            if given.shape[:1] != chosen.shape:
+                raise SkillError(
+                    f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but one "
+                    f"goal for each of the {len(chosen)} environments was expected"
+                )
+            rows = np.flatnonzero(chosen == number)
+            found[name] = rows, given[rows]
+        return found
+
+    def _goal_advice(self, name: str) -> str:
+        return "return (names, goals)"
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Store the end of the last call."""
@@ -100,3 +141,10 @@ class FunctionSelector(ReadySelector):
                 f"{shown_obs(obs[row])}, but its initiation() is False there; choose a skill that "
                 f"may start there: {listed(may)}"
             )
+
+
+def _are_goals(value: Any) -> bool:
+    """Return whether the second of two values is goals: arrays, or a dict of them."""
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return isinstance(value, Mapping | list)

@@ -15,7 +15,9 @@ selector = tree.Sequence(
 )
 ```
 
-Text is a skill's name; a function of observations (n, *obs_shape) to (n,) bool is a condition.
+Text is a skill's name; a function of observations (n, *obs_shape) to (n,) bool is a condition. A
+skill that has goals stands with its goal, ``("go_to", (0.5, 1.0))``: an element of its
+``goal_space``, or a function of observations (n, *obs_shape) that returns goals (n, *goal_shape).
 
 The tree is evaluated only where a call is over. A skill's leaf is RUNNING during its call, SUCCESS
 if the call succeeded (by the skill's ``success``; without it, by its ``termination``), and FAILURE
@@ -33,7 +35,7 @@ from typing import Any, ClassVar
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.selectors.base import function_name
+from skillweave.selectors.base import function_name, skill_and_goal
 from skillweave.types import Array
 
 
@@ -71,7 +73,8 @@ class Composite:
     """A node with children: a ``Sequence`` or a ``Fallback``.
 
     Args:
-        children: skills' names, conditions (or bare functions), sequences and fallbacks.
+        children: skills' names (with a goal: ``(name, goal)``), conditions (or bare functions),
+            sequences and fallbacks.
         memory: continue with the running child; else begin with the first child at each evaluation,
             so conditions before it are evaluated again, and skills before it are called again.
 
@@ -84,7 +87,7 @@ class Composite:
 
     def __init__(
         self,
-        *children: str | Callable[[Array], Any] | Condition | Composite,
+        *children: str | tuple[str, Any] | Callable[[Array], Any] | Condition | Composite,
         memory: bool = True,
     ) -> None:
         where = f"tree: {type(self).__name__}"
@@ -124,12 +127,13 @@ class Fallback(Composite):
     goes_on_after = Status.FAILURE
 
 
-Node = str | Condition | Composite
+Node = str | tuple[str, Any] | Condition | Composite
 
 
 def _child(child: Any, where: str) -> Node:
-    if isinstance(child, str | Condition | Composite):
-        return child
+    if isinstance(child, str | Condition | Composite) or skill_and_goal(child)[1] is not None:
+        node: Node = child
+        return node
     if callable(child) and not isinstance(child, type):
         return Condition(child)
     raise DeclarationError(

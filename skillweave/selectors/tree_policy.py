@@ -15,7 +15,13 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.selectors.base import ReadySelector, shown_obs
+from skillweave.selectors.base import (
+    ReadySelector,
+    goal_as_json,
+    goals_at,
+    shown_obs,
+    skill_and_goal,
+)
 from skillweave.selectors.tree import Composite, Condition, Node, Status
 from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import checksum, made_up
@@ -59,6 +65,11 @@ class TreeSelector(ReadySelector):
         """Return the range of its leaves, with −1 for none."""
         return {"leaf": range(-1, len(self._plan.skills))}
 
+    @property
+    def gives_goals(self) -> bool:
+        """Return whether a leaf gives its skill a goal."""
+        return bool(self._plan.goals)
+
     def start(self, n: int) -> Memory:
         """Return a memory without a running call."""
         return {
@@ -93,7 +104,21 @@ class TreeSelector(ReadySelector):
                 "last child is a skill that may start everywhere"
             )
         after = {"leaf": tick.leaf, "succeeded": tick.succeeded, "child": tick.after}
-        return tick.skill, after
+        if not self._plan.goals and not self.goal_spaces:
+            return tick.skill, after
+        return self.with_goals(tick.skill, self._goals_of(tick.leaf, obs), obs), after
+
+    def _goals_of(self, leaf: Array, obs: Array) -> dict[str, tuple[Array, Any]]:
+        """Return the goals of the running leaves (n,), with their rows, by skill."""
+        found: dict[str, list[tuple[Array, Any]]] = {}
+        for number, goal in self._plan.goals.items():
+            rows = np.flatnonzero(leaf == number)
+            if len(rows):
+                name = self.skills[self._plan.skills[number]]
+                who = f"{self._who}: the goal of {name!r}"
+                values = goals_at(goal, self.goal_spaces.get(name), obs[rows], who)
+                found.setdefault(name, []).append((rows, values))
+        return {name: self._joined_goals(name, parts) for name, parts in found.items()}
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Store whether the running call has succeeded.
@@ -124,6 +149,8 @@ def _as_json(node: Node) -> Any:
     """Return a node as JSON."""
     if isinstance(node, str):
         return node
+    if isinstance(node, tuple):
+        return [node[0], goal_as_json(node[1])]
     if isinstance(node, Condition):
         return {"condition": node.name}
     return {type(node).__name__: [_as_json(c) for c in node.children], "memory": node.memory}
@@ -206,14 +233,18 @@ class _Plan:
     skills: list[int] = field(default_factory=list)  # of each leaf
     composites: int = 0
     conditions: list[_Check] = field(default_factory=list)
+    goals: dict[int, Any] = field(default_factory=dict)  # by leaf, where its skill has goals
 
     def add(self, node: Node, number_of: Callable[[str], int]) -> Any:
         """Return a node with all below it."""
         if isinstance(node, Condition):
             self.conditions.append(_Check(node))
             return self.conditions[-1]
-        if isinstance(node, str):
-            self.skills.append(number_of(node))
+        if isinstance(node, str | tuple):
+            name, goal = skill_and_goal(node)
+            if goal is not None:
+                self.goals[len(self.skills)] = goal
+            self.skills.append(number_of(name))
             return _Leaf(len(self.skills) - 1, self.skills[-1])
         self.composites += 1
         number = self.composites - 1

@@ -17,6 +17,7 @@ from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
+from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
@@ -50,15 +51,18 @@ class Skill:
         call_steps: the most steps of a call, wherever it is trained; None: the hierarchy's.
         steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
         task_weight: weight of the task's advantage beside its own reward where skills learn
-            together; None: ``Together.task_weight`` (1). 0: only its own reward counts, as it
-            should in a skill for other hierarchies.
+            together; None: ``Together.task_weight`` (1), or 0 for a skill with goals. 0: only its
+            own reward counts, as it should in a skill for other hierarchies.
         algorithm: settings of the algorithm that trains it, its network included; None: the
             hierarchy's.
         target_return: mean return of the periodic evaluation (the hierarchy's ``eval_every``) at
             which its training ends early; None: it uses all its steps.
         target_success: the same for the share of successful episodes, from 0 to 1.
+        goal_space: the space of its goals, any that observations may have; None: it has none. Its
+            networks see the observation and the goal of the call, and ``step.goal`` holds it.
         policy: acts without training: a function of observations (n, *obs_shape), which needs no
-            ``staticmethod``, or a method ``policy(self, obs)``; a torch module;
+            ``staticmethod``, or a method ``policy(self, obs)``, with a goal ``policy(self, obs,
+            goal)``; a torch module;
             ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
             environment has an action mask, networks that return logits respect it; actions of
             others go to the environment unchanged.
@@ -77,12 +81,14 @@ class Skill:
     algorithm: Any = None
     target_return: float | None = None
     target_success: Share | None = None
+    goal_space: Space[Any] | None = None
     policy: Any = None
     needs_info: Sequence[str] | None = None
     reward_changes: bool = False
     color: tuple[int, int, int] | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
+    of_goals: ClassVar[tuple[str, ...]] = ("goals", "clip_goal")
 
     _path: str = ""
 
@@ -127,6 +133,29 @@ class Skill:
         Default: nowhere in evaluations; for automata and trees, where ``termination`` stopped it.
         """
         return np.zeros(len(step.reward), bool)
+
+    def goals(self, obs: Array, rng: np.random.Generator) -> Array:
+        """Return goals to practise where it learns or is evaluated by itself, (n, *goal_shape).
+
+        Elsewhere the selector chooses goals. Default: elements of ``goal_space`` at random.
+
+        Args:
+            obs: (n, *obs_shape), where the calls start.
+            rng: the only source of chance.
+        """
+        assert self.goal_space is not None
+        return draw_from(self.goal_space, len(obs), rng)
+
+    def clip_goal(self, obs: Array, goal: Array) -> Array:
+        """Return goals in reach of ``obs`` (n, *obs_shape), in place of those that were chosen.
+
+        Default: they stay as they are, and one that is not in ``goal_space`` is an error.
+
+        Args:
+            obs: where the calls start.
+            goal: (n, *goal_shape), as it was chosen.
+        """
+        return goal
 
     def defines(self, method: str) -> bool:
         """Return whether the subclass overrides ``method``."""
@@ -174,17 +203,36 @@ class Skill:
                 f"{where}: needs_info is {short(keys)}; it must be a tuple of keys of info: "
                 "needs_info = ('key',)"
             )
-        known = [*Skill.__annotations__.keys() - {"methods", "_path"}, *self.methods]
+        self._check_goals(where)
+        known = [
+            *Skill.__annotations__.keys() - {"methods", "of_goals", "_path"},
+            *self.methods,
+            *self.of_goals,
+        ]
         for name, meant in misspelt(self, Skill, known):
             warnings.warn(
                 f"{where} has {name!r}, which is no attribute of a skill: is {meant!r} meant?",
                 stacklevel=2,
             )
-        for method in self.methods:
+        for method in (*self.methods, *self.of_goals):
             if not callable(getattr(self, method)):
                 raise DeclarationError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
+
+    def _check_goals(self, where: str) -> None:
+        """Raise a DeclarationError where its goals are declared in a way that has no meaning."""
+        if self.goal_space is None:
+            if given := [method for method in self.of_goals if self.defines(method)]:
+                raise DeclarationError(
+                    f"{where} has {given[0]}(), but no goals: set goal_space, the space of its "
+                    "goals: goal_space = gymnasium.spaces.Box(-1, 1, (2,))"
+                )
+        elif not isinstance(self.goal_space, Space):
+            raise DeclarationError(
+                f"{where}: goal_space is {short(self.goal_space)}; it must be a Gymnasium space: "
+                "goal_space = gymnasium.spaces.Box(-1, 1, (2,))"
+            )
 
 
 def _is_color(value: object) -> bool:
@@ -204,14 +252,16 @@ def about(skill: Skill) -> str:
 
 def own_methods(skill: Skill) -> list[str]:
     """Return the methods that a skill overrides."""
-    return [method for method in skill.methods if skill.defines(method)]
+    return [method for method in (*skill.methods, *skill.of_goals) if skill.defines(method)]
 
 
 def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
     """Yield the settings of a skill that differ from the defaults, except its name."""
     for field in Skill.__annotations__:
         value = getattr(skill, field)
-        if field not in ("name", "methods", "_path") and value is not getattr(Skill, field):
+        if field not in ("name", "methods", "of_goals", "_path") and value is not getattr(
+            Skill, field
+        ):
             yield field, value
 
 

@@ -111,10 +111,17 @@ def fitted(
     Raises:
         PolicyError: it does not fit; the message names ``who`` and both spaces.
     """
-    from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
-
     if isinstance(policy, Foreign):
         policy = policy.bind(observation_space, action_space, who)
+    return checked_fit(policy, observation_space, action_space, who, env)
+
+
+def checked_fit(
+    policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
+) -> Policy:
+    """Return a bound policy, after it was tried out; see ``fitted``."""
+    from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
+
     for kind, mine, theirs in (
         ("observation_space", policy.observation_space, observation_space),
         ("action_space", policy.action_space, action_space),

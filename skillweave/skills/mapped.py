@@ -14,6 +14,8 @@ from gymnasium import Space
 
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.skills.foreign_policy import Foreign
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal, without_goal
+from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
 from skillweave.skills.plan import Plan, Shapes
 from skillweave.types import Array, Memory
@@ -39,6 +41,7 @@ class MappedPolicy(Foreign):
         super().__init__(name, observation_space, action_space)
         self.mapping = mapping or PolicyMapping()
         self._plan: Plan | None = None
+        self._goals: Goals | None = None
 
     def __copy__(self) -> Self:
         twin = object.__new__(type(self))  # with the same model, which is not loaded again
@@ -85,10 +88,39 @@ class MappedPolicy(Foreign):
         bound.fit_mapping()
         return bound
 
+    @property
+    def takes_goal(self) -> bool:
+        """Return whether the goal of a skill is an input of it."""
+        return self.mapping.takes_goal
+
+    def bind_with_goals(
+        self, observation_space: Space[Any], action_space: Space[Any], who: str, goals: Goals
+    ) -> Self:
+        """Return a copy as of ``bind``, as the policy of a skill that has goals.
+
+        It observes ``with_goal``.
+
+        Raises:
+            PolicyError: the goal is no input of it, or its mapping does not fit.
+        """
+        bound = super().bind(observation_space, action_space, who)
+        if not self.takes_goal:
+            raise PolicyError(f"{bound._who} takes no goal, but its skill has goals: {self.advice}")
+        bound._goals = goals
+        bound.observation_space = with_goal(bound.observation_space, goals.space)
+        bound.fit_mapping()
+        return bound
+
+    advice = "write Goal() at its place in sees"
+    """How the policy is given the goal, for messages."""
+
     def fit_mapping(self) -> None:
         """Fit the mapping to the spaces, which are known."""
-        spaces = self.observation_space, self.action_space
-        self._plan = Plan(self.mapping, *spaces, self.expected(), self._who, self.states())
+        seen, size = self.observation_space, None
+        if self._goals is not None:
+            seen, size = without_goal(seen), self._goals.size
+        spaces = seen, self.action_space
+        self._plan = Plan(self.mapping, *spaces, self.expected(), self._who, self.states(), size)
 
     @property
     def plan(self) -> Plan:
@@ -107,6 +139,11 @@ class MappedPolicy(Foreign):
             return {}
         return self.plan.start(n)
 
+    def split(self, obs: Array) -> tuple[Array, Array | None]:
+        """Return observations, and goals (n, G), of what a skill with goals observes."""
+        assert self._goals is not None
+        return obs[OBSERVATION], self._goals.flat(obs[GOAL])
+
     def remembers(self) -> bool:
         """Return whether it has a memory."""
         return bool(self.mapping.state) or self.mapping.remembers_output or self.mapping.period > 1
@@ -123,9 +160,12 @@ class MappedPolicy(Foreign):
     ) -> tuple[Array, Memory]:
         """Return actions; logits are sampled with ``rng`` if not ``deterministic``.
 
-        ``goal`` (n, G) replaces the mapping's own goal.
+        ``goal`` (n, G) replaces the mapping's own goal. The policy of a skill with goals finds them
+        in ``obs``.
         """
         plan = self._plan or self.plan
+        if self._goals is not None:
+            obs, goal = self.split(obs)
         if plan.remembers_nothing:
             inputs = obs if plan.inputs is None else plan.read(obs, None, goal)
             output, _ = self.call(inputs, (), mask, deterministic, rng)

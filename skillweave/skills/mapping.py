@@ -228,6 +228,11 @@ class PolicyMapping:
         """Return the parts of all inputs."""
         return [source for parts in (self.sees or {}).values() for source in parts]
 
+    @property
+    def takes_goal(self) -> bool:
+        """Return whether the goal is among the inputs."""
+        return any(isinstance(source, Goal) for source in self.sources())
+
     def check_goal(self) -> None:
         """Raise a DeclarationError where the goal has no place, or is out of its range."""
         places = [s for s in self.sources() if isinstance(s, Goal)]

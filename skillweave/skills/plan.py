@@ -274,6 +274,7 @@ class Plan:
         expected: the shapes of the model's inputs, without those of its state; empty: unknown.
         who: begins messages.
         states: the shapes of the recurrent state of one environment, and its type.
+        goal_size: the numbers of the goal of the skill; None: it has no goals.
 
     Raises:
         PolicyError: the mapping does not fit the spaces or the model; the message names the field.
@@ -287,6 +288,7 @@ class Plan:
         expected: Shapes,
         who: str,
         states: Sequence[tuple[tuple[int, ...], Any]] = (),
+        goal_size: int | None = None,
     ) -> None:
         self.mapping = mapping
         self.who = who
@@ -296,7 +298,7 @@ class Plan:
         self.state_keys = tuple(f"state.{i}" for i in range(len(self.states)))
         self._leaves = [] if mapping.sees is None else leaves_of(observation_space)
         self._goal = self._fitted_goal()
-        self._goal_shape: tuple[int, ...] | None = None
+        self._goal_shape: tuple[int, ...] | None = None if goal_size is None else (goal_size,)
         self._has_goal = any(isinstance(s, Goal) for s in mapping.sources())
         self.inputs: dict[str, Input] | None = None
         self.remembers_nothing = (
@@ -394,10 +396,12 @@ class Plan:
         return Input(tuple(pieces), scalings, shape, tuple(sources))
 
     def _goal_width(self, where: str) -> int:
+        if self._goal_shape is not None:  # the goals of a skill
+            return self._goal_shape[0]
         if self._goal is None:
             raise PolicyError(
                 f"{where} is Goal(), but there is no goal: give goal=, numbers or a function of "
-                "observations"
+                "observations; or goal_space, to a skill that is called with goals"
             )
         self._goal_shape = self.goal(made_up(self.spaces[0], 2)).shape[1:]
         if len(self._goal_shape) != 1:

@@ -46,7 +46,7 @@ CHANGING = (
 """Kinds of attributes that a method may change in place."""
 
 
-class _Seen:
+class Seen:
     """Objects, and names of their functions, that were tested in this process."""
 
     def __init__(self) -> None:
@@ -68,7 +68,7 @@ class _Seen:
         return True
 
 
-_seen = _Seen()
+_seen = Seen()
 
 
 def probe(

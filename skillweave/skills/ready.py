@@ -10,7 +10,7 @@ from typing import Any
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.skills.base import Skill, is_trained
-from skillweave.skills.scripted import from_function
+from skillweave.skills.scripted import from_function, required_arguments
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
 
@@ -36,7 +36,7 @@ def ready_policy(skill: Skill) -> Policy | None:
     # A function in a class body becomes a method when it is looked up. It is a method if it needs
     # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
     bound = isinstance(value, MethodType) and value.__self__ is skill
-    if bound and required_arguments(value.__func__) < 2:
+    if bound and not _is_method(value.__func__, skill.goal_space is not None):
         value = value.__func__
     if callable(value):
         return from_function(value)
@@ -46,11 +46,16 @@ def ready_policy(skill: Skill) -> Policy | None:
     )
 
 
-def required_arguments(function: Any) -> int:
-    """Return the number of required arguments of a function; 1 if Python has no signature."""
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+def _is_method(function: Any, with_goal: bool) -> bool:
+    """Return whether a function in a class body takes the skill as its first argument.
+
+    Args:
+        with_goal: it also takes a goal: ``policy(self, obs, goal)``, or ``policy(obs, goal)``.
+    """
+    if not with_goal:
+        return required_arguments(function) >= 2
     try:
-        parameters = inspect.signature(function).parameters.values()
+        names = list(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # of some functions written in C
-        return 1
-    return sum(p.kind in positional and p.default is p.empty for p in parameters)
+        return False
+    return names[:1] == ["self"] or required_arguments(function) >= 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.skills.foreign_policy import qualified
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION
 from skillweave.skills.mapped import (
     MappedPolicy,
     invoke,
@@ -39,6 +41,9 @@ class ScriptedPolicy(MappedPolicy):
         mapping: PolicyMapping | None = None,
     ) -> None:
         self.function = function
+        self._with_goal = False
+        if mapping is None or not (mapping.sees or mapping.state):
+            self._with_goal = required_arguments(function) > 1
         name = getattr(function, "__name__", type(function).__name__)
         super().__init__(f"function {name}()", observation_space, action_space, mapping)
 
@@ -84,10 +89,29 @@ class ScriptedPolicy(MappedPolicy):
         arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
         return as_array(action, who, PolicyError), rows_first(arrays, mapping.state, who)
 
+    @property
+    def takes_goal(self) -> bool:
+        """Return whether the goal of a skill is an argument or an input of it."""
+        return self._with_goal or super().takes_goal
+
+    advice = "let the function take it, policy(obs, goal), or write Goal() at its place in sees"
+
+    def split(self, obs: Array) -> tuple[Array, Array | None]:
+        """Return observations and goals for its inputs; a function takes both from the whole."""
+        return (obs, None) if self._with_goal else super().split(obs)
+
     def _actions(self, given: Array) -> Array:
         """Return what the function makes of its only input."""
-        who = self._who
-        action = as_array(called(self.function, given, who, kind=PolicyError), who, PolicyError)
+        who, function = self._who, self.function
+        if self._with_goal and self._goals is not None:
+            action = called(
+                lambda seen: function(read_only(seen[OBSERVATION]), read_only(seen[GOAL])),
+                given,
+                who,
+                kind=PolicyError,
+            )
+            return as_array(action, who, PolicyError)
+        action = as_array(called(function, given, who, kind=PolicyError), who, PolicyError)
         mapping = self.mapping
         if self.action_space is not None and mapping.acts is None and mapping.chunk is None:
             shape = self.action_space.shape or ()
@@ -102,6 +126,16 @@ class ScriptedPolicy(MappedPolicy):
     def source(self) -> dict[str, Any]:
         """Return the function's name, and the mapping."""
         return super().source() | {"name": qualified(self.function)}
+
+
+def required_arguments(function: Any) -> int:
+    """Return the number of required arguments of a function; 1 if Python has no signature."""
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of some functions written in C
+        return 1
+    return sum(p.kind in positional and p.default is p.empty for p in parameters)
 
 
 @checked_names

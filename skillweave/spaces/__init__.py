@@ -5,14 +5,26 @@ networks; ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
 from skillweave.spaces.action_codec import ActionCodec, action_codec
+from skillweave.spaces.choices import (
+    ChoiceCodec,
+    ChoiceSpace,
+    NumberedChoiceCodec,
+    choice_codec,
+    numbered_choice_codec,
+)
 from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
 from skillweave.spaces.packing import obs_dtype, obs_shape, pack, put_observation, unpack
 from skillweave.spaces.saving import same_space, space_from_json, space_to_json
 
 __all__ = [
     "ActionCodec",
+    "ChoiceCodec",
+    "ChoiceSpace",
+    "NumberedChoiceCodec",
     "ObsCodec",
     "action_codec",
+    "choice_codec",
+    "numbered_choice_codec",
     "obs_codec",
     "obs_dtype",
     "obs_shape",

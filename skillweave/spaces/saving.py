@@ -14,6 +14,7 @@ import numpy as np
 from skillweave.errors import EnvError, RunError
 from skillweave.reading import fit, shown
 from skillweave.settings import LARGEST, AtLeastOne, Check
+from skillweave.spaces.choices import ChoiceSpace
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts
 from skillweave.types import Array
@@ -46,6 +47,11 @@ class _Dict(TypedDict):
     spaces: list[tuple[str, Any]]
 
 
+class _Choices(TypedDict):
+    choices: AtLeastOne
+    goals: list[tuple[str, Any, int, int]]
+
+
 class _Box(TypedDict):
     shape: Annotated[list[Any], _SIZES]
     dtype: str
@@ -71,6 +77,7 @@ class _MultiBinary(TypedDict):
 
 _SCHEMAS: dict[str, Any] = {
     "Dict": _Dict,
+    "Choices": _Choices,
     "Tuple": _Tuple,
     "Box": _Box,
     "Discrete": _Discrete,
@@ -86,6 +93,12 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
         EnvError: the space is not supported; the message names supported ones.
     """
     match space:
+        case ChoiceSpace():
+            goals = [
+                [name, space_to_json(part), *space.owners[name]]
+                for name, part in space.goal_spaces.items()
+            ]
+            return {"type": "Choices", "choices": space.choices, "goals": goals}
         case gym.spaces.Dict():
             inner = [[name, space_to_json(part)] for name, part in (parts(space) or {}).items()]
             return {"type": "Dict", "spaces": inner}
@@ -136,6 +149,11 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
     match data["type"]:
         case "Dict":  # of pairs: of a plain dict Gymnasium would sort the names
             return gym.spaces.Dict([(k, space_from_json(v)) for k, v in data["spaces"]])
+        case "Choices":
+            goals = data["goals"]
+            spaces = {name: space_from_json(part) for name, part, _, _ in goals}
+            owners = {name: (first, last) for name, _, first, last in goals}
+            return ChoiceSpace(data["choices"], spaces, owners)
         case "Tuple":
             return gym.spaces.Tuple([space_from_json(part) for part in data["spaces"]])
         case "Box":
@@ -159,6 +177,8 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     """Return whether a policy for one space can act in the other: equal kind, shape and choices."""
     if type(a) is not type(b) or a.shape != b.shape:
+        return False
+    if isinstance(a, ChoiceSpace) and isinstance(b, ChoiceSpace) and a.owners != b.owners:
         return False
     inner, other = parts(a), parts(b)
     if inner is not None and other is not None:

@@ -307,6 +307,7 @@ def _evaluate(
             starts,
             deterministic=deterministic,
             rng=np.random.default_rng([seed, 1]),
+            seed=seed,
         )
         calls = None if info is None else PlayedCalls(policy, spaces, info=info)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)

@@ -59,6 +59,10 @@ class Episodes(Protocol):
         """Start remaining episodes where others are over; return these environments (m,)."""
         ...
 
+    def episode_of(self, rows: Array) -> Array:
+        """Return the numbers of the episodes in environments ``rows`` (k,)."""
+        ...
+
 
 def play(
     policy: Policy,
@@ -67,6 +71,7 @@ def play(
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
     before_step: Callable[[Memory], None] | None = None,
+    seed: int = 0,
 ) -> Iterator[Played]:
     """Play all episodes, a step at a time.
 
@@ -74,9 +79,20 @@ def play(
         deterministic: act greedily, else sample with ``rng``.
         before_step: called with the policy's memory after it has chosen an action, before the
             environments step.
+        seed: of the goals of a skill that acts alone: each episode has its own.
     """
     n = episodes.num_envs
     memory = policy.start(n)
+    choose_goals = getattr(policy, "choose_goals", None)
+
+    def begin(rows: Array) -> None:
+        """Let a skill that acts alone choose goals where episodes start."""
+        if choose_goals is not None and len(rows):
+            numbers = episodes.episode_of(rows).tolist()
+            rngs = [np.random.default_rng([seed, 2, max(number, 0)]) for number in numbers]
+            choose_goals(memory, rows, episodes.obs[rows], rngs)
+
+    begin(episodes.rows)
     while len(rows := episodes.rows):
         rows_memory = {k: v[rows] for k, v in memory.items()}
         obs, mask = episodes.obs[rows], episodes.mask()
@@ -107,6 +123,7 @@ def play(
         if len(restarted):
             for k, v in policy.start(n).items():
                 memory[k][restarted] = v[restarted]
+            begin(restarted)
 
 
 class SeededEpisodes:
@@ -151,6 +168,11 @@ class SeededEpisodes:
         cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
         one = np.ones(len(rows), np.int64)
         return Played(rows, self._episode[rows], step, raw.reward, one, cut)
+
+    def episode_of(self, rows: Array) -> Array:
+        """Return the numbers of the episodes in environments ``rows`` (k,)."""
+        number: Array = self._episode[rows]
+        return number
 
     def go_on(self, played: Played) -> Array:
         """Start the remaining episodes, in order, where others are over."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
+from skillweave.skills.goal_spaces import choice_space, with_goal
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,10 @@ class Role:
     choices: int | None = None
     """The number of a selector's choices, or of a critic's values; None: it acts in the
     environment."""
+    goal_spaces: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
+    """Of a selector, the spaces of goals that it chooses, by the names of their skills."""
+    skills: tuple[str, ...] = ()
+    """Of a selector, the names of the skills that it chooses from, in order."""
     row_steps: int = 1
     """Approximate environment steps of a row of its experience."""
     greedy: bool = True
@@ -45,14 +51,17 @@ class Role:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """The space of what it observes."""
-        return self.spec.spaces.observation
+        """The space of what it observes: the environment's; of a skill with goals also the goal."""
+        space = self.spec.spaces.observation
+        if self.skill is None or self.skill.goal_space is None:
+            return space
+        return with_goal(space, self.skill.goal_space)
 
     @property
     def action_space(self) -> gym.Space[Any]:
         """The space of its actions, or of its choices."""
         if self.choices is not None:
-            return gym.spaces.Discrete(self.choices)
+            return choice_space(self.choices, self.goal_spaces, self.skills)
         return self.spec.spaces.action
 
 

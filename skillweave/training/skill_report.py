@@ -16,6 +16,7 @@ from skillweave.planning.hand_over import HandOver
 from skillweave.settings import Count
 from skillweave.skills import Skill, asked
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goals import goals_of
 from skillweave.training.play import Played
 from skillweave.types import Array, Policy, unprefixed
 
@@ -117,10 +118,10 @@ def judge_step(skills: SkillSet, played: Played) -> StepOutcome:
     success = np.zeros(len(acting), bool)
     for i, skill in enumerate(skills.skills):
         if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
-            reward[rows] = _outcome(skill, played, played.elapsed, rows).reward
+            reward[rows] = _outcome(skill, played, played.elapsed, rows, f"goal.{i}").reward
         due = (acting == i) & (over | is_endless(skills, i))
         if skill.defines("success") and len(rows := np.flatnonzero(due)):
-            success[rows] = _outcome(skill, played, played.elapsed, rows).success
+            success[rows] = _outcome(skill, played, played.elapsed, rows, f"goal.{i}").success
     return StepOutcome(why, reward, success & over, success)
 
 
@@ -438,6 +439,17 @@ def all_steps(skills: Mapping[str, SkillReport]) -> int:
     return sum(skills[name].steps for name in top)
 
 
-def _outcome(skill: Skill, played: Played, elapsed: Array, rows: Array) -> Outcome:
-    """Judge a step of ``rows`` (m,) of the acting environments; ``elapsed`` is of all."""
-    return judge(skill, seen_by(skill, played.step, elapsed[rows], rows), played.rows[rows])
+def _outcome(
+    skill: Skill, played: Played, elapsed: Array, rows: Array, key: str = "goal"
+) -> Outcome:
+    """Judge a step of ``rows`` (m,) of the acting environments; ``elapsed`` is of all.
+
+    Args:
+        key: the name of the skill's goals in the policy's memory.
+    """
+    goal = None
+    if (goals := goals_of(skill)) is not None:
+        assert played.chosen is not None
+        goal = goals.read(played.chosen[key][rows])
+    step = seen_by(skill, played.step, elapsed[rows], rows, goal)
+    return judge(skill, step, played.rows[rows])

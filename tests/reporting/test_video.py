@@ -80,10 +80,10 @@ class Walker:
         return None
 
 
-def label(memory: Memory) -> tuple[str, tuple[int, int, int]]:
+def label(memory: Memory) -> tuple[str, tuple[int, int, int], str]:
     """The first three steps are one skill's, the rest another's."""
     second = int(memory["acted"][0]) > 3
-    return ("walk", "run")[second], color_of(second)
+    return ("walk", "run")[second], color_of(second), ""
 
 
 def decode(path: Path) -> tuple[list[Array], list[int]]:

@@ -148,7 +148,8 @@ def step_of(n: int = 2) -> Step:
     never = np.zeros(n, bool)
     obs, action = np.zeros((n, 1)), np.zeros(n, int)
     reward, elapsed = np.ones(n, np.float32), np.arange(1, n + 1)
-    return Step(obs, action, obs.copy(), reward, never, never, never, elapsed, {})
+    goal = np.zeros((n, 2))
+    return Step(obs, action, obs.copy(), reward, never, never, never, elapsed, {}, goal)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,203 @@
+"""Spaces with goals: what a skill with goals observes, and elements of a space of goals.
+
+Importing it needs no torch, so that skills can be declared without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave.types import Array
+
+OBSERVATION, GOAL = "observation", "goal"
+"""The parts of what a skill with a goal observes."""
+
+
+def with_goal(observation_space: gym.Space[Any], goal_space: gym.Space[Any]) -> gym.spaces.Dict:
+    """Return the space of what a skill with a goal observes: the observation and the goal."""
+    return gym.spaces.Dict([(OBSERVATION, observation_space), (GOAL, goal_space)])
+
+
+def without_goal(observation_space: gym.Space[Any]) -> gym.Space[Any]:
+    """Return the observation's part of a space of ``with_goal``."""
+    assert isinstance(observation_space, gym.spaces.Dict)
+    return observation_space[OBSERVATION]
+
+
+def goal_part(observation_space: gym.Space[Any]) -> gym.Space[Any]:
+    """Return the goal's part of a space of ``with_goal``."""
+    assert isinstance(observation_space, gym.spaces.Dict)
+    return observation_space[GOAL]
+
+
+SKILL = "skill"
+"""The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
+
+
+def choice_space(
+    choices: int, goal_spaces: Mapping[str, gym.Space[Any]], skills: Sequence[str]
+) -> gym.Space[Any]:
+    """Return the space of a selector's choices: numbers, or numbers and goals.
+
+    Args:
+        choices: the number of skills, times lengths where these are chosen, too.
+        goal_spaces: of the skills that have goals, by their names.
+        skills: the names of all skills, in order.
+    """
+    if not goal_spaces:
+        return gym.spaces.Discrete(choices)
+    from skillweave.spaces.choices import ChoiceSpace  # needs torch, which declaring does not
+
+    each = choices // len(skills)
+    first = {name: each * skills.index(name) for name in goal_spaces}
+    owners = {name: (start, start + each) for name, start in first.items()}
+    return ChoiceSpace(choices, goal_spaces, owners)
+
+
+def number_of(choice: Array) -> Array:
+    """Return the numbers (k,) of choices (k,) with or without goals."""
+    return choice if choice.dtype.fields is None else choice[SKILL]
+
+
+def blank_choices(space: gym.Space[Any], number: Array) -> Array:
+    """Return choices of a ``choice_space`` with these numbers (k,), and some goals, to be set."""
+    if isinstance(space, gym.spaces.Discrete):
+        return number
+    choice = np.repeat(example_of(space)[None], len(number), axis=0)
+    choice[SKILL] = number
+    return choice
+
+
+MOST_SHOWN = 6
+"""The most numbers of a goal that captions show."""
+
+
+def shown_goal(goal: Array) -> str:
+    """Return one goal as short text for captions: ``(0.3, -1)``."""
+    if goal.dtype.names:
+        return "(" + ", ".join(f"{k} {shown_goal(goal[k])}" for k in goal.dtype.names) + ")"
+    values = [f"{x:.3g}" for x in np.asarray(goal).reshape(-1)[:MOST_SHOWN].tolist()]
+    if goal.size > MOST_SHOWN:
+        return f"({goal.size} numbers)"
+    return f"({', '.join(values)})" if goal.ndim else values[0]
+
+
+def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
+    """Draw n elements of a space as one batch: uniformly where it is bounded."""
+    from skillweave.spaces.packing import obs_dtype  # needs torch, which declaring does not
+
+    inner = parts_of(space)
+    if inner is not None:
+        drawn = np.zeros(n, obs_dtype(space))
+        for name, part in inner.items():
+            drawn[name] = draw_from(part, n, rng)
+        return drawn
+    if isinstance(space, gym.spaces.Discrete):
+        return (int(space.start) + rng.integers(int(space.n), size=n)).astype(space.dtype)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        start = np.asarray(space.start)
+        return (start + rng.integers(space.nvec, size=(n, *space.shape))).astype(space.dtype)
+    if isinstance(space, gym.spaces.MultiBinary):
+        return rng.integers(2, size=(n, *space.shape)).astype(space.dtype)
+    assert isinstance(space, gym.spaces.Box)
+    shape = (n, *space.shape)
+    if space.dtype.kind in "iub":
+        low, high = space.low.astype(np.int64), space.high.astype(np.int64)
+        return rng.integers(low, high, size=shape, endpoint=True).astype(space.dtype)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    below, above = np.isfinite(low), np.isfinite(high)
+    drawn = rng.standard_normal(shape)
+    tail = np.abs(drawn)
+    drawn = np.where(below & ~above, low + tail, np.where(above & ~below, high - tail, drawn))
+    both = below & above
+    if both.any():
+        with np.errstate(invalid="ignore", over="ignore"):
+            uniform = low + rng.random(shape) * (high - low)
+        drawn = np.where(both, uniform, drawn)
+    found: Array = drawn.astype(space.dtype).clip(space.low, space.high)
+    return found
+
+
+def example_of(space: gym.Space[Any]) -> Array:
+    """Return an element of a space: zero where that is in it."""
+    from skillweave.spaces.packing import obs_dtype  # needs torch, which declaring does not
+
+    inner = parts_of(space)
+    if inner is not None:
+        found = np.zeros((), obs_dtype(space))
+        for name, part in inner.items():
+            found[name] = example_of(part)
+        return found
+    if isinstance(space, gym.spaces.Box):
+        return np.zeros(space.shape, space.dtype).clip(space.low, space.high)
+    start = np.asarray(getattr(space, "start", 0), space.dtype)
+    return np.broadcast_to(start, space.shape or ()).copy()
+
+
+def outside(space: gym.Space[Any], goals: Array) -> int | None:
+    """Return the first row of goals (n, …) that is not in a space; None: all are."""
+    inner = parts_of(space)
+    if inner is not None:
+        rows = [outside(part, goals[name]) for name, part in inner.items()]
+        return min((row for row in rows if row is not None), default=None)
+    if isinstance(space, gym.spaces.Box):
+        inside = (goals >= space.low) & (goals <= space.high)  # False for NaN
+        if goals.dtype.kind == "f":
+            inside &= np.isfinite(goals)
+    elif isinstance(space, gym.spaces.MultiBinary):
+        inside = (goals == 0) | (goals == 1)
+    else:
+        start: Any = np.asarray(space.start)  # type: ignore[attr-defined]
+        count: Any = space.nvec if isinstance(space, gym.spaces.MultiDiscrete) else space.n  # type: ignore[attr-defined]
+        inside = (goals >= start) & (goals < start + count)
+    wrong = ~inside.reshape(len(goals), -1).all(axis=1)
+    return int(wrong.argmax()) if wrong.any() else None
+
+
+def limits_of(dtype: np.dtype[Any]) -> tuple[int, int]:
+    """Return the smallest and the largest number of a type of whole numbers."""
+    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
+
+
+def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
+    """Return the named parts of a Dict or Tuple; None for any other space."""
+    from skillweave.spaces.packing import parts  # needs torch, which declaring does not
+
+    return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
+
+
+def batch_of_one(space: gym.Space[Any], value: Any) -> Any:
+    """Return an element of a Dict or Tuple as a batch of one, in dicts and tuples."""
+    if isinstance(space, gym.spaces.Dict):
+        return {name: batch_of_one(part, value[name]) for name, part in space.spaces.items()}
+    if isinstance(space, gym.spaces.Tuple):
+        return tuple(batch_of_one(p, v) for p, v in zip(space.spaces, value, strict=True))
+    return np.asarray(value)[None]
+
+
+def part_at(goal: Array, path: tuple[str, ...]) -> Array:
+    """Return the part of goals (…) with these names."""
+    for name in path:
+        goal = goal[name]
+    return goal
+
+
+def leaf_paths(space: gym.Space[Any], before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Return the names that lead to each innermost part of a space; () of one without parts."""
+    inner = parts_of(space)
+    if inner is None:
+        return [before]
+    return [path for name, part in inner.items() for path in leaf_paths(part, (*before, name))]
+
+
+@lru_cache(64)
+def joint_dtype(
+    obs: np.dtype[Any], shape: tuple[int, ...], goal: np.dtype[Any], goal_shape: tuple[int, ...]
+) -> np.dtype[Any]:
+    """Return the dtype of observations with goals, as ``obs_dtype`` of ``with_goal`` has it."""
+    return np.dtype([(OBSERVATION, obs, shape), (GOAL, goal, goal_shape)], align=True)

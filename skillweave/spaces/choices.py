@@ -1,0 +1,213 @@
+"""Choices of a skill with its goal, as a selector makes them, and their numbers.
+
+A choice has a number (a skill, or a skill and a length) and a goal for each skill that has goals;
+only the goal of the chosen skill counts. In one array it is ``choice["skill"]`` and
+``choice["goal"][name]``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from torch import Tensor
+
+from skillweave.errors import EnvError
+from skillweave.spaces.action_codec import ActionCodec, action_codec
+from skillweave.spaces.packing import obs_dtype
+from skillweave.types import Array
+
+SKILL, GOAL = "skill", "goal"
+"""The parts of a choice."""
+
+
+class ChoiceSpace(gym.spaces.Dict):
+    """The space of a selector's choices where skills have goals.
+
+    Args:
+        choices: the number of skills, times lengths where these are chosen, too.
+        goal_spaces: of the skills that have goals, by their names.
+        owners: the numbers that each of these skills has, from the first to before the last.
+    """
+
+    def __init__(
+        self,
+        choices: int,
+        goal_spaces: Mapping[str, gym.Space[Any]],
+        owners: Mapping[str, tuple[int, int]],
+    ) -> None:
+        goals = gym.spaces.Dict(list(goal_spaces.items()))
+        super().__init__([(SKILL, gym.spaces.Discrete(choices)), (GOAL, goals)])
+        self.choices = choices
+        self.goal_spaces = dict(goal_spaces)
+        self.owners = dict(owners)
+
+
+@dataclass(frozen=True)
+class ChoiceCodec(ActionCodec):
+    """A converter of choices with goals.
+
+    In policy units a choice is a row of float32: its number, then the goals of all skills, each as
+    an ``ActionCodec`` has them.
+    """
+
+    goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
+    """Of each skill with goals: its name, their codec, and the numbers that choose it."""
+
+    @property
+    def choices(self) -> int:
+        """Return the number of choices."""
+        space = self.space
+        assert isinstance(space, ChoiceSpace)
+        return space.choices
+
+    @cached_property
+    def columns(self) -> tuple[slice, ...]:
+        """Return the columns of each skill's goal in policy units."""
+        found, start = [], 1
+        for _, codec, _ in self.goals:
+            width = max(1, len(codec.parts)) if codec.discrete else codec.size
+            found.append(slice(start, start + width))
+            start += width
+        return tuple(found)
+
+    @cached_property
+    def size(self) -> int:
+        """Return the numbers of a choice in policy units."""
+        last: int = self.columns[-1].stop
+        return last
+
+    def units(self, action: Any, at: int) -> Any:
+        """Return the goals ``at`` of choices (…, size) as their own codec has them."""
+        codec, part = self.goals[at][1], action[..., self.columns[at]]
+        if not codec.discrete:
+            return part
+        part = part.long() if isinstance(part, Tensor) else part.astype(np.int64)
+        return part if codec.multi else part[..., 0]
+
+    def to_env(self, action: Array) -> Array:
+        """Convert policy units (n, size) to choices (n,)."""
+        choice = np.zeros(len(action), obs_dtype(self.space))
+        choice[SKILL] = action[:, 0].astype(np.int64)
+        for at, (name, codec, _) in enumerate(self.goals):
+            choice[GOAL][name] = codec.to_env(self.units(action, at))
+        return choice
+
+    def from_env(self, action: Array) -> Array:
+        """Convert choices (n,) to policy units (n, size)."""
+        found = np.zeros((len(action), self.size), np.float32)
+        found[:, 0] = action[SKILL]
+        for at, (name, codec, _) in enumerate(self.goals):
+            units = codec.from_env(np.asarray(action[GOAL][name]))
+            found[:, self.columns[at]] = units.reshape(len(units), -1)
+        return found
+
+    def check(self, action: Tensor) -> None:
+        """Raise a ValueError where choices in policy units (…, size) do not exist."""
+        if not bool(action.isfinite().all()):
+            raise ValueError("a choice of its rows is not finite")
+        number = action[..., 0]
+        if not bool(((number >= 0) & (number < self.choices) & (number == number.trunc())).all()):
+            raise ValueError("a choice of its rows does not exist")
+        for at, (_, codec, _) in enumerate(self.goals):
+            codec.check(self.units(action, at))
+
+
+def choice_codec(space: ChoiceSpace) -> ChoiceCodec:
+    """Return the codec of a selector's choices.
+
+    Raises:
+        EnvError: a goal cannot be chosen by a network; the message names the space.
+    """
+    goals = tuple(
+        (name, action_codec(part), space.owners[name]) for name, part in space.goal_spaces.items()
+    )
+    return ChoiceCodec(space, (), goals=goals)
+
+
+MOST = 10_000
+"""The most skills with goals, each a number, that a selector with values chooses from."""
+
+
+@dataclass(frozen=True)
+class NumberedChoiceCodec(ActionCodec):
+    """A converter of choices whose goals are discrete: each skill with each goal has a number."""
+
+    goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
+    """As of ``ChoiceCodec``."""
+
+    @cached_property
+    def table(self) -> Array:
+        """Return the choice of each number, (size,)."""
+        space = self.space
+        assert isinstance(space, ChoiceSpace)
+        rows = []
+        for number in range(space.choices):
+            own = [x for x in self.goals if x[2][0] <= number < x[2][1]]
+            goals = _all_goals(own[0][1]) if own else [None]
+            for goal in goals:
+                choice = np.zeros((), obs_dtype(space))
+                choice[SKILL] = number
+                for name, codec, _ in self.goals:
+                    first = _all_goals(codec)[0]
+                    mine = own and own[0][0] == name
+                    choice[GOAL][name] = goal if mine else first
+                rows.append(choice)
+        return np.stack(rows)
+
+    @cached_property
+    def number_of_choice(self) -> Array:
+        """Return the choice without goal that each number has, (size,) int64: of masks."""
+        found: Array = self.table[SKILL]
+        return found
+
+    def to_env(self, action: Array) -> Array:
+        """Convert numbers (n,) to choices (n,)."""
+        found: Array = self.table[action]
+        return found
+
+    def from_env(self, action: Array) -> Array:
+        """Convert choices (n,) to numbers (n,) int64."""
+        keys = {self._key(choice): i for i, choice in enumerate(self.table)}
+        return np.array([keys[self._key(choice)] for choice in action], np.int64)
+
+    def _key(self, choice: Any) -> tuple[Any, ...]:
+        number = int(choice[SKILL])
+        goals = [choice[GOAL][name] for name, _, (a, b) in self.goals if a <= number < b]
+        return (number, *(np.asarray(goal).tobytes() for goal in goals))
+
+
+def _all_goals(codec: ActionCodec) -> list[Array]:
+    """Return all goals of a discrete space."""
+    units = np.indices(codec.parts).reshape(len(codec.parts), -1).T
+    return list(codec.to_env(units if codec.multi else units[:, 0]))
+
+
+def numbered_choice_codec(space: ChoiceSpace) -> NumberedChoiceCodec:
+    """Return the codec of a selector's choices as numbers, where all goals are discrete.
+
+    Raises:
+        EnvError: there are too many; the message says how many.
+    """
+    goals = tuple(
+        (name, action_codec(part), space.owners[name]) for name, part in space.goal_spaces.items()
+    )
+    size = space.choices
+    for _, codec, (first, last) in goals:
+        size += (last - first) * (math.prod(codec.parts) - 1)
+    if size > MOST:
+        raise EnvError(
+            f"the selector would choose among {size:,} skills with goals, but one with values "
+            f"takes at most {MOST:,}: let it learn by PPO, or give goal_space fewer goals"
+        )
+    return NumberedChoiceCodec(space, (size,), goals=goals)
+
+
+def chosen(choice: Tensor, owner: tuple[int, int]) -> Tensor:
+    """Return where the numbers ``choice`` (…) are of a skill, (…) bool."""
+    return (choice >= owner[0]) & (choice < owner[1])

@@ -1,0 +1,253 @@
+"""Selectors give goals: rules, automata and trees, and selectors that learn."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_runs import assert_same, stopped_run
+from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
+
+import skillweave as sw
+from skillweave.errors import DeclarationError, PolicyError, SkillError
+from skillweave.hierarchy.options import OptionsEnv
+
+SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+HERE = (0.5, -0.5)
+
+
+def toward_zero(obs):
+    return -np.sign(obs) * 0.5
+
+
+def right(obs):
+    return obs[:, 0] > 0
+
+
+READY = {
+    "function": lambda obs: (np.full(len(obs), "go_to"), toward_zero(obs)),
+    "function, by skill": lambda obs: (np.zeros(len(obs), int), {"go_to": toward_zero(obs)}),
+    "automaton": sw.Automaton(
+        {"a": ("go_to", HERE), "b": ["rest", ("go_to", toward_zero)]},
+        {("a", "b"): "success", ("b", "a"): "success"},
+    ),
+    "tree": sw.tree.Fallback(
+        sw.tree.Sequence(right, ("go_to", HERE)), ("go_to", toward_zero), "rest"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", READY)
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_ready_selectors_give_goals(name, learn, tmp_path):
+    skills = [go_to(), Rest()]
+    run = declared(skills, selector=READY[name], learn=learn).train(tmp_path / "run", quiet=True)
+    report = run.evaluate(4)
+    assert report.skills["go_to"].calls > 0
+    again = declared([go_to(), Rest()], selector=READY[name], learn=learn)
+    assert sw.load(tmp_path / "run", again).evaluate(4).returns == report.returns
+
+
+def test_goals_are_those_that_the_selector_gave(tmp_path):
+    seen = []
+
+    class Looks(Rest):
+        name = "go_to"
+        goal_space = SPACES["box"]
+
+        def policy(self, obs, goal):
+            seen.append(np.array(goal))
+            return np.zeros((len(obs), 2), np.float32)
+
+    hierarchy = declared([Looks()], selector=lambda obs: (np.full(len(obs), "go_to"), obs / 4))
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    seen.clear()
+    env = Point()
+    obs, _ = env.reset(seed=1)
+    player, first = run.player(), obs
+    for _ in range(7):  # the point stays where it is; calls last 3 steps
+        player.act(obs)
+        obs, *_ = env.step(np.zeros(2))
+    assert np.allclose(np.concatenate(seen), first / 4)
+
+
+SPACE_NAMES = [name for name in SPACES if name not in ("whole", "dict", "tuple", "picture")]
+
+
+@pytest.mark.parametrize("space", SPACE_NAMES)
+@pytest.mark.parametrize("learn", ["apart", "together", "apart, then together"])
+def test_a_selector_learns_skill_and_goal(space, learn, tmp_path):
+    skills = [Rest(), go_to(space)]
+    run = declared(skills, selector=SELECTOR, learn=learn, steps=700).train(
+        tmp_path / "run", quiet=True
+    )
+    report = run.evaluate(3)
+    again = declared([Rest(), go_to(space)], selector=SELECTOR, learn=learn)
+    assert sw.load(tmp_path / "run", again).evaluate(3).returns == report.returns
+    run.evaluate(3, deterministic=False)
+
+
+@pytest.mark.parametrize("learn", ["apart", "together"])
+@pytest.mark.parametrize("space", ["box", "number", "numbers"])
+def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
+    def hierarchy():
+        return declared(
+            [Rest(), go_to(space)], selector=SELECTOR, learn=learn, steps=1500, train_defaults=OFTEN
+        )
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+@pytest.mark.parametrize("learn", ["apart", "together"])
+def test_skills_with_goals_inside(learn, tmp_path):
+    def hierarchy():
+        how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN}
+        inner = declared([Rest(), go_to("number")], name="inner", **how)
+        still = type("Still", (Rest,), {})()
+        return declared([inner, still], steps=1500, **how)
+
+    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    assert "inner/go_to" in run.evaluate(3).skills
+    assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
+    stopped_run(hierarchy(), tmp_path / "cut", 5)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", run.path)
+
+
+def test_chosen_lengths_and_goals(tmp_path):
+    how = {"selector": SELECTOR, "call_steps": sw.Lengths(2, 4), "steps": 700}
+    run = declared([Rest(), go_to()], **how).train(tmp_path / "run", quiet=True)
+    run.evaluate(3, deterministic=False)
+
+
+OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+
+
+@pytest.mark.parametrize("space", ["number", "numbers", "bits"])
+@pytest.mark.parametrize(
+    "selector",
+    [
+        sw.DQN(**OFF, train_freq=2, network=SMALL),
+        sw.DQN.rainbow(**OFF, train_freq=2, network=SMALL),
+        sw.SAC(**OFF, network=SMALL),
+    ],
+    ids=["DQN", "Rainbow", "SAC"],
+)
+def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path):
+    class Sometimes(Rest):
+        def initiation(self, obs):
+            return obs[:, 0] > 0
+
+    def hierarchy(learn="apart"):
+        skills = [Sometimes(), go_to(space)]
+        return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
+    stopped_run(hierarchy(), tmp_path / "cut", 4)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    hierarchy("together").train(tmp_path / "together", seed=3, quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("selector", "space", "says"),
+    [
+        (sw.DQN(), "box", r"selector: DQN cannot choose goals of Box.*'go_to' needs them"),
+        (sw.SAC(), "box", "selector: SAC cannot choose goals of Box"),
+        (sw.TD3(), "number", "selector: TD3 cannot choose goals, but"),
+        (sw.PPO(), "dict", "selector: PPO cannot choose goals of Dict"),
+        (sw.PPO(), "picture", "selector: PPO cannot choose goals of Box"),
+    ],
+)
+def test_algorithms_say_which_goals_they_cannot_choose(selector, space, says):
+    with pytest.raises(DeclarationError, match=says):
+        declared([go_to(space)], algorithm=ON, selector=selector).check_spaces()
+
+
+@pytest.mark.parametrize(
+    ("selector", "says"),
+    [
+        (
+            lambda obs: np.full(len(obs), "go_to"),
+            r"chose skill 'go_to' without a goal .*return \(names, goals\)",
+        ),
+        (lambda obs: (np.full(len(obs), "go_to"), obs[0]), "gave goals of shape"),
+        (lambda obs: (np.full(len(obs), "go_to"), obs + 9), "which is out of goal_space Box"),
+        (lambda obs: (np.full(len(obs), "rest"), {"rest": obs}), "which has no goals"),
+        (sw.Automaton({"a": "go_to"}, {}), r"without a goal .*write \('go_to', goal\)"),
+        (sw.tree.Sequence(("go_to", (1.0, 2.0, 3.0))), "gave goals of shape"),
+    ],
+)
+def test_a_goal_that_is_not_right(selector, says, tmp_path):
+    with pytest.raises(SkillError, match=says):
+        declared([go_to(), Rest()], selector=selector).train(tmp_path / "run", quiet=True).evaluate(
+            2
+        )
+
+
+def test_goals_for_skills_without_goals(tmp_path):
+    rule = lambda obs: (np.full(len(obs), "rest"), obs)  # noqa: E731
+    with pytest.raises(SkillError, match="returned skills and goals, but no skill"):
+        declared([Rest()], selector=rule).check_spaces()
+    agent = sw.train_agent(Point, ON, 200, tmp_path / "agent", quiet=True)
+    with pytest.raises(PolicyError, match="has goals, but its policy observes Box"):
+        declared([go_to(policy=agent.policy)]).check_spaces()
+
+
+def test_a_goal_out_of_reach_is_clipped(tmp_path):
+    def nearest(self, obs, goal):
+        return np.clip(goal, -0.3, 0.3)
+
+    skill = go_to(clip_goal=nearest)
+    rule = lambda obs: (np.full(len(obs), "go_to"), np.full((len(obs), 2), 5.0))  # noqa: E731
+    run = declared([skill], selector=rule).train(tmp_path / "run", quiet=True)
+    player = run.player()
+    player.act(np.zeros(2, np.float32))
+    assert np.allclose(player.memory["goal.0"], 0.3)
+
+
+def test_an_environment_of_options_takes_goals(tmp_path):
+    run = declared([Rest(), go_to()], selector=SELECTOR, steps=700).train(
+        tmp_path / "run", quiet=True
+    )
+    engine = sw.EnvSpec(Point, engine="sync")
+    from skillweave.envs.make import make_engine
+
+    env = OptionsEnv(make_engine(engine, 3), run.policy.skills, gamma=0.9)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(5):
+        obs, _reward, *_ = env.step(env.action_space.sample())
+    assert obs.shape == (3, 2)
+    env.close()
+
+
+def test_what_goals_are_not_for_yet():
+    inner = declared([Rest()], selector=lambda obs: np.full(len(obs), "rest"), name="inner")
+    whole = type("Whole", (sw.Skill,), {"policy": inner, "goal_space": SPACES["box"]})()
+    with pytest.raises(
+        DeclarationError, match="hierarchy with a goal_space, which is not supported"
+    ):
+        declared([whole])
+    with pytest.raises(DeclarationError, match="interrupt is True, but skill 'go_to' has goals"):
+        declared(selector=SELECTOR, together=sw.Together(interrupt=True))
+    with pytest.raises(DeclarationError, match="goals and task_weight 2"):
+        declared([go_to(task_weight=2.0)], selector=SELECTOR, learn="together")
+    guide = sw.Guide(sw.Automaton({"a": {("go_to", HERE), "rest"}}, {}))
+    with pytest.raises(DeclarationError, match="guide: it gives a goal"):
+        declared([go_to(), Rest()], selector=SELECTOR, guide=guide).check_spaces()
+
+
+def test_spaces_of_goals():
+    with pytest.raises(DeclarationError, match="goal_space is 3; it must be a Gymnasium space"):
+        declared([type("GoTo", (sw.Skill,), {"goal_space": 3})()])
+    with pytest.raises(DeclarationError, match=r"has clip_goal.., but no goals: set goal_space"):
+        declared([type("GoTo", (sw.Skill,), {"clip_goal": lambda self, obs, goal: goal})()])
+    graph = gym.spaces.Graph(gym.spaces.Discrete(2), None)
+    with pytest.raises(DeclarationError, match=r"goal_space Graph.* is not supported"):
+        declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()

@@ -1,0 +1,139 @@
+"""One contract: a skill with goals learns by every algorithm, with goals of every kind."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from small_runs import assert_same, reports_every, stopped_run
+from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
+
+import skillweave as sw
+from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.seeding import Seeds
+
+often = reports_every(40)
+OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+ALGORITHMS = {
+    "PPO": (ON, False),
+    "PPO, discrete": (ON, True),
+    "PPO, recurrent": (
+        sw.PPO(
+            num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.RNN("gru", 6))
+        ),
+        False,
+    ),
+    "DQN": (sw.DQN(**OFF, train_freq=2, network=SMALL), True),
+    "Rainbow": (sw.DQN.rainbow(**OFF, train_freq=2, network=SMALL), True),
+    "SAC": (sw.SAC(**OFF, network=SMALL), False),
+    "SAC, discrete": (sw.SAC(**OFF, network=SMALL), True),
+    "TD3": (sw.TD3(**OFF, network=SMALL), False),
+}
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_learns_with_goals(name, tmp_path):
+    algorithm, discrete = ALGORITHMS[name]
+    env = functools.partial(Point, discrete=discrete)
+    run = declared(env=env, algorithm=algorithm).train(tmp_path / "run", quiet=True)
+    alone = run.evaluate(3, skill="go_to")
+    assert alone.skills["go_to"].calls == 3
+    whole = run.evaluate(3)
+    assert whole.skills["go_to"].steps == sum(whole.lengths)
+    again = declared(env=env, algorithm=algorithm)
+    loaded = again.load_weights(run.save_weights(tmp_path / "weights.safetensors"))
+    assert loaded.evaluate(3).returns == whole.returns
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("as_dict", [False, True])
+def test_goals_of_every_space(space, as_dict, tmp_path):
+    env = functools.partial(Point, as_dict=as_dict)
+    hierarchy = declared([go_to(space), Rest()], env=env, selector=rest, steps=130)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    report = run.evaluate(4, skill="go_to")
+    assert report.skills["go_to"].calls == 4
+    assert run.policy.skills.policies[0].observation_space["goal"] == SPACES[space]
+
+
+def rest(obs):
+    return np.full(len(obs), "rest")
+
+
+@pytest.mark.parametrize("name", ["PPO", "PPO, recurrent", "DQN", "SAC", "TD3"])
+def test_an_interrupted_run_ends_with_the_same_weights(name, tmp_path):
+    algorithm, discrete = ALGORITHMS[name]
+
+    def hierarchy():
+        env = functools.partial(Point, discrete=discrete)
+        return declared(env=env, algorithm=algorithm, steps=400, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+@pytest.mark.parametrize("space", ["dict", "whole"])
+def test_goals_of_other_spaces_are_resumed(space, tmp_path):
+    def hierarchy():
+        return declared([go_to(space), Rest()], selector=rest, steps=400, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+def test_goals_of_a_damaged_checkpoint_are_refused():
+    acting = None
+    collector = SkillCollector(make_engine(EnvSpec(Point, engine="sync"), 2), acting, go_to())
+    collector.start(Seeds(0))
+    state = collector.state()
+    state["kept.goal"][1, 0] = 7.0
+    with pytest.raises(ValueError, match="'goal' of an open call is no goal of its skill"):
+        collector.restore(state)
+
+
+def test_goals_where_other_calls_come_first(tmp_path):
+    class Late(sw.Skill):
+        max_steps = 5
+
+        def initiation(self, obs):
+            return obs[:, 0] > 0.5
+
+        def reward(self, step):
+            return step.next_obs[:, 0]
+
+    late = type("GoBack", (type(go_to()),), {"initiation": lambda self, obs: obs[:, 0] < -0.3})()
+    apart = sw.Apart(start_calls=2, episode_calls=3)
+    hierarchy = declared([go_to(), Late(), late], selector=rest_or_go, steps=600, apart=apart)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    assert run.evaluate(3, skill="go_back").skills["go_back"].steps > 0
+
+
+def rest_or_go(obs):
+    return np.full(len(obs), "go_to"), {"go_to": np.zeros((len(obs), 2)), "go_back": obs / 4}
+
+
+def test_a_skill_with_goals_beside_one_without_learns_together(tmp_path):
+    class Right(sw.Skill):
+        max_steps = 4
+
+        def reward(self, step):
+            return step.next_obs[:, 0]
+
+    selector = sw.PPO(num_envs=4, n_steps=64, batch_size=16, network=SMALL)
+    hierarchy = declared([Right(), go_to()], selector=selector, learn="together", steps=1200)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    assert run.evaluate(3, skill="go_to").skills["go_to"].calls == 3
+
+
+@pytest.mark.slow
+def test_goals_in_processes(tmp_path):
+    spec = EnvSpec(Point, engine="sync", workers=2)
+    run = declared(env=spec).train(tmp_path / "run", quiet=True)
+    assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

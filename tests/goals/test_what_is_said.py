@@ -1,0 +1,218 @@
+"""Wrong goals are named, a goal that nothing reads is said, and goals are shown."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from worlds import ON, SMALL, SPACES, Point, Rest, declared, far_corner, go_to
+
+import skillweave as sw
+from skillweave.collecting.judge import JudgedBy
+from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
+from skillweave.experience import Batch
+from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
+from skillweave.skills.goals import Goals, goals_of
+from skillweave.spaces import obs_dtype
+
+
+@pytest.mark.parametrize(
+    ("goals", "says"),
+    [
+        (lambda self, obs, rng: obs[0], r"goals\(\) returned shape \(2,\), but \(4, 2\) was"),
+        (lambda self, obs, rng: None, r"goals\(\) returned None"),
+        (lambda self, obs, rng: obs.astype(str), r"goals\(\) returned <U.*are numbers"),
+        (lambda self, obs, rng: obs + 7, r"goals\(\) gave the goal .* out of goal_space Box"),
+        (lambda self, obs, rng: obs * np.nan, r"goals\(\) gave the goal \[nan"),
+        (lambda self, obs, rng: obs.no, r"goals\(\) raised AttributeError"),
+    ],
+)
+def test_goals_that_are_wrong(goals, says, tmp_path):
+    with pytest.raises(SkillError, match=says):
+        declared([go_to(goals=goals)]).train(tmp_path / "run", quiet=True)
+
+
+def test_a_reward_that_ignores_the_goal_is_said(tmp_path, capsys):
+    class Blind(sw.Skill):
+        name = "go_to"
+        goal_space = SPACES["box"]
+        max_steps = 5
+
+        def reward(self, step):
+            return step.next_obs[:, 0]
+
+    declared([Blind()]).train(tmp_path / "run")
+    said = capsys.readouterr()
+    assert "none reads step.goal" in said.out + said.err
+    declared([go_to()]).train(tmp_path / "other")
+    said = capsys.readouterr()
+    assert "none reads step.goal" not in said.out + said.err
+
+
+def test_a_player_takes_a_goal(tmp_path):
+    class Walk(Rest):
+        name = "go_to"
+        goal_space = SPACES["box"]
+
+        def policy(self, obs, goal):
+            return np.clip(goal - obs, -1, 1)
+
+    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
+    player = run.player(skill="go_to", goal=(0.5, -0.5))
+    assert np.allclose(player.act(np.zeros(2, np.float32)), (0.5, -0.5))
+    player.reset(goal=(0.25, 0.0))
+    assert np.allclose(player.act(np.zeros(2, np.float32)), (0.25, 0.0))
+    with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
+        run.player(skill="go_to", goal=(5, 5)).act(np.zeros(2, np.float32))
+    with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
+        run.player(goal=(0, 0))
+
+
+def test_policies_from_elsewhere_take_the_goal(tmp_path):
+    torch.manual_seed(0)
+    network = torch.nn.Linear(4, 2)
+
+    class Foreign(Rest):
+        name = "go_to"
+        goal_space = SPACES["box"]
+        policy = sw.from_torch(network, sees=(0, 1, sw.Goal()))
+
+    run = declared([Foreign()]).train(tmp_path / "run", quiet=True)
+    obs, goal = np.float32([0.1, -0.2]), np.float32([0.5, -0.5])
+    action = run.player(skill="go_to", goal=goal).act(obs)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(np.concatenate([obs, goal])))
+    assert np.allclose(action, expected.clamp(-1, 1), atol=1e-5)
+
+    for policy, says in [
+        (lambda obs: obs, r"takes no goal, but its skill has goals: let the function take it"),
+        (torch.nn.Linear(2, 2), r"takes no goal.*write Goal\(\) at its place in sees"),
+    ]:
+        skill = type("GoTo", (Rest,), {"policy": staticmethod(policy), "goal_space": SPACES["box"]})
+        skill.name = "go_to"
+        with pytest.raises(PolicyError, match=says):
+            declared([skill()]).check_spaces()
+
+
+def test_weights_of_another_goal_space_are_refused(tmp_path):
+    run = declared().train(tmp_path / "run", quiet=True)
+    wider = type("GoTo", (type(go_to()),), {"goal_space": gym.spaces.Box(-2, 2, (2,), np.float32)})
+    with pytest.raises(RunError, match=r"'go_to' was trained for goals of Box\(-1.0, 1.0"):
+        sw.load(run.path, declared([wider()]))
+
+
+def test_a_network_that_leaves_out_the_goal_is_refused():
+    blind = sw.PPO(network=sw.Network((8,), sees=(0, 1)))
+    with pytest.raises(DeclarationError, match=r"network.sees leaves out the goal, whose places"):
+        declared(algorithm=blind).check_spaces()
+
+
+def test_goals_are_the_same_for_the_same_seed(tmp_path):
+    run = declared().train(tmp_path / "run", quiet=True)
+
+    def goals_with(num_envs):
+        found = {}
+
+        def watch(played):
+            for episode, goal in zip(played.episode, played.chosen["goal"], strict=True):
+                found.setdefault(int(episode), goal.tolist())
+
+        alone = run._policy("go_to")
+        sw.evaluate(alone, Point, episodes=6, num_envs=num_envs, watch=watch)
+        return found
+
+    few, many = goals_with(2), goals_with(6)
+    assert few == many
+    assert len({tuple(goal) for goal in few.values()}) == 6
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_goals_are_drawn_and_joined(name):
+    skill = go_to(name)
+    goals = goals_of(skill)
+    rng = np.random.default_rng(0)
+    obs = rng.normal(size=(50, 2)).astype(np.float32)
+    drawn = goals.draw(obs, rng)
+    assert len(drawn) == 50
+    assert not np.array_equal(drawn[0], drawn[1]) or name in ("number", "bits", "numbers")
+    stored = goals.stored(drawn)
+    assert np.array_equal(goals.read(stored), drawn)
+    joint = goals.join(obs, drawn)
+    assert joint.dtype == obs_dtype(with_goal(Point.observation_space, skill.goal_space))
+    assert np.array_equal(joint["observation"], obs)
+    assert np.array_equal(joint["goal"], drawn)
+    assert goals.flat(drawn).shape == (50, goals.size)
+    assert np.array_equal(
+        draw_from(skill.goal_space, 9, np.random.default_rng(3)),
+        draw_from(skill.goal_space, 9, np.random.default_rng(3)),
+    )
+    goals.fitted(obs[:2], goals.read(goals.start(2)), "test")
+
+
+def test_rows_are_judged_again_with_their_goals():
+    skill, rng = go_to(), np.random.default_rng(0)
+    obs, after, goal = (rng.uniform(-1, 1, (5, 2)).astype(np.float32) for _ in range(3))
+    goals = Goals(skill)
+    no = np.zeros((5, 1), bool)
+    rows = Batch(
+        obs=goals.join(obs, goal)[:, None],
+        next_obs=goals.join(after, goal)[:, None],
+        reward=np.zeros((5, 1), np.float32),
+        env_action=obs[:, None],
+        env_reward=np.zeros((5, 1), np.float32),
+        env_terminated=no,
+        env_truncated=no,
+        call_elapsed=np.ones((5, 1), np.int64),
+    )
+    judged = JudgedBy(skill)(rows)
+    assert np.allclose(judged["reward"][:, 0], -np.abs(after - goal % 2).sum(1))
+
+
+def test_captions_show_the_goal():
+    assert shown_goal(np.float32([0.25, -1])) == "(0.25, -1)"
+    assert shown_goal(np.int64(3)) == "3"
+    assert shown_goal(np.zeros((8, 8, 3))) == "(192 numbers)"
+    one = draw_from(SPACES["dict"], 1, np.random.default_rng(0))[0]
+    assert shown_goal(one).startswith("(at (")
+
+
+def test_goals_reach_the_label_of_a_film(tmp_path):
+    run = declared([go_to(), Rest()], selector=far_corner).train(tmp_path / "run", quiet=True)
+    policy = run.policy
+    memory = policy.start(1)
+    _, memory = policy.act(memory, np.zeros((1, 2), np.float32))
+    assert np.allclose(policy.goal_now(memory), 0.9)
+
+
+def test_exports_of_hierarchies_with_goals_are_refused(tmp_path):
+    pytest.importorskip("onnx")
+    run = declared(algorithm=ON).train(tmp_path / "run", quiet=True)
+    with pytest.raises(PolicyError, match="'go_to' has goals, and hierarchies with goals cannot"):
+        run.export(tmp_path / "export")
+    pytest.importorskip("onnxruntime")
+    sw.save_policy(run.policy.skills.policies[0], tmp_path / "policy")
+    loaded = go_to(policy=sw.load_policy(tmp_path / "policy"))
+    other = declared([loaded]).train(tmp_path / "other", quiet=True)
+    obs = np.float32([0.3, -0.2])
+    mine, theirs = (r.player(skill="go_to", goal=(0.5, 0.5)).act(obs) for r in (run, other))
+    assert np.allclose(mine, theirs, atol=1e-5)
+
+
+SELECTORS = {
+    "PPO": sw.PPO(num_envs=4, n_steps=32, batch_size=16, network=SMALL),
+    "DQN": sw.DQN(num_envs=4, batch_size=16, learning_starts=20, buffer_size=500, network=SMALL),
+}
+
+
+@pytest.mark.parametrize(
+    ("stage", "learns_by"), [("go_to", "PPO"), ("selector", "PPO"), ("selector", "DQN")]
+)
+def test_evolution_with_goals(stage, learns_by, tmp_path):
+    evolution = sw.Evolution(population=2, generations=2, episodes=1)
+    late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
+    how = {"selector": SELECTORS[learns_by], "steps": 900}
+    run = declared([go_to("number"), late], **how).train(
+        tmp_path / "run", evolve={stage: evolution}, eval_every=300, quiet=True
+    )
+    assert run.evaluate(2, skill="go_to").skills["go_to"].calls == 2

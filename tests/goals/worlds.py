@@ -1,0 +1,118 @@
+"""A point in a square, and skills with goals of every kind for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import skillweave as sw
+
+SMALL = sw.Network(hidden=(8,))
+ON = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2, network=SMALL)
+WAYS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], np.float32)
+
+
+class Point(gym.Env):
+    """A point that is pushed; an episode has 30 steps."""
+
+    observation_space: Any = gym.spaces.Box(-2, 2, (2,), np.float32)
+    action_space: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, discrete: bool = False, as_dict: bool = False) -> None:
+        self.discrete, self.as_dict = discrete, as_dict
+        if discrete:
+            self.action_space = gym.spaces.Discrete(4)
+        if as_dict:
+            place = gym.spaces.Box(-2, 2, (2,), np.float32)
+            picture = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+            self.observation_space = gym.spaces.Dict({"place": place, "picture": picture})
+
+    def _obs(self) -> Any:
+        if not self.as_dict:
+            return self.place.copy()
+        return {"place": self.place.copy(), "picture": np.full((8, 8, 3), self.steps, np.uint8)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.place, self.steps = self.np_random.uniform(-1, 1, 2).astype(np.float32), 0
+        return self._obs(), {}
+
+    def step(self, action: Any) -> Any:
+        push = WAYS[action] if self.discrete else np.asarray(action, np.float32)
+        self.place = np.clip(self.place + 0.2 * push, -2, 2)
+        self.steps += 1
+        far = float(np.abs(self.place - 1).max())
+        return self._obs(), float(far < 0.2), False, self.steps >= 30, {"success": far < 0.2}
+
+
+def place_of(obs: Any) -> Any:
+    """Return where the point is, (n, 2)."""
+    return obs["place"] if obs.dtype.fields else obs
+
+
+SPACES: dict[str, Any] = {
+    "box": gym.spaces.Box(-1, 1, (2,), np.float32),
+    "box of float64": gym.spaces.Box(np.array([-1.0, 0.0]), np.array([1.0, 2.0]), dtype=np.float64),
+    "unbounded": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
+    "number": gym.spaces.Discrete(3, start=2),
+    "numbers": gym.spaces.MultiDiscrete([3, 2]),
+    "bits": gym.spaces.MultiBinary(2),
+    "whole": gym.spaces.Box(-2, 2, (2,), np.int64),
+    "dict": gym.spaces.Dict(
+        {"at": gym.spaces.Box(-1, 1, (2,), np.float32), "side": gym.spaces.Discrete(2)}
+    ),
+    "tuple": gym.spaces.Tuple([gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)]),
+    "picture": gym.spaces.Box(0, 255, (8, 8, 3), np.uint8),
+}
+
+
+def aim_of(goal: Any) -> Any:
+    """Return a point (n, 2) to go to, of a goal of any of the spaces."""
+    if goal.dtype.fields:
+        goal = goal["at" if "at" in goal.dtype.names else "0"]
+    flat = goal.reshape(len(goal), -1).astype(np.float64)
+    return np.broadcast_to(flat[:, :2] % 2, (len(goal), 2))
+
+
+class GoTo(sw.Skill):
+    """Go to a point."""
+
+    max_steps = 8
+    goal_space: Any = SPACES["box"]
+
+    def reward(self, step):
+        return -np.abs(place_of(step.next_obs) - aim_of(step.goal)).sum(1)
+
+    def termination(self, step):
+        return np.abs(place_of(step.next_obs) - aim_of(step.goal)).max(1) < 0.15
+
+    def success(self, step):
+        return np.abs(place_of(step.next_obs) - aim_of(step.goal)).max(1) < 0.15
+
+
+class Rest(sw.Skill):
+    """Stay where it is."""
+
+    max_steps = 3
+
+    def policy(self, obs):
+        return np.zeros((len(obs), 2), np.float32)
+
+
+def go_to(space: str = "box", **attributes: Any) -> sw.Skill:
+    """A ``GoTo`` for goals of a space."""
+    return type("GoTo", (GoTo,), {"goal_space": SPACES[space], **attributes})()
+
+
+def far_corner(obs):
+    """A selector that is a rule: go to the far corner."""
+    return np.full(len(obs), "go_to"), np.full((len(obs), 2), 0.9)
+
+
+def declared(skills: Any = None, env: Any = Point, **how: Any) -> sw.Hierarchy:
+    """A small hierarchy of a skill with goals under a rule."""
+    defaults = {"selector": far_corner, "algorithm": ON, "learn": "apart", "call_steps": 8}
+    defaults |= {"steps": 200}
+    return sw.Hierarchy(env, [go_to()] if skills is None else skills, **(defaults | how))
