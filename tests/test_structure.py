@@ -389,6 +389,11 @@ def test_no_lines_are_packed(path: Path) -> None:
 # Docstrings
 
 
+def is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> bool:
+    """One of the signatures of a function that has its docstring."""
+    return any(ast.unparse(d) == "overload" for d in node.decorator_list)
+
+
 def undocumented(source: str) -> list[str]:
     """Public modules, classes, functions and methods without a docstring.
 
@@ -400,7 +405,7 @@ def undocumented(source: str) -> list[str]:
         for child in node.body:
             if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
                 continue
-            if child.name.startswith("_"):
+            if child.name.startswith("_") or is_overload(child):
                 continue
             if ast.get_docstring(child) is None:
                 yield f"{prefix}{child.name}, line {child.lineno}"

@@ -105,16 +105,17 @@ class Learnable:
         Raises:
             DeclarationError: the algorithm cannot learn on with it; ``who`` begins the message.
         """
-        from skillweave.networks.config import Network
-
         if (kind := type(config).__name__) != self.kind:
             raise DeclarationError(
                 f"{who}: {self.name} learns on by {self.kind}, but the algorithm is {kind}: write "
                 f"algorithm = sw.{self.kind}(...)"
             )
-        nets = list(self.networks.values())
-        shapes: list[Any] = [Network(net.hidden, net.activation) for net in nets]  # type: ignore[arg-type]
-        changes = {"network": shapes[0], "normalize_obs": self.scaling is not None}
+        nets = self.networks.values()
+        shapes = [{"hidden": net.hidden, "activation": net.activation} for net in nets]
+        changes: dict[str, Any] = {
+            "network": shapes[0],
+            "normalize_obs": self.scaling is not None,
+        }
         if "critic" in self.networks:
             changes["critic"] = shapes[-1]
         return replace(config, **changes, **self.settings)
