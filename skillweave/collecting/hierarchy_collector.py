@@ -272,7 +272,8 @@ class HierarchyCollector(Collector):
 
     def _calls(self, trace: Trace, info: Sequence[str]) -> Batch:
         over = trace["call_end"] != RUNNING
-        columns = {name: trace[name] for name in CALLS if name in trace}
+        goals = (f"{skill.name}/goal" for skill in self.skills.skills)
+        columns = {name: trace[name] for name in (*CALLS, *goals) if name in trace}
         columns["call_succeeded"] = call_successes(trace, self.skills.skills, "", over)
         return Batch(**columns, **{INFO + key: info_numbers_of(trace, key) for key in info})
 

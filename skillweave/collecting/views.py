@@ -94,7 +94,8 @@ def call_successes(trace: Trace, skills: Sequence[Skill], path: str, over: Array
     for i, skill in enumerate(skills):
         last = over & (running == i) if skill.defines("success") else None
         if last is not None and last.any():
-            succeeded[last] = judged(trace, skill, "success", last, elapsed)
+            goal = trace.get(f"{path}{skill.name}/goal")
+            succeeded[last] = judged(trace, skill, "success", last, elapsed, goal)
     return succeeded
 
 

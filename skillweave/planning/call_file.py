@@ -31,6 +31,7 @@ from skillweave.types import LARGEST_REWARD, Array
 
 KIND = "calls"
 INFO = "info."
+GOAL = "goal."
 PLAIN = ("checksums", "recurrent", "own_success")
 """Entries of the header with a value for each skill."""
 SPACES = ("observation", "action")
@@ -72,6 +73,8 @@ class CallsHeader(TypedDict):
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
+    goals: NotRequired[list[str]]
+    """The skills that have goals."""
     run: NotRequired[LoggedRun]
 
 
@@ -95,6 +98,7 @@ def write_calls(
         "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
+        "goals": [name.removeprefix(GOAL) for name in columns if name.startswith(GOAL)],
     }
     header |= {} if run is None else {"run": run}
     tensors = {name: to_tensor(value) for name, value in columns.items()}
@@ -131,7 +135,11 @@ def _fields(
     if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
     columns = {name: value.numpy() for name, value in tensors.items()}
+    goals = tuple(header.get("goals", ()))
+    if not set(goals) <= set(skills):
+        raise ValueError("it has goals of other skills")
     expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
+    expected |= {GOAL + name for name in goals}
     if columns.keys() != expected:
         raise ValueError(f"it has the columns {', '.join(sorted(columns))}"[:300])
     calls, steps = len(columns["choice"].reshape(-1)), len(columns["reward"].reshape(-1))
@@ -145,8 +153,11 @@ def _fields(
     _check("action", columns["action"], (steps, *(spaces["action_space"].shape or ())), None)
     for key in info:
         _check(INFO + key, columns[INFO + key], (steps, *columns[INFO + key].shape[1:]), None)
+    for name in goals:
+        column = columns[GOAL + name]
+        _check(GOAL + name, column, (calls, *column.shape[1:2]), np.dtype(np.float64))
     _check_values(columns, steps, choices)
-    own = {name: value for name, value in columns.items() if not name.startswith(INFO)}
+    own = {name: value for name, value in columns.items() if not name.startswith((INFO, GOAL))}
     return (
         own
         | spaces
@@ -156,6 +167,7 @@ def _fields(
             **{name: tuple(header[name]) for name in PLAIN},
             "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
+            "goals": {name: columns[GOAL + name] for name in goals},
         }
     )
 

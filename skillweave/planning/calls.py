@@ -14,12 +14,13 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.blame import Blame, blame
-from skillweave.planning.call_file import INFO, read_calls, write_calls
+from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
 from skillweave.planning.skill_code import code_of
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum, source_of
+from skillweave.skills.goal_spaces import without_goal
 from skillweave.spaces import same_space
 from skillweave.types import Array
 
@@ -57,6 +58,8 @@ class CallLog(CallColumns):
         action: (T, *action_shape).
         reward: (T,) float32, the environment's.
         info: by key, (T, …) values of the environment's ``info``.
+        goals: by skill that has goals, (C, G) float64, the numbers of its calls' goals; in rows of
+            other skills they mean nothing.
     """
 
     @checked_names
@@ -159,8 +162,10 @@ class CallLog(CallColumns):
                 f"the log is of calls with {_shown_lengths(self.lengths)}, but these are with "
                 f"{_shown_lengths(lengths)}; record a log of these calls"
             )
-        for policy in skills.policies:
-            self.check_spaces(policy.observation_space, policy.action_space)
+        for skill, policy in zip(skills.skills, skills.policies, strict=True):
+            seen = policy.observation_space
+            seen = seen if skill.goal_space is None else without_goal(seen)
+            self.check_spaces(seen, policy.action_space)
         if learning and LEARNING in self.checksums:
             return
         for name, now, then in zip(names, skill_checksums(skills), self.checksums, strict=True):
@@ -232,6 +237,10 @@ def join(logs: Iterable[CallLog]) -> CallLog:
                 "of one log the skills' success() was known, of another not (its run was loaded "
                 "without their code); record both with it"
             )
+        if {k: v.shape[1:] for k, v in log.goals.items()} != {
+            k: v.shape[1:] for k, v in first.goals.items()
+        }:
+            raise RunError("the skills have other goals in one log; join logs of the same skills")
         if log.info.keys() != first.info.keys():
             raise RunError(
                 f"one log has the info keys {', '.join(first.info) or 'none'}, another "
@@ -256,6 +265,7 @@ def join(logs: Iterable[CallLog]) -> CallLog:
         episode=np.concatenate(episodes),
         offset=np.concatenate(offsets),
         info=info,
+        goals={name: np.concatenate([log.goals[name] for log in logs]) for name in first.goals},
     )
 
 
@@ -276,7 +286,9 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
         # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
         acts = source.get("sha256") or str(source.get("name")).partition(".")[2]
         reflexes = [reflex.name for reflex in skills.reflexes]
-        whole = repr([acts, skills.limit(i), skills.greedy, reflexes])
+        goals = skills.skills[i].goal_space
+        own = [] if goals is None else [str(goals)]
+        whole = repr([acts, skills.limit(i), skills.greedy, reflexes, *own])
         checksums.append(checksum(whole.encode()))
         if not isinstance(skills.skills[i], RecordedSkill):
             code = code_of(skills.skills[i], policy, skills.reflexes)
@@ -303,7 +315,8 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
 def columns_of(log: CallLog) -> Mapping[str, Array]:
     """Return all arrays of a log by name."""
     named = {name: getattr(log, name) for name in (*PER_CALL, "offset", *PER_STEP)}
-    return named | {INFO + key: value for key, value in log.info.items()}
+    named |= {INFO + key: value for key, value in log.info.items()}
+    return named | {GOAL + name: value for name, value in log.goals.items()}
 
 
 def _shown_lengths(lengths: Sequence[int]) -> str:

@@ -63,6 +63,7 @@ class CallColumns:
     action: Array
     reward: Array
     info: dict[str, Array] = field(default_factory=dict)
+    goals: dict[str, Array] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.choice)
@@ -190,6 +191,7 @@ class CallColumns:
             **{name: getattr(self, name)[steps] for name in PER_STEP},
             offset=offset,
             info={key: value[steps] for key, value in self.info.items()},
+            goals={name: goal[rows] for name, goal in self.goals.items()},
         )
 
     def within(self, steps: int) -> Self:

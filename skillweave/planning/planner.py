@@ -117,6 +117,11 @@ class Planner(ReadySelector):
         check_features(features, "Planner")
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
+        if log.goals:
+            raise DeclarationError(
+                f"Planner: the log has calls of skills with goals ({', '.join(log.goals)}), which "
+                "cannot be planned with yet: train a selector, or declare a skill for each goal"
+            )
         self.log, self.task = log, as_task(task, predicates)
         self.lengths = log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.pays:

@@ -21,9 +21,10 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
-from skillweave.planning.recorder import CALL, Recorder, TraceFeed, check_size
+from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
+from skillweave.skills.goal_spaces import GOAL, blank_choices, choice_space
 from skillweave.spaces import same_space
 from skillweave.types import Array, Memory, Memoryless
 
@@ -119,21 +120,68 @@ def record_calls(
         recorder = Recorder(skill_set, spaces, num_envs, info=info)
         player = Player(skill_set, selector)
         rng = (seeds / "choices").numpy()
-        sampled = isinstance(selector, RandomChoice)
+        sampled = isinstance(choose, RandomChoice) or (
+            isinstance(choose, str) and choose == "random"
+        )
         turn = Turn(not sampled, rng)
         played = _play(recorder, engine, player, steps, turn, seeds.integer(), choose)
         log = recorder.log()
         return replace(log, seed=played[log.episode])
 
 
+class WithDrawnGoals(Memoryless):
+    """A selector of skills alone, with goals that are drawn as for practice.
+
+    Args:
+        selector: chooses skills.
+        skills: of which some have goals.
+        space: of choices with goals.
+    """
+
+    def __init__(self, selector: Any, skills: SkillSet, space: gym.Space[Any]) -> None:
+        self._selector, self._skills, self._space = selector, skills, space
+        self._goals = goals_in(skills)
+
+    def start(self, n: int) -> Memory:
+        """Return the selector's memory."""
+        memory: Memory = self._selector.start(n)
+        return memory
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return choices (n,) with goals."""
+        rng = rng or np.random.default_rng()
+        how: dict[str, Any] = {"deterministic": deterministic, "rng": rng}
+        number, memory = self._selector.act(memory, obs, mask, **how)
+        choice, skill = blank_choices(self._space, number), self._skills.skill_of(number)
+        for i, (name, goals) in self._goals.items():
+            mine = np.flatnonzero(skill == i)
+            if len(mine):
+                choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
+        return choice, memory
+
+
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     names = tuple(s.name for s in skills.skills)
-    choices = gym.spaces.Discrete(skills.choices)
+    goal_spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
+    choices: gym.Space[Any] = choice_space(skills.choices, goal_spaces, names)
+    chooses: Any = None
     if isinstance(choose, str) and choose == "random":
-        return RandomChoice(skills.choices)
-    if isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
+        chooses = RandomChoice(skills.choices)
+    elif isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
         choose.begin(skills.choices)
-        return choose
+        chooses = choose
+    elif isinstance(choose, RandomChoice):
+        chooses = choose
+    if chooses is not None:
+        return WithDrawnGoals(chooses, skills, choices) if goal_spaces else chooses
     if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
         if (ready := ready_selector(choose, names)) is not None:
             return ready.bind(engine.observation_space, choices, "selector")
@@ -167,7 +215,7 @@ def _play(
     Returns:
         The seeds of the episodes, in the order of their starts; −1: unknown, of EnvPool.
     """
-    n, feed = engine.num_envs, TraceFeed([recorder])
+    n, feed, goals = engine.num_envs, TraceFeed([recorder]), goals_in(recorder.skills)
     seeds: list[int] = []
     begun = np.zeros(n, np.int64)  # episodes of each environment
 
@@ -192,7 +240,7 @@ def _play(
         turn.age[rows] += 1
         step = raw.seen(here, action, turn.age[rows])
         end = player.observe(memory, rows, step)
-        feed.add(rows, step, {"": {key: memory[key][rows] for key in CALL if key in memory}})
+        feed.add(rows, step, {"": calls_in({k: v[rows] for k, v in memory.items()}, goals)})
         made += len(rows)
         obs[rows] = raw.next_obs
         over = rows[raw.terminated | raw.truncated]

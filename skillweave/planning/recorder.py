@@ -23,6 +23,7 @@ from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import join
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import Array, Memory, Step
 
@@ -95,6 +96,9 @@ class Recorder:
         self.path, self._above = path, dict(above or {})
         self._columns = f"{path}/" if path else ""
         self._own_rewards, self._inside = own_rewards, inside
+        every = ((skill.name, goals_of(skill)) for skill in skills.skills)
+        self.goals = {name: goals for name, goals in every if goals is not None}
+        """The goals of skills that have some, by name."""
         self.steps = 0
         """Steps that are kept."""
         self._bytes = 0
@@ -156,6 +160,10 @@ class Recorder:
             episode[starts],
             order[starts],
             trace["elapsed"][starts] - 1,
+            *(
+                goals.flat(trace[f"{self._columns}{name}/goal"][starts])
+                for name, goals in self.goals.items()
+            ),
         )
         over = acts & (end != RUNNING)
         if self.path:
@@ -181,7 +189,7 @@ class Recorder:
             learning: names of the skills that learnt meanwhile.
         """
         starts, steps, ends = self._joined()
-        known, start, choice, episode, order, age = starts
+        known, start, choice, episode, order, age, *goals = starts
         _, end_reason, succeeded, terminated, truncated, may = ends
         call, next_obs, action, reward = steps[:4]
         counts = np.bincount(np.searchsorted(known, call), minlength=len(known))
@@ -211,6 +219,7 @@ class Recorder:
             action=action,
             reward=reward,
             info=dict(zip(self.info, steps[4:], strict=False)),
+            goals=dict(zip(self.goals, goals, strict=True)),
         )
         return log if self.latest is None else log.latest(self.latest)
 
@@ -268,7 +277,8 @@ class Recorder:
             if isinstance(skill, RecordedSkill):
                 own[acts] = np.nan
             elif skill.defines("reward") and acts.any():
-                own[acts] = judged(trace, skill, "reward", acts, elapsed)
+                goal = trace.get(f"{self._columns}{skill.name}/goal")
+                own[acts] = judged(trace, skill, "reward", acts, elapsed, goal)
         return own
 
     def _ends(self, trace: Batch, over: Array, call: Array) -> tuple[Array, ...]:
@@ -347,7 +357,10 @@ class Recorder:
         more = [np.zeros(0, np.float32)] * (len(self.info) + self._own_rewards)
         steps: tuple[Array, ...] = (whole, obs, actions, np.zeros(0, np.float32), *more)
         return _Part(
-            (whole, obs, whole, whole, whole, whole),
+            (
+                *(whole, obs, whole, whole, whole, whole),
+                *(goals.flat(goals.read(goals.start(0))) for goals in self.goals.values()),
+            ),
             steps if first is None else tuple(column[:0] for column in first),
             [(whole, np.zeros(0, np.int8), truth, truth, truth, self.skills.startable(obs))],
         )
@@ -373,8 +386,7 @@ class TraceFeed:
 
         Args:
             step: of these environments; ``elapsed`` counts the steps of the episode.
-            levels: by path, ``skill``, ``elapsed``, ``end`` and perhaps ``limit`` of each level's
-                calls after the step, (k,) each.
+            levels: by path, what ``calls_in`` reads of each level's calls after the step.
         """
         # Environments stop one after another; when half have stopped, a new trace begins.
         if self._steps and 2 * len(ids) < len(self._steps[0][0]):
@@ -400,7 +412,8 @@ class TraceFeed:
         columns = {name: [getattr(step, field) for step in steps] for name, field in FED.items()}
         for path, calls in levels[0].items():
             for key in calls:
-                name = join(path, key if key == "skill" else f"call_{key}")
+                plain = key == "skill" or key.endswith("/goal")
+                name = join(path, key if plain else f"call_{key}")
                 columns[name] = [level[path][key] for level in levels]
         joined = {name: np.concatenate(parts) for name, parts in columns.items()}
         lead = len(steps), len(every[0])
@@ -416,6 +429,28 @@ class TraceFeed:
             whole[name][at] = x
         pairs = zip(infos, places, strict=True)
         return Trace([_spread(info, place, lead[1]) for info, place in pairs], whole)
+
+
+def calls_in(memory: Memory, goals: Mapping[int, tuple[str, Goals]], prefix: str = "") -> Memory:
+    """Return what a ``TraceFeed`` takes of a player's memory.
+
+    These are ``skill``, ``elapsed``, ``end`` and perhaps ``limit``, (k,) each, and the goals of
+    skills that have some, (k, *goal_shape).
+
+    Args:
+        goals: of ``goals_in``.
+        prefix: of the level's names in the memory.
+    """
+    found = {key: memory[prefix + key] for key in CALL if prefix + key in memory}
+    for i, (name, own) in goals.items():
+        found[f"{name}/goal"] = own.read(memory[f"{prefix}goal.{i}"])
+    return found
+
+
+def goals_in(skills: SkillSet) -> dict[int, tuple[str, Goals]]:
+    """Return the names and goals of skills that have goals, by their places."""
+    every = ((i, skill.name, goals_of(skill)) for i, skill in enumerate(skills.skills))
+    return {i: (name, goals) for i, name, goals in every if goals is not None}
 
 
 FED = {

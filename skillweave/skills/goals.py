@@ -7,6 +7,7 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -146,9 +147,9 @@ class Goals:
     def flat(self, goal: Array) -> Array:
         """Return goals as numbers (n, G), for policies that take them so."""
         if not self._bytes:
-            return goal.reshape(len(goal), -1).astype(np.float64, copy=False)
+            return goal.reshape(len(goal), self.size).astype(np.float64, copy=False)
         columns = (part_at(goal, path) for path in leaf_paths(self.space))
-        flat = [x.reshape(len(goal), -1).astype(np.float64) for x in columns]
+        flat = [x.reshape(len(goal), math.prod(x.shape[1:])).astype(np.float64) for x in columns]
         return np.concatenate(flat, axis=1)
 
     @property

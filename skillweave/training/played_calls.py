@@ -13,7 +13,7 @@ from skillweave.collecting.call_end import EPISODE, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import AGENT
 from skillweave.planning.calls import CallLog
-from skillweave.planning.recorder import CALL, Recorder, TraceFeed, levels_below
+from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.skills import Skill
 from skillweave.training.play import Played
 from skillweave.types import Array, Memory, Policy
@@ -52,6 +52,7 @@ class PlayedCalls:
             path: "".join(f"{place}." for place in above.values())
             for path, (_, above) in self._levels.items()
         }
+        self._goals = {path: goals_in(below) for path, (below, _) in self._levels.items()}
         self._spaces = spaces
         self._how: dict[str, Any] = {"info": info, "own_rewards": own_rewards, "inside": inside}
         self._feed: TraceFeed | None = None
@@ -98,7 +99,7 @@ class PlayedCalls:
             return {"skill": nothing, "elapsed": played.step.elapsed, "end": end}
         assert played.after is not None
         prefix, after = self._prefix[path], played.after
-        calls = {key: after[prefix + key] for key in CALL if prefix + key in after}
+        calls = calls_in(after, self._goals[path], prefix)
         if played.cut.any():  # the player sees the environment's own ends
             cut = played.cut & (calls["end"] == RUNNING)
             calls["end"] = np.where(cut, np.int8(EPISODE), calls["end"])

@@ -1,0 +1,107 @@
+"""Logs of calls, and reports, where skills have goals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from goals.worlds import SPACES, Rest, aim_of, declared, go_to, place_of
+
+import skillweave as sw
+from skillweave.planning import CallLog, Planner, join
+
+
+def walk(self: Any, obs: Any, goal: Any) -> Any:
+    """Go to a goal that is a box, straight."""
+    return np.clip(5 * (aim_of(goal) - place_of(obs)), -1, 1).astype(np.float32)
+
+
+def rests(obs: Any) -> Any:
+    """A selector that never calls a skill with goals."""
+    return np.full(len(obs), "rest")
+
+
+def ready(space: str = "box", **how: Any) -> sw.Run:
+    """A run of a ready skill with goals, and one without."""
+    skills = [go_to(space, policy=walk), Rest()]
+    return declared(skills, **({"selector": rests} | how)).train(quiet=True)
+
+
+def two_goals(obs: Any) -> Any:
+    """A selector: to a corner where the point is left, else rest."""
+    left = obs[:, 0] < 0
+    return np.where(left, "go_to", "rest"), np.full((len(obs), 2), 0.75)
+
+
+def test_random_calls_have_goals_as_for_practice() -> None:
+    log = ready().log_calls(600, num_envs=4)
+    mine = log.skill == 0
+    assert 10 < mine.sum() < len(log)
+    goals = log.goals["go_to"]
+    assert goals.shape == (len(log), 2)
+    assert len(np.unique(goals[mine], axis=0)) == mine.sum()
+    assert (np.abs(goals[mine]) <= 1).all()
+    near = np.abs(log.end[mine] - goals[mine] % 2).max(1) < 0.15
+    np.testing.assert_array_equal(log.succeeded[mine], near)
+    assert 0 < near.mean() <= 1
+
+
+@pytest.mark.parametrize("space", ["number", "dict", "tuple", "bits"])
+def test_goals_of_other_kinds(space: str) -> None:
+    log = ready(space).log_calls(200, num_envs=2)
+    sizes = {"number": 1, "dict": 3, "tuple": 3, "bits": 2}
+    assert log.goals["go_to"].shape == (len(log), sizes[space])
+    assert log.succeeded[log.skill == 0].any()
+
+
+def test_a_selector_gives_the_goals(tmp_path: Any) -> None:
+    run = ready(selector=two_goals)
+    log = run.log_calls(300, choose=two_goals, num_envs=2)
+    assert (log.goals["go_to"][log.skill == 0] == 0.75).all()
+    played = run.evaluate(3, log_calls=True, quiet=True).calls
+    assert (played.goals["go_to"][played.skill == 0] == 0.75).all()
+    np.testing.assert_array_equal(
+        played.succeeded[played.skill == 0],
+        np.abs(played.end[played.skill == 0] - 0.75).max(1) < 0.15,
+    )
+    log.save(tmp_path / "calls.safetensors")
+    read = CallLog.load(tmp_path / "calls.safetensors")
+    np.testing.assert_array_equal(read.goals["go_to"], log.goals["go_to"])
+    both = join([log, read])
+    assert len(both.goals["go_to"]) == 2 * len(log)
+    assert len(log.of("go_to").goals["go_to"]) == (log.skill == 0).sum()
+
+
+def test_training_logs_goals(tmp_path: Any) -> None:
+    selector = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1)
+    hierarchy = declared([go_to(policy=walk), Rest()], selector=selector)
+    run = hierarchy.train(tmp_path / "run", log_calls=400, quiet=True)
+    log = run.calls
+    mine = log.skill == 0
+    near = np.abs(log.end[mine] - log.goals["go_to"][mine] % 2).max(1) < 0.15
+    np.testing.assert_array_equal(log.succeeded[mine], near)
+
+
+def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
+    selector = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1)
+    run = declared([go_to(policy=walk), Rest()], selector=selector).train(
+        tmp_path / "run", quiet=True
+    )
+    found = run.report(tmp_path / "report.html", episodes=2)
+    assert not any("success()" in sentence for sentence in found["missing"])
+    assert "go_to" in (tmp_path / "report.html").read_text()
+
+
+def test_a_planner_says_that_it_chooses_no_goals() -> None:
+    log = ready().log_calls(100, num_envs=2)
+    with pytest.raises(sw.DeclarationError, match=r"skills with goals \(go_to\)"):
+        Planner(log, lambda obs: obs[:, 0] > 0.5)
+
+
+def test_logs_with_other_goals_are_not_joined() -> None:
+    log = ready().log_calls(100, num_envs=2)
+    other = ready("bits").log_calls(100, num_envs=2)
+    assert SPACES["box"] != SPACES["bits"]
+    with pytest.raises(sw.RunError):
+        join([log, other])
