@@ -115,4 +115,6 @@ def declared(skills: Any = None, env: Any = Point, **how: Any) -> sw.Hierarchy:
     """A small hierarchy of a skill with goals under a rule."""
     defaults = {"selector": far_corner, "algorithm": ON, "learn": "apart", "call_steps": 8}
     defaults |= {"steps": 200}
-    return sw.Hierarchy(env, [go_to()] if skills is None else skills, **(defaults | how))
+    # By default the number of processes depends on the time that a step takes, and so do weights.
+    spec = env if isinstance(env, sw.EnvSpec) else sw.EnvSpec(env, workers=1)
+    return sw.Hierarchy(spec, [go_to()] if skills is None else skills, **(defaults | how))
