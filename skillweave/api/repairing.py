@@ -28,6 +28,7 @@ from skillweave.hierarchy.repair import (
 )
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.messages import as_path, short, shown_path
+from skillweave.notices import notice
 from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
@@ -68,7 +69,12 @@ def repair(
     roles = roles_of(declared)
     skill, after = _checked(roles, skill, after)
     if resume:
-        return _go_on(declared, skill, after, run_dir, done, quiet, callback)
+        return _go_on(declared, skill, after, steps, run_dir, done, quiet, callback)
+    if run_dir is not None and (place := as_path(run_dir, "run_dir") / "run.json").exists():
+        raise RunError(
+            f"{shown_path(place.parent)} holds a run: name a new directory; or, if a repair was "
+            "stopped there, add resume=True"
+        )
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
     content, entries, policies = _content(declared, source, roles, policy)
@@ -117,12 +123,13 @@ def _go_on(
     declared: D,
     skill: str,
     after: str,
+    steps: int,
     run_dir: str | Path | None,
     done: Mapping[str, Any] | None,
     quiet: bool,
     callback: Callback | None,
 ) -> Trained[D]:
-    """Finish a repair that was stopped."""
+    """Finish a repair that was stopped, with the steps that it was begun with."""
     if run_dir is None:
         raise DeclarationError(
             "resume=True continues a repair, so name its directory: "
@@ -135,6 +142,9 @@ def _go_on(
             f"{shown_path(run.path)} holds no repair of {skill!r} after {after!r}; leave out "
             "resume=True to start one in another directory"
         )
+    budget = next(e["budget"] for e in reversed(run.manifest["stages"]) if "repair" in e)
+    if budget != steps:
+        notice(f"the repair goes on with the {budget:,} steps that it was begun with")
     return go_on(
         apply_manifest(declared, run), run, quiet, None, None, callback=callback, done=done
     )

@@ -60,8 +60,9 @@ class Blame:
     @property
     def fine(self) -> bool:
         """True if the second skill is not clearly less often done than elsewhere."""
+        elsewhere = 1.0 if np.isnan(self.elsewhere) else self.elsewhere
         high = float(wilson(self.rate * self.calls, self.calls)[1])
-        return high >= (1.0 if np.isnan(self.elsewhere) else self.elsewhere)
+        return self.rate >= elsewhere or high >= elsewhere
 
     def __str__(self) -> str:
         """Return the reason in plain sentences."""

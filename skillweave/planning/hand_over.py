@@ -178,11 +178,12 @@ class Chain:
 
     def __str__(self) -> str:
         """Return the estimate and the product as a sentence."""
+        text = f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
+        if 0 in self.calls:
+            name = self.skills[self.calls.index(0)]
+            return f"{text}no product, as no logged call of {name!r} came right after"
         factors = " × ".join(f"{rate:.0%}" for rate in self.rates)
-        return (
-            f"{' then '.join(self.skills)}: {self.estimate:.0%} along the logged calls; "
-            f"{self.product:.0%} as the product {factors}"
-        )
+        return f"{text}{self.product:.0%} as the product {factors}"
 
 
 def hand_over(
@@ -250,7 +251,14 @@ def chain(
         starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
         near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
         follows = (weights_of(distance) * chance[near]).sum(1)
-        chance = np.where(won[rows[i]] & ~log.terminated[rows[i]], follows, 0.0)
+        may = log.may_follow[rows[i]].reshape(len(rows[i]), len(log.skills), -1)
+        goes_on = won[rows[i]] & ~log.terminated[rows[i]]
+        if goes_on.any() and not (goes_on & may[:, numbers[i + 1]].any(1)).any():
+            raise RunError(
+                f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was done "
+                "(its initiation() is False there), so this chain cannot be run"
+            )
+        chance = np.where(goes_on & may[:, numbers[i + 1]].any(1), follows, 0.0)
     matrix = hand_over(log, done)
     pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
     rates = tuple(rate for rate, _ in pairs)

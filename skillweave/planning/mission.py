@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from skillweave.arguments import checked_names
@@ -19,7 +19,13 @@ from skillweave.planning.parts import (
     compile_mission,
     sequence,
 )
-from skillweave.planning.predicates import as_event, as_predicate, named_predicates
+from skillweave.planning.predicates import (
+    Held,
+    Predicate,
+    as_event,
+    as_predicate,
+    named_predicates,
+)
 
 
 @checked_names
@@ -74,6 +80,11 @@ class Mission(RewardMachine):
         self.legs = _part(list(legs), "Mission")
         avoid = [avoid] if callable(avoid) or not isinstance(avoid, Collection) else list(avoid)
         self.avoid = tuple(as_predicate(a, "Mission: avoid") for a in avoid)
+        functions = [predicate.function for predicate in self.avoid]
+        if both := [x.name for x in _needed(self.legs) if x.function in functions]:
+            raise DeclarationError(
+                f"Mission: {both[0]!r} must be done and must be avoided: leave out one of them"
+            )
         self.repeat = None if repeat is None else whole_number(repeat, "Mission: repeat", 1)
         self._build(compile_mission(self.legs, self.avoid, self.repeat))
 
@@ -122,6 +133,17 @@ def in_any_order(*parts: Any) -> AnyOrder:
         DeclarationError: it has less than two parts or more than six, or one of a wrong type.
     """
     return AnyOrder(_several(parts, "in_any_order()"))
+
+
+def _needed(part: Part) -> Iterator[Predicate]:
+    """Yield the predicates that hold in every way to do a part."""
+    if isinstance(part, InOrder | AnyOrder):
+        for inner in part.parts:
+            yield from _needed(inner)
+    elif isinstance(part, Held):
+        yield part.predicate
+    elif isinstance(part, Predicate):
+        yield part
 
 
 def _several(parts: Sequence[Any], where: str) -> tuple[Part, ...]:

@@ -215,6 +215,8 @@ def from_sb3(
         DeclarationError: an argument has a wrong type.
     """
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
+    if not isinstance(learn, bool):
+        raise DeclarationError(f"from_sb3(): learn is {short(learn)}; it must be True or False")
     if not isinstance(model, str | Path):
         if not (hasattr(model, "policy") and hasattr(model, "observation_space")):
             raise DeclarationError(
@@ -225,10 +227,13 @@ def from_sb3(
         return SB3Policy(model, mapping=_mapping(model, normalize, trust, options))
     file = Path(model)
     if trust is not True:
+        check_file(file)
+        kind_of = algorithm.__name__ if isinstance(algorithm, type) else repr(algorithm or "ppo")
+        further = ", learn=True" if learn else ""
         raise PolicyError(
             f"{file} was not opened: a Stable-Baselines3 zip holds pickles, which can run any code "
             "on your machine. If you trust its author: "
-            f"from_sb3({str(file)!r}, {algorithm!r}, trust=True)"
+            f"from_sb3({str(file)!r}, {kind_of}, trust=True{further})"
         )
     kind = _algorithm(algorithm, file)
     content = read_file(file)

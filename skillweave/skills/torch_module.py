@@ -222,6 +222,8 @@ def from_torch(
     mapping = mapping_of(
         "from_torch()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
     )
+    if not isinstance(learn, bool):
+        raise DeclarationError(f"from_torch(): learn is {short(learn)}; it must be True or False")
     if learn and (mapping != PolicyMapping() or isinstance(module, str | Path)):
         raise DeclarationError(
             "from_torch(learn=True) takes a module made of its class, which learns on with the "

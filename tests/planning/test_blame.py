@@ -7,7 +7,7 @@ import pytest
 from logs import log_of
 
 from skillweave.errors import RunError
-from skillweave.planning import CallLog
+from skillweave.planning import Blame, CallLog
 
 A, B = 0, 1
 
@@ -66,3 +66,10 @@ def test_few_calls_do_not_tell() -> None:
 def test_a_pair_without_a_call_is_said() -> None:
     with pytest.raises(RunError, match="no call of 'a' after a call of 'b'"):
         log("low").blame("a", "b")
+
+
+@pytest.mark.parametrize("calls", [44, 45, 124])
+def test_a_skill_that_is_always_done_is_to_blame_for_nothing(calls: int) -> None:
+    nan, reasons = float("nan"), {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
+    found = Blame("b", "a", 1.0, 1.0, calls, 1.0, 1.0, None, (nan, nan), reasons, False)
+    assert "neither skill is to blame" in str(found)

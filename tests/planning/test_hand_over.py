@@ -169,3 +169,16 @@ def test_where_calls_end(log: CallLog) -> None:
 def test_wrong_arguments_of_hand_over(log: CallLog, make: Any, kind: Any, message: str) -> None:
     with pytest.raises(kind, match=message):
         make(log)
+
+
+def test_a_chain_whose_next_skill_may_never_start_is_refused(log: CallLog) -> None:
+    may = log.may_follow.copy()
+    may[log.skill == A, B] = False
+    with pytest.raises(RunError, match=r"'stay' may not start where any logged call of 'go'"):
+        replace(log, may_follow=may).chain("go", "stay")
+
+
+def test_a_pair_without_a_call_has_no_product(log: CallLog) -> None:
+    assert "no product, as no logged call of 'stay' came right after" in str(
+        log.chain("stay", "stay")
+    )

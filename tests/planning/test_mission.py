@@ -318,3 +318,15 @@ def test_goals() -> None:
     task = fixed.at(np.array([0.0]))
     assert task.step(task.start(2), step_to(obs))[2].tolist() == [True, True]
     assert Mission(reached(near, [4])).state_names == ("near(4)", "done")
+
+
+@pytest.mark.parametrize(
+    "legs", [(P[0],), (P[1], [P[2], held(P[0], 3)]), (in_any_order(P[1], P[0]),)]
+)
+def test_what_must_be_done_and_avoided_is_refused(legs: Any) -> None:
+    with pytest.raises(DeclarationError, match="must be done and must be avoided"):
+        Mission(*legs, avoid=P[0])
+
+
+def test_one_of_several_ways_may_be_avoided() -> None:
+    assert Mission(either(P[1], P[0]), avoid=P[0]).avoid == (P[0],)

@@ -154,8 +154,9 @@ def test_a_zip_is_not_opened_without_trust(tmp_path, trust):
     assert mark.exists()
 
 
-def test_refusing_needs_nothing_installed_and_no_file(monkeypatch, tmp_path):
+def test_refusing_needs_nothing_installed_and_reads_nothing(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    (tmp_path / "nothing.zip").touch()
     with pytest.raises(SkillweaveError, match="trust=True"):
         from_sb3(tmp_path / "nothing.zip", "ppo")
 

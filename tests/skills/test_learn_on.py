@@ -250,6 +250,10 @@ class TestRefused:
             torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Dropout(), torch.nn.Linear(4, 2)),
             torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2)),
             torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh()),
+            torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ELU(5.0), torch.nn.Linear(4, 2)),
+            torch.nn.Sequential(
+                torch.nn.Linear(3, 4), torch.nn.GELU(approximate="tanh"), torch.nn.Linear(4, 2)
+            ),
             torch.nn.LSTM(3, 2),
         ],
         ids=lambda m: type(m).__name__,
@@ -278,3 +282,16 @@ class TestRefused:
         module.weight.data[0, 0] = float("nan")
         with pytest.raises(sw.PolicyError, match="NaN"):
             sw.from_torch(module, learn=True)
+
+    def test_a_zip_without_trust_repeats_what_was_asked(self, tmp_path):
+        model_of("PPO", World()).save(tmp_path / "m.zip")
+        with pytest.raises(sw.PolicyError, match=r"\"?'?ppo'?\"?, trust=True, learn=True\)"):
+            sw.from_sb3(tmp_path / "m.zip", learn=True)
+        with pytest.raises(sw.RunError, match="does not exist"):
+            sw.from_sb3(tmp_path / "other.zip", learn=True)
+
+    def test_another_word_for_learn(self):
+        with pytest.raises(sw.DeclarationError, match="learn is 'yes'"):
+            sw.from_sb3(model_of("PPO", World()), learn="yes")
+        with pytest.raises(sw.DeclarationError, match="learn is 1"):
+            sw.from_torch(torch.nn.Linear(3, 2), learn=1)
