@@ -128,7 +128,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def repaired(run: Run, path: Path, **how: Any) -> Run:
-    settings = {"after": "flip", "steps": 5_120, "calls": 20, "quiet": True} | how
+    steps = {} if how.get("resume") else {"steps": 5_120}
+    settings = {"after": "flip", "calls": 20, "quiet": True, **steps} | how
     return run.repair(settings.pop("skill", "press"), run_dir=path, **settings)
 
 
@@ -355,7 +356,7 @@ def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
     agent = sw.Agent(SPEC, ON, 256).train(tmp_path / "agent", quiet=True)
     with pytest.raises(DeclarationError, match="plain agent"):
         repaired(agent, tmp_path / "a")
-    with pytest.raises(RunError, match="holds a finished run"):
+    with pytest.raises(RunError, match="holds a run: name a new directory"):
         repaired(run, run.path)
     with pytest.raises(RunError, match="holds no repair of 'press' after 'flip'"):
         repaired(run, run.path, resume=True)

@@ -194,7 +194,7 @@ def maze() -> Family:
         ],
         source=lambda: only_first(mazes.declare("large")),
         over=_maze_over,
-        planner={"gamma": 0.997, "temperature": 0.03, "features": PLACE},
+        planner={"gamma": 0.997, "features": PLACE},
         score=share_done,
         by_hand=lambda task: _mazes.ShortestPath(task.name),
         shipped="mazes",

@@ -898,7 +898,7 @@ class Run:
         skill: str,
         *,
         after: str,
-        steps: int = 200_000,
+        steps: int | None = None,
         run_dir: str | Path | None = None,
         done: Mapping[str, Any] | None = None,
         calls: int = 200,
@@ -917,7 +917,7 @@ class Run:
         Args:
             skill: the skill that fails, by its path.
             after: the skill after which it fails, of the same selector.
-            steps: environment steps of training; measuring takes more.
+            steps: environment steps of training; measuring takes more. None: 200,000.
             run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
             done: by skill, the event that a call is for, in place of the skill's ``success``; as
                 for ``planning.hand_over``. The skill learns by its own reward in any case.
@@ -925,7 +925,7 @@ class Run:
             seed: the root of every random stream.
             quiet: no progress.
             callback: as in ``Hierarchy.train``.
-            resume: finish the repair in ``run_dir``, with the run's own settings.
+            resume: finish the repair in ``run_dir``, with its own steps and settings.
 
         Returns:
             The new run, with the repaired weights or the earlier ones.
@@ -946,7 +946,7 @@ class Run:
                 self.policy,
                 skill,
                 after,
-                whole_number(steps, "steps", 1),
+                None if steps is None else whole_number(steps, "steps", 1),
                 run_dir,
                 done,
                 whole_number(calls, "calls", 1),

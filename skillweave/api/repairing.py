@@ -28,7 +28,6 @@ from skillweave.hierarchy.repair import (
 )
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.messages import as_path, short, shown_path
-from skillweave.notices import notice
 from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
@@ -37,6 +36,8 @@ from skillweave.training.stage import check_stages
 
 D = TypeVar("D", bound=Declaration)
 
+USUAL_STEPS = 200_000
+"""Steps of a repair for which none are given."""
 GOOD = 0.95
 """A hand-over that is done at least this often needs no repair."""
 MADE_ELSEWHERE = ("metrics_bytes", "lineage_bytes", "sha256", "policies", "starts", "continued")
@@ -51,7 +52,7 @@ def repair(
     policy: HierarchyPolicy,
     skill: str,
     after: str,
-    steps: int,
+    steps: int | None,
     run_dir: str | Path | None,
     done: Mapping[str, Any] | None,
     calls: int,
@@ -75,6 +76,7 @@ def repair(
             f"{shown_path(place.parent)} holds a run: name a new directory; or, if a repair was "
             "stopped there, add resume=True"
         )
+    steps = USUAL_STEPS if steps is None else steps
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
     content, entries, policies = _content(declared, source, roles, policy)
@@ -123,7 +125,7 @@ def _go_on(
     declared: D,
     skill: str,
     after: str,
-    steps: int,
+    steps: int | None,
     run_dir: str | Path | None,
     done: Mapping[str, Any] | None,
     quiet: bool,
@@ -143,8 +145,10 @@ def _go_on(
             "resume=True to start one in another directory"
         )
     budget = next(e["budget"] for e in reversed(run.manifest["stages"]) if "repair" in e)
-    if budget != steps:
-        notice(f"the repair goes on with the {budget:,} steps that it was begun with")
+    if steps not in (None, budget):
+        raise DeclarationError(
+            f"steps is {steps:,}, but this repair was begun with {budget:,}: leave out steps"
+        )
     return go_on(
         apply_manifest(declared, run), run, quiet, None, None, callback=callback, done=done
     )
