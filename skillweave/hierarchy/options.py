@@ -16,8 +16,10 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
-from skillweave.skills.goal_spaces import SKILL, choice_space
+from skillweave.skills.goal_spaces import GOAL, SKILL, choice_space
+from skillweave.skills.goals import as_goals
 from skillweave.spaces import pack, unpack
+from skillweave.spaces.choices import ChoiceSpace
 from skillweave.types import Array
 
 
@@ -103,7 +105,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         n = self.num_envs
         goals = None
         if self._player.goals:
-            choice = pack(self.single_action_space, actions)
+            choice = self._choices(actions)
             self._check(skill := choice[SKILL])
             goals = self._player.goals_in(choice, self._obs, "OptionsEnv.step")
         else:
@@ -201,6 +203,18 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
 
     def _named(self, choice: Array) -> str:
         return self.skills.skills[int(self.skills.skill_of(choice))].name
+
+    def _choices(self, actions: Any) -> Array:
+        """Return skills with goals as choices (N,); no number of a goal changes."""
+        space = self.single_action_space
+        choice = pack(space, actions)
+        if not isinstance(actions, np.ndarray):
+            assert isinstance(space, ChoiceSpace)
+            for name, part in space.goal_spaces.items():
+                given, whose = actions[GOAL][name], f"skill {name!r}"
+                goals = as_goals(given, self.num_envs, part, "OptionsEnv.step", whose)
+                choice[GOAL][name] = goals
+        return choice
 
     def _check(self, skill: Array) -> None:
         count = self.skills.choices

@@ -8,14 +8,15 @@ from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Dict, Tuple
+from gymnasium.spaces import Dict
 
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError, SkillweaveError
 from skillweave.messages import short, shortened
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of
-from skillweave.skills.outputs import as_array, called
+from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of, repeated
+from skillweave.skills.goals import as_goals
+from skillweave.skills.outputs import called
 from skillweave.types import Array, Memory, Step, read_only
 
 
@@ -81,21 +82,8 @@ class ReadySelector(Foreign):
                     f"{self._who} gave a goal for skill {self.skills[number]!r}, which has no "
                     "goals: set its goal_space, or leave out the goal"
                 )
-            part, wanted = choices[GOAL][name], tuple(spaces[name].shape or ())
-            given = _as_goals(values, spaces[name], self._who)
-            if given.shape[1:] != wanted or len(given) != len(rows):
-                raise SkillError(
-                    f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but "
-                    f"{(len(rows), *wanted)} was expected: one goal of {short(spaces[name])} for "
-                    "each environment"
-                )
-            kinds = "iub" if part.dtype.kind in "iub" else "iubf"
-            if given.dtype.kind not in kinds and given.dtype != part.dtype:
-                raise SkillError(
-                    f"{self._who} gave goals of {given.dtype} for skill {name!r}, but goals of "
-                    f"{short(spaces[name])} are {part.dtype}"
-                )
-            part[rows] = given
+            whose = f"skill {name!r}"
+            choices[GOAL][name][rows] = as_goals(values, len(rows), spaces[name], self._who, whose)
             lacks[rows] = False
         for name in spaces:
             wrong = np.flatnonzero(lacks & (skill == self.skills.index(name)))
@@ -112,13 +100,9 @@ class ReadySelector(Foreign):
         space = self.goal_spaces.get(name)
         if space is None or len(parts) == 1:
             return parts[0]
-        arrays = [_as_goals(values, space, self._who) for _, values in parts]
-        try:
-            return np.concatenate([rows for rows, _ in parts]), np.concatenate(arrays)
-        except ValueError as error:
-            raise SkillError(
-                f"{self._who} gave goals of different shapes for skill {name!r}: {error}"
-            ) from error
+        whose = f"skill {name!r}"
+        arrays = [as_goals(goals, len(rows), space, self._who, whose) for rows, goals in parts]
+        return np.concatenate([rows for rows, _ in parts]), np.concatenate(arrays)
 
     def _goal_advice(self, name: str) -> str:
         """Return how a goal is given to skill ``name``, for messages."""
@@ -174,13 +158,13 @@ def skill_and_goal(value: Any) -> tuple[Any, Any]:
 
 
 def goals_at(goal: Any, space: Space[Any] | None, obs: Array, who: str) -> Any:
-    """Return the goals of ``(name, goal)`` in observations (k, …): fixed, or by a function."""
+    """Return the goals of ``(name, goal)`` in observations (k, …): fixed, or by a function.
+
+    ``space`` is that of the skill's goals; None: it has none, which is said later.
+    """
     if callable(goal):
         return called(goal, read_only(obs), who)
-    if isinstance(space, Dict | Tuple):
-        return _repeated(space, goal, len(obs))
-    fixed = as_array(goal, who)
-    return np.broadcast_to(fixed, (len(obs), *fixed.shape))
+    return goal if space is None else repeated(space, goal, len(obs))
 
 
 def goal_as_json(goal: Any) -> Any:
@@ -188,27 +172,6 @@ def goal_as_json(goal: Any) -> Any:
     if callable(goal):
         return {"function": function_name(goal)}
     return repr(goal.tolist() if isinstance(goal, np.ndarray) else goal)
-
-
-def _as_goals(values: Any, space: Space[Any], who: str) -> Array:
-    """Return goals (k, …) as an array."""
-    if isinstance(values, np.ndarray) or not isinstance(space, Dict | Tuple):
-        return as_array(values, who)
-    from skillweave.spaces import pack  # needs torch, which declaring does not
-
-    try:
-        return pack(space, values)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise SkillError(f"{who} gave {short(values)}, which are no goals of {space}") from error
-
-
-def _repeated(space: Space[Any], goal: Any, n: int) -> Any:
-    """Return one goal of a Dict or Tuple as a batch of n."""
-    if isinstance(space, Dict):
-        return {k: _repeated(part, goal[k], n) for k, part in space.spaces.items()}
-    if isinstance(space, Tuple):
-        return tuple(_repeated(p, g, n) for p, g in zip(space.spaces, goal, strict=True))
-    return np.broadcast_to(goal, (n, *np.shape(goal)))
 
 
 def listed(names: tuple[str, ...]) -> str:

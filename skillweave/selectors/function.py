@@ -13,6 +13,7 @@ from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillError
 from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
 from skillweave.skills.foreign_policy import qualified
+from skillweave.skills.goals import as_goals
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
 from skillweave.skills.scripted import required_arguments
@@ -102,14 +103,12 @@ class FunctionSelector(ReadySelector):
         found = {}
         for name, values in goals.items():
             number = self._number(name, self._who, SkillError)
-            given = as_array(values, self._who)
-            if given.shape[:1] != chosen.shape:
-                raise SkillError(
-                    f"{self._who} gave goals of shape {given.shape} for skill {name!r}, but one "
-                    f"goal for each of the {len(chosen)} environments was expected"
-                )
             rows = np.flatnonzero(chosen == number)
-            found[name] = rows, given[rows]
+            space = self.goal_spaces.get(name)
+            if space is not None:
+                whose = f"skill {name!r}"
+                values = as_goals(values, len(chosen), space, self._who, whose, rows=rows)
+            found[name] = rows, values
         return found
 
     def _goal_advice(self, name: str) -> str:

@@ -159,11 +159,6 @@ def outside(space: gym.Space[Any], goals: Array) -> int | None:
     return int(wrong.argmax()) if wrong.any() else None
 
 
-def limits_of(dtype: np.dtype[Any]) -> tuple[int, int]:
-    """Return the smallest and the largest number of a type of whole numbers."""
-    return int(np.iinfo(dtype).min), int(np.iinfo(dtype).max)
-
-
 def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     """Return the named parts of a Dict or Tuple; None for any other space."""
     from skillweave.spaces.packing import parts  # needs torch, which declaring does not
@@ -171,13 +166,23 @@ def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
 
 
-def batch_of_one(space: gym.Space[Any], value: Any) -> Any:
-    """Return an element of a Dict or Tuple as a batch of one, in dicts and tuples."""
-    if isinstance(space, gym.spaces.Dict):
-        return {name: batch_of_one(part, value[name]) for name, part in space.spaces.items()}
-    if isinstance(space, gym.spaces.Tuple):
-        return tuple(batch_of_one(p, v) for p, v in zip(space.spaces, value, strict=True))
-    return np.asarray(value)[None]
+def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
+    """Return one goal as a batch of n, of a Dict or Tuple in dicts and tuples; it is not checked.
+
+    A value that is no goal of the space is returned as it is, or repeated, so that the check of
+    the batch can show it.
+    """
+    if isinstance(space, gym.spaces.Dict) and isinstance(goal, Mapping):
+        return {k: repeated(space[k], v, n) if k in space.spaces else v for k, v in goal.items()}
+    if isinstance(space, gym.spaces.Tuple) and isinstance(goal, tuple | list):
+        if len(goal) != len(space.spaces):
+            return goal
+        return tuple(repeated(part, v, n) for part, v in zip(space.spaces, goal, strict=True))
+    try:
+        fixed = np.asarray(goal)
+    except ValueError:  # of parts of unequal lengths
+        return goal
+    return np.repeat(fixed[None], n, axis=0)
 
 
 def part_at(goal: Array, path: tuple[str, ...]) -> Array:

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.errors import DeclarationError, EnvError, SkillError, SkillweaveError
 from skillweave.messages import short
@@ -19,15 +21,15 @@ from skillweave.skills.base import Skill, path_of
 from skillweave.skills.goal_spaces import (
     GOAL,
     OBSERVATION,
-    batch_of_one,
     example_of,
     joint_dtype,
     leaf_paths,
-    limits_of,
     outside,
     part_at,
+    parts_of,
+    repeated,
 )
-from skillweave.skills.outputs import as_array, called
+from skillweave.skills.outputs import called
 from skillweave.types import Array, read_only
 
 
@@ -47,11 +49,10 @@ class Goals:
     """
 
     def __init__(self, skill: Skill) -> None:
-        from skillweave.spaces.packing import obs_dtype, obs_shape, pack  # needs torch
+        from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
 
         space = skill.goal_space
         assert space is not None
-        self._pack = pack
         self.skill, self.space = skill, space
         self._who = f"skill {path_of(skill)!r}"
         try:
@@ -122,17 +123,15 @@ class Goals:
             SkillError: they have another shape or type, or are out of the space, where the skill
                 does not clip them.
         """
-        goals = self._as_goals(goal, len(obs), who, kind)
+        goals = as_goals(goal, len(obs), self.space, who, self._who, kind)
         if self.skill.defines("clip_goal"):
             who, kind = f"{self._who}: clip_goal()", SkillError
-            goals = self._as_goals(self._clipped(obs, goals, who), len(obs), who, kind)
-        if (row := outside(self.space, goals)) is not None:
-            advice = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
-            raise kind(
-                f"{who} gave the goal {short(goals[row].tolist())}, which is out of goal_space "
-                f"{short(self.space)} of {self._who}"
-                + ("" if self.skill.defines("clip_goal") else advice)
+            goals = as_goals(
+                self._clipped(obs, goals, who), len(obs), self.space, who, self._who, kind
             )
+        if (row := outside(self.space, goals)) is not None:
+            advice = "" if self.skill.defines("clip_goal") else f"; {ADVICE}"
+            raise kind(_is_out(goals[row], self.space, who, self._who) + advice)
         return goals
 
     def _clipped(self, obs: Array, goal: Array, who: str) -> Any:
@@ -140,9 +139,7 @@ class Goals:
 
     def one(self, goal: Any) -> Any:
         """Return one goal as a batch of one; it is not checked yet."""
-        if isinstance(goal, Mapping | tuple) and self._bytes:
-            return self._pack(self.space, batch_of_one(self.space, goal))
-        return np.asarray(goal)[None]
+        return repeated(self.space, goal, 1)
 
     def flat(self, goal: Array) -> Array:
         """Return goals as numbers (n, G), for policies that take them so."""
@@ -156,36 +153,94 @@ class Goals:
     def _label(self) -> str:
         return f"{self._who}: goals()"
 
-    def _as_goals(self, goal: Any, n: int, who: str, kind: type[SkillweaveError]) -> Array:
-        wanted = (n, *self.shape)
-        gave = f"{who} returned" if who.endswith(")") else f"{who} gave goals of"
-        if goal is None:
-            raise kind(
-                f"{who} returned None, but goals {wanted} were expected: is a return missing?"
-            )
-        if self._bytes and not isinstance(goal, np.ndarray):
-            try:
-                goals = self._pack(self.space, goal)
-            except (KeyError, TypeError, ValueError, IndexError) as error:
-                raise kind(
-                    f"{who} returned {short(goal)}, which are no goals of {self.space}"
-                ) from error
-        else:
-            goals = as_array(goal, who, kind)
-        if goals.shape != wanted:
-            raise kind(
-                f"{gave} shape {goals.shape}, but {wanted} was expected: one goal of "
-                f"{short(self.space)} for each of the {n} environments"
-            )
-        if goals.dtype == self.dtype:
-            return goals
-        whole = self.dtype.kind in "iub"
-        if self._bytes or goals.dtype.kind not in ("iub" if whole else "iubf"):
-            numbers = "whole numbers" if whole else "numbers"
-            wanted_type = self.dtype if self._bytes else numbers
-            raise kind(f"{gave} {goals.dtype}, but goals of {short(self.space)} are {wanted_type}")
-        if whole and goals.size:
-            limits = (0, 1) if self.dtype == bool else limits_of(self.dtype)
-            if (goals < limits[0]).any() or (goals > limits[1]).any():
-                raise kind(f"{who} returned goals that are no {self.dtype}")
-        return goals.astype(self.dtype)
+
+ADVICE = "give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
+
+
+def as_goals(
+    values: Any,
+    n: int,
+    space: Space[Any],
+    who: str,
+    skill: str,
+    kind: type[SkillweaveError] = SkillError,
+    rows: Array | None = None,
+) -> Array:
+    """Return goals as an array of the space's type, (n, *goal_shape); no number changes.
+
+    Whether they are in the space is not checked beyond that.
+
+    Args:
+        values: (n, *goal_shape); of a Dict or Tuple also dicts and tuples of such arrays.
+        who: whose goals they are, for messages.
+        skill: which is given them, for messages.
+        kind: the type of the error.
+        rows: the environments (k,) whose goals are returned, (k, *goal_shape); None: all. The
+            goals of the others may be anything.
+
+    Raises:
+        SkillError: they have another shape or type, or a number that the type cannot hold.
+    """
+    from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
+
+    dtype, wanted = obs_dtype(space), (n, *obs_shape(space))
+    if values is None:
+        raise kind(f"{who} returned None, but goals {wanted} were expected: is a return missing?")
+    inner = parts_of(space)
+    if inner is not None and not isinstance(values, np.ndarray):
+        given = _parts_given(values, space)
+        if given is None:
+            raise kind(f"{who} gave {short(values)}, which are no goals of {space}")
+        packed = np.zeros(n if rows is None else len(rows), dtype)
+        for (name, part), value in zip(inner.items(), given, strict=True):
+            whose = f"the part {name!r} of {skill}"
+            packed[name] = as_goals(value, n, part, who, whose, kind, rows)
+        return packed
+    try:
+        goals = np.asarray(values)
+    except ValueError as error:  # of parts of unequal lengths
+        raise kind(
+            f"{who} gave {short(values)}, which are no goals of {short(space)} of {skill}: the "
+            f"shape {wanted} was expected"
+        ) from error
+    if goals.shape != wanted:
+        raise kind(
+            f"{who} gave goals of shape {goals.shape} for {skill}, but {wanted} was expected: one "
+            f"goal of {short(space)} for each of the {n} environments"
+        )
+    goals = goals if rows is None else goals[rows]
+    if goals.dtype == dtype:
+        return goals
+    whole = dtype.kind in "iub"
+    if inner is not None or goals.dtype.kind not in ("iub" if whole else "iubf"):
+        needed = dtype if inner is not None else "whole numbers" if whole else "numbers"
+        raise kind(
+            f"{who} gave goals of {goals.dtype} for {skill}, but goals of {short(space)} are "
+            f"{needed}"
+        )
+    if whole and goals.size:
+        low, high = (0, 1) if dtype == bool else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        wrong = ((goals < low) | (goals > high)).reshape(len(goals), -1).any(axis=1)
+        if wrong.any():
+            raise kind(_is_out(goals[wrong.argmax()], space, who, skill) + "; give one in it")
+    with np.errstate(over="ignore"):  # an infinity is out of every space
+        return goals.astype(dtype)
+
+
+def _parts_given(values: Any, space: Space[Any]) -> list[Any] | None:
+    """Return the parts of goals of a Dict or Tuple, in its order; None: they are others."""
+    if isinstance(space, Dict):
+        if not isinstance(values, Mapping) or not set(space.spaces) <= set(values):
+            return None
+        return [values[name] for name in space.spaces]
+    assert isinstance(space, Tuple)
+    if not isinstance(values, tuple | list) or len(values) != len(space.spaces):
+        return None
+    return list(values)
+
+
+def _is_out(goal: Array, space: Space[Any], who: str, skill: str) -> str:
+    return (
+        f"{who} gave the goal {short(goal.tolist())}, which is out of goal_space {short(space)} of "
+        f"{skill}"
+    )

@@ -15,6 +15,9 @@ from skillweave.hierarchy.options import OptionsEnv
 SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
 HERE = (0.5, -0.5)
+BYTES = gym.spaces.Box(0, 255, (2,), np.uint8)
+BITS = gym.spaces.MultiBinary(2)
+NESTED = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32), "byte": BYTES})
 
 
 def toward_zero(obs):
@@ -227,6 +230,21 @@ def test_an_environment_of_options_takes_goals(tmp_path):
     env.close()
 
 
+def test_an_environment_of_options_does_not_change_goals(tmp_path):
+    from skillweave.envs.make import make_engine
+
+    skill = go_to()
+    type(skill).goal_space = BYTES
+    rule = sw.tree.Sequence(("go_to", (1, 2)))
+    run = declared([skill, Rest()], selector=rule).train(tmp_path / "run", quiet=True)
+    engine = make_engine(sw.EnvSpec(Point, engine="sync"), 2)
+    env = OptionsEnv(engine, run.policy.skills, gamma=0.9)
+    env.reset(seed=0)
+    with pytest.raises(SkillError, match=r"gave the goal \[300, 1\], which is out of goal_space"):
+        env.step({"skill": np.zeros(2, int), "goal": {"go_to": np.array([[1, 1], [300, 1]])}})
+    env.close()
+
+
 def test_what_goals_are_not_for_yet():
     inner = declared([Rest()], selector=lambda obs: np.full(len(obs), "rest"), name="inner")
     whole = type("Whole", (sw.Skill,), {"policy": inner, "goal_space": SPACES["box"]})()
@@ -251,3 +269,81 @@ def test_spaces_of_goals():
     graph = gym.spaces.Graph(gym.spaces.Discrete(2), None)
     with pytest.raises(DeclarationError, match=r"goal_space Graph.* is not supported"):
         declared([type("GoTo", (sw.Skill,), {"goal_space": graph})()]).check_spaces()
+
+
+def evaluated(selector, space, tmp_path):
+    """Evaluate a selector of a skill with goals of a space."""
+    skill = go_to()
+    type(skill).goal_space = space
+    if space.shape is None:
+        type(skill).reward = lambda self, step: step.goal["at"].sum(1)
+        type(skill).termination = lambda self, step: step.goal["at"].sum(1) > 9
+        type(skill).success = lambda self, step: step.goal["at"].sum(1) > 9
+    hierarchy = declared([skill, Rest()], selector=selector)
+    return hierarchy.train(tmp_path / "run", quiet=True).evaluate(2)
+
+
+@pytest.mark.parametrize(
+    ("goal", "space"),
+    [((300, 300), BYTES), ((-1, 7), BYTES), ((257, 0), BITS), ((3, 2**40), SPACES["numbers"])],
+)
+@pytest.mark.parametrize("form", ["function", "automaton", "tree", "by function"])
+def test_whole_goals_do_not_wrap_around(goal, space, form, tmp_path):
+    selector = {
+        "function": lambda obs: (["go_to"] * len(obs), np.tile(goal, (len(obs), 1))),
+        "automaton": sw.Automaton({"a": ("go_to", goal)}, {}),
+        "tree": sw.tree.Sequence(("go_to", goal)),
+        "by function": sw.tree.Sequence(("go_to", lambda obs: np.tile(goal, (len(obs), 1)))),
+    }[form]
+    says = rf"gave the goal \[{goal[0]}, {goal[1]}\], which is out of goal_space .*skill 'go_to'"
+    with pytest.raises(SkillError, match=says):
+        evaluated(selector, space, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("byte", "says"),
+    [
+        ((300, 1), r"gave the goal \[300, 1\], .* of the part 'byte' of skill 'go_to'"),
+        ((1.5, 1.0), "gave goals of float64 for the part 'byte' of .* are whole numbers"),
+        ((1, 2, 3), "gave goals of shape"),
+    ],
+)
+def test_parts_of_goals_do_not_change(byte, says, tmp_path):
+    selector = sw.tree.Sequence(("go_to", {"at": (0.5, 0.5), "byte": byte}))
+    with pytest.raises(SkillError, match=says):
+        evaluated(selector, NESTED, tmp_path)
+
+
+def test_goals_of_other_rows_may_be_anything(tmp_path):
+    def rule(obs):
+        goes = obs[:, 0] > 0
+        goals = np.where(goes[:, None], [200, 3], -1)
+        return np.where(goes, "go_to", "rest"), goals
+
+    assert len(evaluated(rule, BYTES, tmp_path).returns) == 2
+
+
+@pytest.mark.parametrize(
+    ("selector", "says"),
+    [
+        (
+            sw.Automaton({"a": ("go_to", (0.5, (0.5, 1)))}, {}),
+            "which are no goals of Box",
+        ),
+        (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
+        (sw.tree.Sequence(("go_to", lambda obs: None)), "returned None, but goals"),
+    ],
+)
+def test_goals_that_are_no_arrays(selector, says, tmp_path):
+    with pytest.raises(SkillError, match=says):
+        evaluated(selector, SPACES["box"], tmp_path)
+
+
+def test_goals_of_unequal_shapes(tmp_path):
+    """In one decision the environments are in different states."""
+    selector = sw.Automaton({"a": ("go_to", HERE), "b": ("go_to", (1.0, 2.0, 3.0))}, {})
+    skill = go_to()
+    run = declared([skill, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
+    ready = run.policy.selector
+    with pytest.raises(SkillError, match=r"gave goals of shape \(1, 3\) for skill 'go_to'"):
+        ready.act({"state": np.array([0, 1])}, np.zeros((2, 2), np.float32))

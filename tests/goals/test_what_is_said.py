@@ -20,9 +20,12 @@ from skillweave.spaces import obs_dtype
 @pytest.mark.parametrize(
     ("goals", "says"),
     [
-        (lambda self, obs, rng: obs[0], r"goals\(\) returned shape \(2,\), but \(4, 2\) was"),
+        (
+            lambda self, obs, rng: obs[0],
+            r"goals\(\) gave goals of shape \(2,\) for skill .* but \(4, 2\) was",
+        ),
         (lambda self, obs, rng: None, r"goals\(\) returned None"),
-        (lambda self, obs, rng: obs.astype(str), r"goals\(\) returned <U.*are numbers"),
+        (lambda self, obs, rng: obs.astype(str), r"goals\(\) gave goals of <U.*are numbers"),
         (lambda self, obs, rng: obs + 7, r"goals\(\) gave the goal .* out of goal_space Box"),
         (lambda self, obs, rng: obs * np.nan, r"goals\(\) gave the goal \[nan"),
         (lambda self, obs, rng: obs.no, r"goals\(\) raised AttributeError"),
