@@ -19,6 +19,8 @@ from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
+from skillweave.skills.goal_spaces import other_goals
+from skillweave.spaces import space_from_json
 from skillweave.training.plain_agent import PlainAgent, load_agent_of
 from skillweave.types import Policy
 
@@ -145,12 +147,21 @@ def _check_roles(roles: Roles, run: RunDirectory) -> None:
                 f"{run.path}: skill {path!r} is a hierarchy in the run or in "
                 "this declaration, not in both; declare it as it was trained"
             )
+        _check_goals(roles.skills[path], entry, f"{run.path}: skill {path!r}")
         if "hierarchy" in entry:
             entries[path] = entry["hierarchy"]
     for path, level in roles.levels.items():
         where = f"{run.path}: {path}" if path else str(run.path)
         check_selector(level.ready_selector is not None, SELECTOR in entries[path], where)
         _check_reflexes(level, entries[path], where)
+
+
+def _check_goals(skill: Skill, entry: Mapping[str, Any], who: str) -> None:
+    """Raise a RunError where a skill had other goals in its run."""
+    if skill.goal_space is None or "goal_space" not in entry:  # said where policies are fitted
+        return
+    if says := other_goals(space_from_json(entry["goal_space"]), skill.goal_space):
+        raise RunError(f"{who} {says}")
 
 
 def _check_reflexes(level: Level, entry: dict[str, Any], where: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from gymnasium import Space
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
@@ -24,6 +25,7 @@ from skillweave.runs.initial_policies import (
     same_shapes,
 )
 from skillweave.seeding import Seeds
+from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.skills.learnable import Learnable
 from skillweave.spaces import same_space
 from skillweave.training.role import Role
@@ -75,7 +77,8 @@ def starts(
                 _config_in(stage, name), role.observation_space, role.action_space
             )
             chooses = options_of(content, name)
-            _check_start(name, algorithm, chooses, learnt[name], places[name])
+            goal_space = None if role.skill is None else role.skill.goal_space
+            _check_start(name, algorithm, chooses, learnt[name], places[name], goal_space)
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 
@@ -226,7 +229,12 @@ def _learnt_by_name(
 
 
 def _check_start(
-    name: str, algorithm: Algorithm, chooses: Chooses, learnt: Learnt, where: Path | str
+    name: str,
+    algorithm: Algorithm,
+    chooses: Chooses,
+    learnt: Learnt,
+    where: Path | str,
+    goal_space: Space[Any] | None,
 ) -> None:
     """Raise a RunError where a learner cannot start from its policy in another run."""
     before = learnt.policy.algorithm
@@ -240,6 +248,10 @@ def _check_start(
         )
     elif not same_space(before.observation_space, algorithm.observation_space):
         what = "its observations are others here"
+    elif goal_space is not None and (
+        says := other_goals(goal_part(before.observation_space), goal_space)
+    ):
+        what = f"it {says}"
     elif not same_space(before.action_space, algorithm.action_space):
         what = "its actions are others here"
     elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):

@@ -19,7 +19,7 @@ from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
-from skillweave.skills.goal_spaces import goal_part, without_goal
+from skillweave.skills.goal_spaces import goal_part, other_goals, without_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.mapped import MappedPolicy
@@ -106,7 +106,11 @@ def _fitted(policy: Policy, role: Role, who: str) -> Policy:
     spaces = role.observation_space, role.action_space
     goals, seen = goals_of(role.skill), policy.observation_space
     sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
-    if goals is None or sees_goal:
+    if goals is None:
+        return fitted(policy, *spaces, who, role.spec.name)
+    if seen is not None and sees_goal:
+        if says := other_goals(goal_part(seen), goals.space):
+            raise PolicyError(f"{who}: its policy {says}")
         return fitted(policy, *spaces, who, role.spec.name)
     if not isinstance(policy, Foreign):
         raise PolicyError(

@@ -26,7 +26,7 @@ from skillweave.reading import fit, shown
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
-from skillweave.skills.goal_spaces import goal_part, with_goal, without_goal
+from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 
@@ -298,10 +298,5 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
                 )
         if goal_space is None:
             continue
-        recorded = goal_part(part.observation_space)
-        if recorded != goal_space:
-            raise RunError(
-                f"{where}: skill {path!r} was trained for goals of "
-                f"{shown(recorded)}, but now its goal_space is "
-                f"{shown(goal_space)}: declare goal_space as it was, or train again"
-            )
+        if says := other_goals(goal_part(part.observation_space), goal_space):
+            raise RunError(f"{where}: skill {path!r} {says}")

@@ -69,6 +69,8 @@ class SkillEntry(TypedDict):
     call_steps: NotRequired[AtLeastOne]
     ready: NotRequired[bool]
     policy: NotRequired[Source]
+    goal_space: NotRequired[dict[str, Any]]
+    """The space of its goals, if it has some."""
     hierarchy: NotRequired[NestedEntry]
     """Its parts, if the skill is a hierarchy."""
 

@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.messages import short
 from skillweave.types import Array
 
 OBSERVATION, GOAL = "observation", "goal"
@@ -33,6 +34,19 @@ def goal_part(observation_space: gym.Space[Any]) -> gym.Space[Any]:
     """Return the goal's part of a space of ``with_goal``."""
     assert isinstance(observation_space, gym.spaces.Dict)
     return observation_space[GOAL]
+
+
+def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
+    """Return the end of a message about a skill that was trained for other goals; "": the same.
+
+    Other bounds are other goals: they say which goals it practised.
+    """
+    if trained == declared:
+        return ""
+    return (
+        f"was trained for goals of {short(trained, 300)}, but now its goal_space is "
+        f"{short(declared, 300)}: declare goal_space as it was, or train again"
+    )
 
 
 SKILL = "skill"

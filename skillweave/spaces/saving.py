@@ -178,8 +178,9 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     """Return whether a policy for one space can act in the other: equal kind, shape and choices."""
     if type(a) is not type(b) or a.shape != b.shape:
         return False
-    if isinstance(a, ChoiceSpace) and isinstance(b, ChoiceSpace) and a.owners != b.owners:
-        return False
+    if isinstance(a, ChoiceSpace) and isinstance(b, ChoiceSpace):
+        # Of goals the bounds matter, too: what a network puts out is scaled by them.
+        return space_to_json(a) == space_to_json(b)
     inner, other = parts(a), parts(b)
     if inner is not None and other is not None:
         return (

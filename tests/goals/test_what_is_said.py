@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from worlds import ON, SMALL, SPACES, Point, Rest, declared, far_corner, go_to
+from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, far_corner, go_to
 
 import skillweave as sw
 from skillweave.collecting.judge import JudgedBy
@@ -98,11 +98,49 @@ def test_policies_from_elsewhere_take_the_goal(tmp_path):
             declared([skill()]).check_spaces()
 
 
+WIDER = gym.spaces.Box(-2, 2, (2,), np.float32)
+
+
+def wider(**attributes):
+    return type("GoTo", (GoTo,), {"goal_space": WIDER, **attributes})()
+
+
 def test_weights_of_another_goal_space_are_refused(tmp_path):
     run = declared().train(tmp_path / "run", quiet=True)
-    wider = type("GoTo", (type(go_to()),), {"goal_space": gym.spaces.Box(-2, 2, (2,), np.float32)})
-    with pytest.raises(RunError, match=r"'go_to' was trained for goals of Box\(-1.0, 1.0"):
+    says = r"was trained for goals of Box\(-1.0, 1.0.* now its goal_space is Box\(-2.0, 2.0"
+    with pytest.raises(RunError, match=f"'go_to' {says}"):
         sw.load(run.path, declared([wider()]))
+    before = (run.path / "run.json").read_bytes()
+    with pytest.raises(RunError, match=f"'go_to' {says}"):
+        declared([wider()], steps=400).train(run.path, resume=True, quiet=True)
+    assert (run.path / "run.json").read_bytes() == before
+    for start_from in (run.path, {"go_to": run.path}):
+        with pytest.raises(RunError, match=f"'go_to' cannot start .*: it {says}"):
+            declared([wider()]).train(tmp_path / "next", start_from=start_from, quiet=True)
+    trained = run.policy.skills.policies[0]
+    with pytest.raises(PolicyError, match=f"skill 'go_to': its policy {says}"):
+        declared([wider(policy=trained)]).check_spaces()
+    sw.save_policy(trained, tmp_path / "policy")
+    with pytest.raises(PolicyError, match=f"skill 'go_to': its policy {says}"):
+        declared([wider(policy=sw.load_policy(tmp_path / "policy"))]).check_spaces()
+
+
+def test_a_selector_of_other_goals_is_refused(tmp_path):
+    """Its skill is ready, so that only the selector has learnt."""
+
+    def walk(self, obs, goal):
+        return np.clip(goal - obs, -1, 1)
+
+    small = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=ON.network)
+    hierarchy = declared([go_to(policy=walk)], selector=small)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    other = declared([wider(policy=walk)], selector=small)
+    with pytest.raises(RunError, match="'go_to' was trained for goals of"):
+        sw.load(run.path, other)
+    with pytest.raises(RunError, match="'go_to' was trained for goals of"):
+        other.train(run.path, resume=True, quiet=True)
+    with pytest.raises(RunError, match=r"'selector' cannot start .*: its actions are others here"):
+        other.train(tmp_path / "next", start_from=run.path, quiet=True)
 
 
 def test_a_network_that_leaves_out_the_goal_is_refused():
