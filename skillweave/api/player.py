@@ -58,7 +58,7 @@ class Player:
         self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
         self._seed = seed
         self._rng = np.random.default_rng(seed)
-        self._goal: Any = None
+        self._goal: Array | None = None  # (1, …)
         self.reset(goal=goal)
 
     def reset(self, *, goal: Any = None) -> None:
@@ -69,14 +69,16 @@ class Player:
 
         Raises:
             DeclarationError: a goal is given to a policy that takes none.
+            SkillError: the goal is out of the skill's ``goal_space``; the goal before stays.
         """
-        self._goal = self._goal if goal is None else goal
         goals = getattr(self.policy, "goals", None)
-        if self._goal is not None and goals is None:
+        if goal is not None and goals is None:
             raise DeclarationError(
-                f"the goal {short(self._goal)} is given to a policy that takes none: name a skill "
+                f"the goal {short(goal)} is given to a policy that takes none: name a skill "
                 'with goals, run.player(skill="go_to", goal=...)'
             )
+        if goal is not None:
+            self._goal = goals.one(goal, "the player")
         self._needs_goal = goals is not None
         self.memory: Memory = self.policy.start(1)
         self._before: tuple[Array, Array] | None = None
@@ -124,12 +126,12 @@ class Player:
     def _choose_goal(self, seen: Array) -> None:
         """Set the goal of the episode that starts with an observation (1, …)."""
         alone: Any = self.policy
-        self._needs_goal = False
         if self._goal is None:
             alone.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
-            return
-        goal = alone.goals.one(self._goal)
-        self.memory["goal"] = alone.goals.stored(alone.goals.fitted(seen, goal, "the player"))
+        else:
+            goal = alone.goals.fitted(seen, self._goal.copy(), "the player")
+            self.memory["goal"] = alone.goals.stored(goal)
+        self._needs_goal = False  # only now: without its goal it must not act
 
     def _allowed(self, mask: Any) -> Array:
         """Return a mask as a batch of one."""

@@ -129,6 +129,10 @@ class Goals:
             goals = as_goals(
                 self._clipped(obs, goals, who), len(obs), self.space, who, self._who, kind
             )
+        return self._inside(goals, who, kind)
+
+    def _inside(self, goals: Array, who: str, kind: type[SkillweaveError]) -> Array:
+        """Return goals that are in the space."""
         if (row := outside(self.space, goals)) is not None:
             advice = "" if self.skill.defines("clip_goal") else f"; {ADVICE}"
             raise kind(_is_out(goals[row], self.space, who, self._who) + advice)
@@ -137,9 +141,17 @@ class Goals:
     def _clipped(self, obs: Array, goal: Array, who: str) -> Any:
         return called(lambda seen: self.skill.clip_goal(seen, read_only(goal)), read_only(obs), who)
 
-    def one(self, goal: Any) -> Any:
-        """Return one goal as a batch of one; it is not checked yet."""
-        return repeated(self.space, goal, 1)
+    def one(self, goal: Any, who: str) -> Array:
+        """Return a copy of one goal as a batch of one, checked.
+
+        Whether it is in the space is left to ``fitted`` where the skill clips goals, which needs
+        an observation.
+
+        Raises:
+            SkillError: it is none of the space; the message names ``who``.
+        """
+        goals = as_goals(repeated(self.space, goal, 1), 1, self.space, who, self._who).copy()
+        return goals if self.skill.defines("clip_goal") else self._inside(goals, who, SkillError)
 
     def flat(self, goal: Array) -> Array:
         """Return goals as numbers (n, G), for policies that take them so."""
@@ -219,7 +231,7 @@ def as_goals(
             f"{needed}"
         )
     if whole and goals.size:
-        low, high = (0, 1) if dtype == bool else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
         wrong = ((goals < low) | (goals > high)).reshape(len(goals), -1).any(axis=1)
         if wrong.any():
             raise kind(_is_out(goals[wrong.argmax()], space, who, skill) + "; give one in it")

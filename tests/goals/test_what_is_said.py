@@ -67,9 +67,80 @@ def test_a_player_takes_a_goal(tmp_path):
     player.reset(goal=(0.25, 0.0))
     assert np.allclose(player.act(np.zeros(2, np.float32)), (0.25, 0.0))
     with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
-        run.player(skill="go_to", goal=(5, 5)).act(np.zeros(2, np.float32))
+        run.player(skill="go_to", goal=(5, 5))
     with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
         run.player(goal=(0, 0))
+
+
+class Walk(Rest):
+    name = "go_to"
+    goal_space = SPACES["box"]
+
+    def policy(self, obs, goal):
+        return np.clip(goal - obs, -1, 1)
+
+
+ZERO = np.zeros(2, np.float32)
+
+
+@pytest.mark.parametrize("goal", [(5, 5), (1, 2, 3), "x", (0.1, (0.2, 0.3)), {"at": 1}, np.nan])
+def test_a_refused_goal_leaves_the_player_as_it_was(goal, tmp_path):
+    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
+    player = run.player(skill="go_to", goal=(0.5, -0.5))
+    player.act(ZERO)
+    with pytest.raises(SkillError, match="the player gave"):
+        player.reset(goal=goal)
+    assert np.allclose(player.act(ZERO), (0.5, -0.5))
+    player.reset()
+    assert np.allclose(player.act(ZERO), (0.5, -0.5))
+
+
+def test_a_player_never_acts_without_its_goal(tmp_path):
+    """Whether clip_goal moves a goal into the space shows where the episode starts."""
+
+    class Stuck(Walk):
+        name = "go_to"
+
+        def clip_goal(self, obs, goal):
+            return np.where(obs[:, :1] > 0, goal.clip(-1, 1), goal)
+
+    run = declared([Stuck()]).train(tmp_path / "run", quiet=True)
+    player = run.player(skill="go_to", goal=(5, 5))
+    for _ in range(2):
+        with pytest.raises(SkillError, match=r"clip_goal\(\) gave the goal \[5.0, 5.0\]"):
+            player.act(ZERO)
+    assert np.allclose(player.act(np.float32([0.5, 0])), (0.5, 1))
+
+
+def test_a_player_keeps_its_own_goal(tmp_path):
+    run = declared([Walk()]).train(tmp_path / "run", quiet=True)
+    goal = np.array([0.5, 0.5], np.float32)
+    player = run.player(skill="go_to", goal=goal)
+    goal[:] = 0.1
+    assert np.allclose(player.act(ZERO), 0.5)
+    goal[:] = -0.5
+    assert np.allclose(player.act(ZERO), 0.5)
+    player.reset()
+    assert np.allclose(player.act(ZERO), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("space", "goal", "says"),
+    [
+        ("picture", np.full((8, 8, 3), 300), "out of goal_space"),
+        ("bits", (257, 0), r"gave the goal \[257, 0\], which is out of goal_space MultiBinary"),
+        ("dict", {"at": (0, 0)}, "which are no goals of Dict"),
+        ("dict", {"at": (0, 5), "side": 1}, "out of goal_space"),
+        ("tuple", ((0, 0),), "which are no goals of Tuple"),
+        ("tuple", 3, "gave"),
+    ],
+)
+def test_a_player_says_which_goal_is_wrong(space, goal, says, tmp_path):
+    run = declared([go_to(space)], selector=sw.tree.Sequence(("go_to", 1))).train(
+        tmp_path / "run", quiet=True
+    )
+    with pytest.raises(SkillError, match=says):
+        run.player(skill="go_to", goal=goal)
 
 
 def test_policies_from_elsewhere_take_the_goal(tmp_path):
