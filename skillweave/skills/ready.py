@@ -10,6 +10,7 @@ from typing import Any
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.skills.base import Skill, is_trained
+from skillweave.skills.goal_spaces import GOAL
 from skillweave.skills.scripted import from_function, required_arguments
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -36,7 +37,7 @@ def ready_policy(skill: Skill) -> Policy | None:
     # A function in a class body becomes a method when it is looked up. It is a method if it needs
     # two arguments (``def policy(self, obs)``), and a function of obs if it needs one.
     bound = isinstance(value, MethodType) and value.__self__ is skill
-    if bound and not _is_method(value.__func__, skill.goal_space is not None):
+    if bound and not _is_method(value.__func__, skill):
         value = value.__func__
     if callable(value):
         return from_function(value)
@@ -46,16 +47,27 @@ def ready_policy(skill: Skill) -> Policy | None:
     )
 
 
-def _is_method(function: Any, with_goal: bool) -> bool:
+def _is_method(function: Any, skill: Skill) -> bool:
     """Return whether a function in a class body takes the skill as its first argument.
 
-    Args:
-        with_goal: it also takes a goal: ``policy(self, obs, goal)``, or ``policy(obs, goal)``.
+    Where the skill has goals, it also takes a goal: ``policy(self, obs, goal)``, or
+    ``policy(obs, goal)``.
+
+    Raises:
+        DeclarationError: the skill has goals, and it may be ``(self, obs)`` or ``(obs, goal)``.
     """
-    if not with_goal:
-        return required_arguments(function) >= 2
+    required = required_arguments(function)
+    if skill.goal_space is None:
+        return required >= 2
     try:
         names = list(inspect.signature(function).parameters)
     except (TypeError, ValueError):  # of some functions written in C
         return False
-    return names[:1] == ["self"] or required_arguments(function) >= 3
+    if names[:1] == ["self"] or required >= 3:
+        return True
+    if required == 2 and GOAL not in names:
+        raise DeclarationError(
+            f"skill {skill.name!r}: its policy takes ({', '.join(names)}), which may be (self, "
+            "obs) or (obs, goal): give the parameters these names, policy(self, obs, goal)"
+        )
+    return required == 2 and names.index(GOAL) > 1

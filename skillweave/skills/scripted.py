@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,9 +41,10 @@ class ScriptedPolicy(MappedPolicy):
         mapping: PolicyMapping | None = None,
     ) -> None:
         self.function = function
-        self._with_goal = False
+        # How it takes a skill's goal: by the name goal, or as its second argument; None: not.
+        self._with_goal: Literal["goal", "second"] | None = None
         if mapping is None or not (mapping.sees or mapping.state):
-            self._with_goal = required_arguments(function) > 1
+            self._with_goal = _takes_goal(function)
         name = getattr(function, "__name__", type(function).__name__)
         super().__init__(f"function {name}()", observation_space, action_space, mapping)
 
@@ -92,24 +93,28 @@ class ScriptedPolicy(MappedPolicy):
     @property
     def takes_goal(self) -> bool:
         """Return whether the goal of a skill is an argument or an input of it."""
-        return self._with_goal or super().takes_goal
+        return self._with_goal is not None or super().takes_goal
 
-    advice = "let the function take it, policy(obs, goal), or write Goal() at its place in sees"
+    advice = (
+        "let the function take it by this name, policy(obs, goal), or write Goal() at its place in "
+        "sees"
+    )
 
     def split(self, obs: Array) -> tuple[Array, Array | None]:
         """Return observations and goals for its inputs; a function takes both from the whole."""
-        return (obs, None) if self._with_goal else super().split(obs)
+        return (obs, None) if self._with_goal is not None else super().split(obs)
 
     def _actions(self, given: Array) -> Array:
         """Return what the function makes of its only input."""
         who, function = self._who, self.function
-        if self._with_goal and self._goals is not None:
-            action = called(
-                lambda seen: function(read_only(seen[OBSERVATION]), read_only(seen[GOAL])),
-                given,
-                who,
-                kind=PolicyError,
-            )
+        if self._with_goal is not None and self._goals is not None:
+            by_name = self._with_goal == GOAL
+
+            def both(seen: Array) -> Any:
+                obs, goal = read_only(seen[OBSERVATION]), read_only(seen[GOAL])
+                return function(obs, goal=goal) if by_name else function(obs, goal)
+
+            action = called(both, given, who, kind=PolicyError)
             return as_array(action, who, PolicyError)
         action = as_array(called(function, given, who, kind=PolicyError), who, PolicyError)
         mapping = self.mapping
@@ -126,6 +131,29 @@ class ScriptedPolicy(MappedPolicy):
     def source(self) -> dict[str, Any]:
         """Return the function's name, and the mapping."""
         return super().source() | {"name": qualified(self.function)}
+
+
+def _takes_goal(function: Any) -> Literal["goal", "second"] | None:
+    """Return how a function of observations takes a goal, too; None: it does not.
+
+    A second parameter with a default, and of another name, is no goal: ``scale=2.0``.
+    """
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of some functions written in C
+        return None
+    kinds = {p.kind for p in parameters}
+    if any(p.name == GOAL and p.kind in _BY_NAME for p in parameters):
+        return "goal"
+    if required_arguments(function) > 1 or inspect.Parameter.VAR_POSITIONAL in kinds:
+        return "second"
+    second = list(parameters)[1:2]
+    if second and second[0].name == GOAL:  # to be given by its place alone
+        return "second"
+    return "goal" if inspect.Parameter.VAR_KEYWORD in kinds else None
+
+
+_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 
 def required_arguments(function: Any) -> int:

@@ -176,6 +176,79 @@ def wider(**attributes):
     return type("GoTo", (GoTo,), {"goal_space": WIDER, **attributes})()
 
 
+def constant(obs):
+    return np.full((len(obs), 2), 0.1)
+
+
+def chosen(obs, goal):
+    return constant(obs) if goal is None else constant(obs) * 0 + goal
+
+
+class Called:
+    def __call__(self, obs, goal=None):
+        return chosen(obs, goal)
+
+
+class Methods:
+    def default(self, obs, goal=None):
+        return chosen(obs, goal)
+
+    def place(self, obs, goal=(0.8, 0.8)):
+        return chosen(obs, goal)
+
+    def by_name(self, obs, *, goal):
+        return chosen(obs, goal)
+
+    def later(self, obs, scale=1.0, goal=None):
+        return chosen(obs, goal) * scale
+
+    def any_number(self, *given):
+        return chosen(*given)
+
+    def any_name(self, obs, **given):
+        return chosen(obs, given.get("goal"))
+
+    def other_self(skill, obs, goal=None):
+        return chosen(obs, goal)
+
+    def by_place(self, obs, goal=None, /):
+        return chosen(obs, goal)
+
+
+TAKE_GOALS = {
+    **{k: v for k, v in vars(Methods).items() if not k.startswith("_")},
+    "function": lambda obs, goal=None: chosen(obs, goal),
+    "function, later": lambda obs, scale=1.0, goal=None: chosen(obs, goal) * scale,
+    "static": staticmethod(lambda obs, goal=None: chosen(obs, goal)),
+    "static, other names": staticmethod(lambda o, g: chosen(o, g)),
+    "object": Called(),
+    "from_function": sw.from_function(lambda obs, goal=None: chosen(obs, goal)),
+}
+
+
+@pytest.mark.parametrize("name", TAKE_GOALS)
+def test_functions_get_the_goal_where_a_parameter_takes_it(name, tmp_path):
+    skill = go_to(policy=TAKE_GOALS[name])
+    run = declared([skill]).train(tmp_path / "run", quiet=True)
+    player = run.player(skill="go_to", goal=(0.5, -0.5))
+    assert np.allclose(player.act(ZERO), (0.5, -0.5))
+
+
+@pytest.mark.parametrize(
+    ("policy", "kind", "says"),
+    [
+        (lambda self, obs: constant(obs), PolicyError, r"takes no goal.*policy\(obs, goal\)"),
+        (lambda self, obs, scale=2.0: constant(obs), PolicyError, "takes no goal"),
+        (lambda obs, scale=2.0: constant(obs), PolicyError, "takes no goal"),
+        (lambda s, o: constant(o), DeclarationError, r"takes \(s, o\), which may be"),
+        (lambda s, o, g=None: constant(o), DeclarationError, r"takes \(s, o, g\), which may be"),
+    ],
+)
+def test_functions_that_cannot_take_the_goal_are_refused(policy, kind, says):
+    with pytest.raises(kind, match=says):
+        declared([go_to(policy=policy)]).check_spaces()
+
+
 def test_weights_of_another_goal_space_are_refused(tmp_path):
     run = declared().train(tmp_path / "run", quiet=True)
     says = r"was trained for goals of Box\(-1.0, 1.0.* now its goal_space is Box\(-2.0, 2.0"
