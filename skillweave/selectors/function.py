@@ -6,12 +6,19 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Dict, Discrete
 
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillError
-from skillweave.selectors.base import ReadySelector, function_name, listed, shown_obs
+from skillweave.messages import short
+from skillweave.selectors.base import (
+    ReadySelector,
+    function_name,
+    listed,
+    shown_obs,
+    skill_and_goal,
+)
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.goals import as_goals
 from skillweave.skills.outputs import as_array, called, checked_actions
@@ -24,8 +31,8 @@ class FunctionSelector(ReadySelector):
     """A function from observations (n, *obs_shape) to skills (n,): names, or places in the list.
 
     If it needs a second argument, that is the ``LastCall``. Where skills have goals, it returns
-    skills and goals: ``(names, goals)``, the goals (n, *goal_shape), or a dict of such arrays by
-    skill where several have goals. They count where the skill is chosen.
+    skills and goals: ``(names, goals)``, the goals (n, *goal_shape), or a dict of such goals by
+    skill where several have some. They count where the skill is chosen.
 
     Raises:
         SkillError: when it acts: the function failed, or chose an unknown skill, or a skill that
@@ -67,14 +74,25 @@ class FunctionSelector(ReadySelector):
         else:
             value = called(function, read_only(obs), self._who)
             arguments = obs
-        goals = None
-        if isinstance(value, tuple) and len(value) == 2 and _are_goals(value[1]):
+        goals, given = None, value
+        if is_other := _is_other_form(value):
+            value = None
+        elif isinstance(value, tuple) and len(value) == 2 and _are_goals(value[1]):
             value, goals = value
-            if not self.goal_spaces:
-                raise SkillError(
-                    f"{self._who} returned skills and goals, but no skill that it selects has "
-                    "goals: set goal_space in the skill's class, or return the skills alone"
-                )
+        if (is_other or goals is not None) and not self.goal_spaces:
+            raise SkillError(
+                f"{self._who} returned skills and goals, but no skill that it selects has "
+                "goals: set goal_space in the skill's class, or return the skills alone"
+            )
+        try:
+            chosen = np.asarray(value)
+        except ValueError:  # of parts of unequal lengths
+            is_other = bool(self.goal_spaces)
+        if is_other:
+            raise SkillError(
+                f"{self._who} returned {short(given)}: return (names, goals), one of each per "
+                "environment"
+            )
         chosen = as_array(value, self._who)
         if chosen.dtype.kind in "UO" and chosen.shape == (len(obs),):
             numbers = [self._number(name, self._who, SkillError) for name in chosen.tolist()]
@@ -93,6 +111,10 @@ class FunctionSelector(ReadySelector):
         names = list(self.goal_spaces)
         if goals is None:
             return {}
+        # Of a Dict a dict has the parts of goals where none of its keys is a skill.
+        space = self.goal_spaces[names[0]] if len(names) == 1 else None
+        if isinstance(space, Dict) and isinstance(goals, Mapping):
+            goals = goals if set(goals) & set(self.skills) else {names[0]: goals}
         if not isinstance(goals, Mapping):
             if len(names) > 1:
                 raise SkillError(
@@ -143,7 +165,18 @@ class FunctionSelector(ReadySelector):
 
 
 def _are_goals(value: Any) -> bool:
-    """Return whether the second of two values is goals: arrays, or a dict of them."""
+    """Return whether the second of two values is goals: arrays, or a dict or tuple of them."""
     if isinstance(value, np.ndarray):
         return value.ndim > 0
-    return isinstance(value, Mapping | list)
+    return isinstance(value, Mapping | list | tuple)
+
+
+def _is_other_form(value: Any) -> bool:
+    """Return whether skills and goals are paired otherwise than as ``(names, goals)``."""
+    if isinstance(value, tuple) and len(value) == 2:
+        first, second = value
+        if second is None or (isinstance(first, str) and not isinstance(second, str)):
+            return True
+    return isinstance(value, list | tuple) and any(
+        skill_and_goal(pair)[1] is not None for pair in value
+    )

@@ -347,3 +347,71 @@ def test_goals_of_unequal_shapes(tmp_path):
     ready = run.policy.selector
     with pytest.raises(SkillError, match=r"gave goals of shape \(1, 3\) for skill 'go_to'"):
         ready.act({"state": np.array([0, 1])}, np.zeros((2, 2), np.float32))
+
+
+AT = {"at": (0.5, -0.5), "byte": (1, 2)}
+
+
+def rows_of(goal, n):
+    return {name: np.tile(part, (n, 1)) for name, part in goal.items()}
+
+
+@pytest.mark.parametrize(
+    "goals", [lambda n: rows_of(AT, n), lambda n: {"go_to": rows_of(AT, n)}], ids=["bare", "named"]
+)
+def test_a_function_gives_goals_of_a_dict(goals, tmp_path):
+    rule = lambda obs: (["go_to"] * len(obs), goals(len(obs)))  # noqa: E731
+    skill = go_to()
+    type(skill).goal_space = NESTED
+    type(skill).reward = lambda self, step: step.goal["at"].sum(1)
+    type(skill).termination = type(skill).success = lambda self, step: step.goal["at"][:, 0] > 9
+    run = declared([skill, Rest()], selector=rule).train(tmp_path / "run", quiet=True)
+    player = run.player()
+    player.act(np.zeros(2, np.float32))
+    goal = run.policy.goal_now(player.memory)
+    assert np.allclose(goal["at"], AT["at"])
+    assert goal["byte"].tolist() == [1, 2]
+
+
+def test_a_function_gives_goals_of_a_tuple(tmp_path):
+    rule = lambda obs: (["go_to"] * len(obs), (obs / 4, np.ones(len(obs), int)))  # noqa: E731
+    skills = [go_to("tuple"), Rest()]
+    run = declared(skills, selector=rule).train(tmp_path / "run", quiet=True)
+    player = run.player()
+    player.act(np.ones(2, np.float32))
+    goal = run.policy.goal_now(player.memory)
+    assert np.allclose(goal["0"], 0.25)
+    assert goal["1"] == 1
+
+
+def test_parts_of_goals_that_are_missing_are_said(tmp_path):
+    rule = lambda obs: (["go_to"] * len(obs), {"at": obs, "bite": obs})  # noqa: E731
+    with pytest.raises(SkillError, match="which are no goals of Dict"):
+        evaluated(rule, NESTED, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        lambda obs: ("go_to", HERE),
+        lambda obs: ("go_to", np.array(HERE)),
+        lambda obs: [("go_to", HERE) for _ in obs],
+        lambda obs: tuple(("go_to", HERE) for _ in obs),
+        lambda obs: [("go_to", HERE), *["rest"] * (len(obs) - 1)],
+        lambda obs: (["go_to"] * len(obs), None),
+        lambda obs: (["go_to"] * len(obs), obs / 4, 1),
+    ],
+)
+def test_another_form_of_skills_and_goals(rule, tmp_path):
+    with pytest.raises(SkillError, match=r"return \(names, goals\), one of each per environment"):
+        evaluated(rule, SPACES["box"], tmp_path)
+    with pytest.raises(
+        SkillError, match=r"no skill that it selects has goals|names 'go_to'|no arr"
+    ):
+        declared([Rest()], selector=rule).check_spaces()
+
+
+@pytest.mark.parametrize("names", [("rest", "rest"), (1, 1), (np.str_("rest"), np.str_("rest"))])
+def test_a_tuple_of_two_skills_is_no_skill_with_a_goal(names):
+    two = lambda obs: names if len(obs) == 2 else list(names)[:1] * len(obs)  # noqa: E731
+    declared([go_to(), Rest()], selector=two).check_spaces()
