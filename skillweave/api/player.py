@@ -71,7 +71,7 @@ class Player:
             DeclarationError: a goal is given to a policy that takes none.
             SkillError: the goal is out of the skill's ``goal_space``; the goal before stays.
         """
-        goals = getattr(self.policy, "goals", None)
+        goals: Any = getattr(self.policy, "goals", None)
         if goal is not None and goals is None:
             raise DeclarationError(
                 f"the goal {short(goal)} is given to a policy that takes none: name a skill "
