@@ -390,8 +390,9 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
         entry, features = self.entry, self.features()
         (pieces, weights, far, total), (places, share) = self.near(features), self.corners()
         q = ((self.data["worth"][pieces][..., places] * share).sum(2) * weights).sum(1)
-        q = np.where(q > 0, q / (1 + entry["caution"] * far), q)
-        q = np.where(np.isfinite(far), q, -np.inf).astype("f4")
+        known = np.isfinite(far)
+        q = np.where(q > 0, q / (1 + entry["caution"] * np.where(known, far, 0.0)), q)
+        q = np.where(known, q, -np.inf).astype("f4")
         may = np.ones(len(q), bool) if mask is None else mask[0]
         here = SimpleNamespace(
             end=features, to=places[share.argmax()], q=q, total=total, far=far, may=may

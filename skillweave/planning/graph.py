@@ -290,7 +290,7 @@ class CallGraph:
         """
         count = judged.reward.shape[1]
         value = np.zeros((len(self.end), count), np.float32)
-        trust = 1.0 / (1.0 + caution * near.distance)
+        trust = trust_in(near.distance, caution)
         choices = [c for c in range(self.log.choices) if self.known[c] or novel is not None]
         for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
             worth = self._worth(judged, value)
@@ -383,3 +383,10 @@ def _by_depth(then: Array) -> list[Array]:
     order = rows[np.argsort(depth[rows], kind="stable")]
     bounds = np.flatnonzero(np.diff(depth[order])) + 1
     return [part for part in np.split(order, bounds) if len(part)]
+
+
+def trust_in(distance: Array, caution: float) -> Array:
+    """Return the share of a value that is left at these distances; infinite ones have no call."""
+    known = np.where(np.isinf(distance), np.finfo(np.float32).max, distance)
+    trust: Array = 1.0 / (1.0 + caution * known)
+    return trust

@@ -20,7 +20,7 @@ from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.graph import CallGraph, Near
+from skillweave.planning.graph import CallGraph, Near, trust_in
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
@@ -212,7 +212,7 @@ class Planner(ReadySelector):
         # (n, choices, K, J): the worth of each neighbour at each corner.
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
-        q = np.where(q > 0, q / (1.0 + self.caution * near.distance), q)
+        q = np.where(q > 0, q * trust_in(near.distance, self.caution), q)
         return np.where(self.graph.known, q, -np.inf).astype(np.float32)
 
     def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -485,6 +485,10 @@ def test_a_skill_without_a_call_is_never_called(log: CallLog) -> None:
     with pytest.warns(UserWarning, match="no call of 'wait', so the planner never calls it"):
         planner = Planner(some, has_key)
     assert planner.values(log.start[:5])[:, 3].tolist() == [-np.inf] * 5
+    with pytest.warns(UserWarning, match="never calls it"):
+        bold = Planner(some, has_key, caution=0.0)
+    assert bold.values(log.start[:5])[:, 3].tolist() == [-np.inf] * 5
+    assert np.isfinite(bold.values(log.start[:5])[:, :3]).all()
 
 
 def test_a_log_that_does_not_lead_there_says_so(log: CallLog) -> None:
