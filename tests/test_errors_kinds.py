@@ -327,7 +327,7 @@ MISTAKES: dict[str, dict[str, Callable[..., Any]]] = {
         "a module of other observations": lambda: play(ready(sw.from_torch(linear()))),
         "a function that raises": lambda: play(ready(lambda obs: 1 / 0)),
         "a function that returns no action": lambda: play(ready(lambda obs: np.full(len(obs), 7))),
-        "a zip that is not trusted": lambda: sw.from_sb3("x.zip", "ppo"),
+        "a zip that is not trusted": lambda: sw.from_sb3(__file__, "ppo"),
         "a policy in another environment": lambda: sw.evaluate(agent().policy, Far, episodes=1),
     },
     "TrainingError": {

@@ -66,7 +66,10 @@ def agent_of(learnable, config, env):
 def test_it_acts_as_the_model_does(kind):
     env = World(action=DISCRETE if kind in ("DQN", "A2C") else None)
     model = model_of(kind, env)
+    if kind == "A2C":
+        model.policy.action_net.weight.data.mul_(100)  # fresh logits are nearly equal
     agent = agent_of(sw.from_sb3(model, learn=True), SMALL[LEARNS_BY[kind]], env)
+    env.observation_space.seed(0)
     obs = np.stack([env.observation_space.sample() for _ in range(100)])
     actions, _ = agent.act(agent.start(100), obs)
     np.testing.assert_allclose(actions, model.predict(obs, deterministic=True)[0], atol=1e-5)
@@ -85,6 +88,8 @@ def test_it_acts_as_the_model_does(kind):
 def test_observations_of_other_kinds(space):
     env = World(space, gym.spaces.MultiDiscrete([3, 4]))
     model = model_of("PPO", env)
+    model.policy.action_net.weight.data.mul_(100)  # fresh logits are nearly equal
+    space.seed(0)
     agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
     obs = np.stack([space.sample() for _ in range(50)])
     actions, _ = agent.act(agent.start(50), obs)
@@ -97,6 +102,8 @@ def test_dict_observations():
     )
     env = World(space, DISCRETE)
     model = sb3.PPO("MultiInputPolicy", env, seed=3, device="cpu")
+    model.policy.action_net.weight.data.mul_(100)  # fresh logits are nearly equal
+    space.seed(0)
     agent = agent_of(sw.from_sb3(model, learn=True), SMALL["PPO"], env)
     rows = [space.sample() for _ in range(50)]
     obs = {k: np.stack([r[k] for r in rows]) for k in space.spaces}
