@@ -150,7 +150,7 @@ class Cells:
         return self._play(planned.policy, task), log.steps
 
     def _trained(self, task: NewTask, steps: int, path: Path) -> tuple[Evaluation, int]:
-        """Train a selector, or finish one that was begun."""
+        """Train a selector, or finish one that was stopped."""
         hierarchy = self.family.over(task, self.skills(), apart=Apart(selector_steps=steps))
         return self._score(trained(hierarchy, path, self.seed)), steps
 

@@ -131,7 +131,7 @@ def _go_on(
     quiet: bool,
     callback: Callback | None,
 ) -> Trained[D]:
-    """Finish a repair that was stopped, with the steps that it was begun with."""
+    """Finish a repair that was stopped, with the steps that it was started with."""
     if run_dir is None:
         raise DeclarationError(
             "resume=True continues a repair, so name its directory: "
@@ -147,7 +147,7 @@ def _go_on(
     budget = next(e["budget"] for e in reversed(run.manifest["stages"]) if "repair" in e)
     if steps not in (None, budget):
         raise DeclarationError(
-            f"steps is {steps:,}, but this repair was begun with {budget:,}: leave out steps"
+            f"steps is {steps:,}, but this repair was started with {budget:,}: leave out steps"
         )
     return go_on(
         apply_manifest(declared, run), run, quiet, None, None, callback=callback, done=done

@@ -253,12 +253,13 @@ def chain(
         follows = (weights_of(distance) * chance[near]).sum(1)
         may = log.may_follow[rows[i]].reshape(len(rows[i]), len(log.skills), -1)
         goes_on = won[rows[i]] & ~log.terminated[rows[i]]
-        if goes_on.any() and not (goes_on & may[:, numbers[i + 1]].any(1)).any():
+        follows_on = goes_on & may[:, numbers[i + 1]].any(1)
+        if goes_on.any() and not follows_on.any():
             raise RunError(
                 f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was done "
                 "(its initiation() is False there), so this chain cannot be run"
             )
-        chance = np.where(goes_on & may[:, numbers[i + 1]].any(1), follows, 0.0)
+        chance = np.where(follows_on, follows, 0.0)
     matrix = hand_over(log, done)
     pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
     rates = tuple(rate for rate, _ in pairs)

@@ -217,13 +217,13 @@ def _play(
     """
     n, feed, goals = engine.num_envs, TraceFeed([recorder]), goals_in(recorder.skills)
     seeds: list[int] = []
-    begun = np.zeros(n, np.int64)  # episodes of each environment
+    started = np.zeros(n, np.int64)  # episodes of each environment
 
     def begin(rows: Array) -> Array:
         """Begin episodes in environments ``rows``; return observations."""
-        each = [episode_seed(seed, i, int(begun[i])) for i in rows.tolist()]
-        fresh = not begun.any()
-        begun[rows] += 1
+        each = [episode_seed(seed, i, int(started[i])) for i in rows.tolist()]
+        fresh = not started.any()
+        started[rows] += 1
         if isinstance(engine, GymnasiumEngine):
             seeds.extend(each)
             return engine.reset_some(rows, each)
@@ -240,7 +240,7 @@ def _play(
         turn.age[rows] += 1
         step = raw.seen(here, action, turn.age[rows])
         end = player.observe(memory, rows, step)
-        feed.add(rows, step, {"": calls_in({k: v[rows] for k, v in memory.items()}, goals)})
+        feed.add(rows, step, {"": {k: v[rows] for k, v in calls_in(memory, goals).items()}})
         made += len(rows)
         obs[rows] = raw.next_obs
         over = rows[raw.terminated | raw.truncated]

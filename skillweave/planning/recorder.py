@@ -71,7 +71,7 @@ class Recorder:
         path: of the level, "" or ``inner`` for example.
         above: the place of each skill that is a hierarchy on the way to the level, by the path of
             the level that it is in.
-        latest: keep so many steps at least, and forget those before; None: keep all.
+        latest: the number of latest steps to keep at least; None: keep all.
         own_rewards: compute each step by the skill's own reward, too, for ``own_returns``.
         inside: keep the observations inside of calls.
 
@@ -96,8 +96,7 @@ class Recorder:
         self.path, self._above = path, dict(above or {})
         self._columns = f"{path}/" if path else ""
         self._own_rewards, self._inside = own_rewards, inside
-        every = ((skill.name, goals_of(skill)) for skill in skills.skills)
-        self.goals = {name: goals for name, goals in every if goals is not None}
+        self.goals: dict[str, Goals] = dict(goals_in(skills).values())
         """The goals of skills that have some, by name."""
         self.steps = 0
         """Steps that are kept."""
@@ -336,13 +335,13 @@ class Recorder:
         inside = inside[np.argsort(steps[0][inside], kind="stable")]
         by_call = np.argsort(ends[0], kind="stable")
         by_call = by_call[np.isin(ends[0][by_call], known)]
-        begun = np.searchsorted(starts[0], known)
+        first = np.searchsorted(starts[0], known)
         kept = steps if self._inside else (*steps[:1], *steps[2:])
         taken = [column[inside] for column in kept]
         if not self._inside:
             taken.insert(1, steps[1])
         return (
-            tuple(column[begun] for column in starts),
+            tuple(column[first] for column in starts),
             tuple(taken),
             tuple(column[by_call] for column in ends),
         )

@@ -100,7 +100,7 @@ class Tried:
         return _put(memory, new, rows, slot)
 
     def _called(self, choice: Array, steps: Array, last: LastCall) -> Array:
-        """Return the choices (n,) that the calls are of, after so many of their steps."""
+        """Return the choices (n,) that the calls are of, after this number of their steps."""
         other = self._skill_of[np.maximum(choice, 0)] != last.skill
         if not len(self._lengths):
             return np.where(other, last.skill, choice)
