@@ -157,6 +157,19 @@ def test_a_cell_of_the_matrix_shows_its_calls(film: Any) -> None:
             assert clip["from"] <= at * cells["film"]["fps"] <= clip["to"] + 1
 
 
+def test_a_film_that_is_paused_before_it_plays_says_nothing(film: Any) -> None:
+    film.locator("#pairs button").first.click()
+    film.evaluate(
+        """() => {
+            const video = document.getElementById("pair-video");
+            video.load();
+            document.querySelector("#pair-clips button").click();
+            video.pause();
+        }"""
+    )
+    film.wait_for_timeout(200)
+
+
 def test_the_film_jumps_to_the_call_that_is_clicked(film: Any) -> None:
     for place, first in ((0, 0), (1, 5 + HOLD)):
         for i, (skill, start, steps, *_) in enumerate(CALLS):

@@ -10,6 +10,10 @@
     return element;
   };
   const plain = (x) => x.toLocaleString("en", { maximumSignificantDigits: 4 }).replace("-", "−");
+  // A pause that comes before the first picture rejects play(): nothing is wrong then.
+  const play = (video) => video.play().catch((error) => {
+    if (error.name !== "AbortError") throw error;
+  });
   const signed = (x) => (x > 0 ? "+" : "") + plain(x);
 
   // Charts
@@ -170,7 +174,7 @@
       if (!video) return;
       $("pair-clips").replaceChildren(...clips.map((c, i) => {
         const button = make("button", { type: "button" }, `${c.done ? "done" : "not done"}, ${c.steps} steps`);
-        button.addEventListener("click", () => { show(i); video.play(); });
+        button.addEventListener("click", () => { show(i); play(video); });
         return button;
       }));
       video.pause();
@@ -278,7 +282,7 @@
     const at = chosen.episode === place ? chosen.call : 0;
     const to = { ArrowLeft: at - 1, ArrowRight: at + 1, ArrowUp: at - 1, ArrowDown: at + 1, Home: 0, End: last }[event.key];
     if (to !== undefined) choose(place, Math.min(Math.max(to, 0), last));
-    else if ((event.key === " " || event.key === "Enter") && video) video.paused ? video.play() : video.pause();
+    else if ((event.key === " " || event.key === "Enter") && video) video.paused ? play(video) : video.pause();
     else return;
     event.preventDefault();
   };
