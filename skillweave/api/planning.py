@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave.algorithms.config import PPO
@@ -30,6 +29,7 @@ from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
 from skillweave.seeding import Seeds
+from skillweave.skills.goal_spaces import choice_space
 from skillweave.training.imitation import imitate
 from skillweave.types import Policy
 
@@ -45,8 +45,10 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     """
     assert isinstance(policy, HierarchyPolicy)
     skills = replace(policy.skills, interruption=None)
-    spaces = policy.selector.observation_space, gym.spaces.Discrete(skills.choices)
-    selector: Any = planner.among(tuple(s.name for s in skills.skills)).bind(*spaces, SELECTOR)
+    names = tuple(s.name for s in skills.skills)
+    goals = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
+    spaces = policy.selector.observation_space, choice_space(skills.choices, goals, names)
+    selector: Any = planner.among(names).bind(*spaces, SELECTOR)
     hierarchy = copy.copy(declared)
     spec = untasked(declared.spec)
     hierarchy.env = tasked(spec, planner)

@@ -27,6 +27,7 @@ class Explorer(Memoryless):
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the
     most that can be, 1; other calls are worth what they lead to (R-max: Brafman & Tennenholtz
     2002). It plans again on the calls so far every ``every`` steps, and chooses at random before.
+    Of a skill with goals, a new call has a goal that its ``goals`` draws.
 
     It looks for novelty alone: no task counts, and the value 1 has no unit.
 
@@ -85,8 +86,8 @@ class Explorer(Memoryless):
         self._graph, self._worth = graph, worth[:, 0]
 
     def _radius_of(self, graph: CallGraph) -> Array:
-        """Return the distance from which on each choice is new, (choices,) float32."""
-        sizes = np.array([graph.maps[skill].size for skill in graph.skill_of])
+        """Return the distance from which on each option is new, (O,) float32."""
+        sizes = np.array([each.size for each in graph.maps])[graph.skill_of[graph.choice_of]]
         own = PER_FEATURE * np.sqrt(sizes) if self._radius is None else self._radius
         return np.broadcast_to(np.float32(own), sizes.shape)
 
@@ -94,7 +95,8 @@ class Explorer(Memoryless):
         """Return the share of (end of a call, choice) pairs that are new; 1 before planning."""
         if self._graph is None:
             return 1.0
-        return float((self._graph.after.distance > self._far)[self._graph.may].mean())
+        may = self._graph.may[:, self._graph.choice_of]
+        return float((self._graph.after.distance > self._far)[may].mean())
 
     def act(
         self,
@@ -106,13 +108,35 @@ class Explorer(Memoryless):
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
         """Return choices (n,), sampled."""
+        return self.decide(obs, mask, rng)[0], memory
+
+    def decide(
+        self, obs: Array, mask: Array | None, rng: np.random.Generator | None
+    ) -> tuple[Array, dict[str, tuple[Array, Array]]]:
+        """Return choices (n,), and goals of logged calls that are made again.
+
+        Returns:
+            Choices, and by skill with goals the rows (k,) with the numbers of their goals (k, G).
+            All other calls are new, and need new goals.
+        """
         rng = rng or np.random.default_rng()
-        if self._graph is None:
+        graph = self._graph
+        if graph is None:
             score = rng.random((len(obs), self._choices))
-            return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), memory
-        near = self._graph.near(obs)
+            return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), {}
+        near = graph.near(obs)
         q = (self._worth[near.pieces] * near.weights).sum(2)
-        q = np.where(near.distance > self._far, 1.0, q)
+        is_new = near.distance > self._far
+        q = np.where(is_new, 1.0, q)
         largest = np.maximum(np.abs(q).max(1, keepdims=True), 1e-3)
         score = q / (self._temperature * largest) + rng.gumbel(size=q.shape)
-        return (score if mask is None else np.where(mask, score, -np.inf)).argmax(1), memory
+        if mask is not None:
+            score = np.where(mask[:, graph.choice_of], score, -np.inf)
+        rows, option = np.arange(len(obs)), score.argmax(1)
+        choice, call = graph.choice_of[option], near.goal[rows, option]
+        again = (call >= 0) & ~is_new[rows, option]
+        goals = {}
+        for name, numbers in graph.log.goals.items():
+            mine = np.flatnonzero(again & (graph.skill_of[choice] == graph.log.number(name)))
+            goals[name] = mine, numbers[call[mine]]
+        return choice, goals

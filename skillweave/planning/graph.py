@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
@@ -23,6 +24,8 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
 from skillweave.planning.neighbours import (
+    BLOCK,
+    CONSTANT,
     SOFT,
     compared_places,
     feature_maps,
@@ -38,6 +41,10 @@ MOST_PIECES = 10_000
 """The most pieces of a graph; of a longer log they have more steps."""
 MOST_CALLS = 20_000
 """The most calls of a graph; of more, every so-many-th is used."""
+CANDIDATES = 32
+"""The nearest calls of a skill with goals, whose goals are the options."""
+MOST_APART = 64
+"""Goals up to which each is an option of its own everywhere, as another skill would be."""
 MOST_SWEEPS = 2_000
 TOLERANCE = 1e-4
 """Value iteration ends where no value changes by more than this share of the largest."""
@@ -45,20 +52,26 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class Near:
-    """The nearest pieces of each choice to n observations, each of another call."""
+    """The nearest pieces of each option to n observations, each of another call.
+
+    An option is a choice; of a skill with goals, a choice with one of the logged goals.
+    """
 
     pieces: Array
-    """(n, choices, K) int64."""
+    """(n, O, K) int64."""
     weights: Array
-    """(n, choices, K) float32, they add up to 1 for each choice."""
+    """(n, O, K) float32, they add up to 1 for each option."""
     distance: Array
-    """(n, choices) float32, to the nearest."""
+    """(n, O) float32, to the nearest."""
     total: Array
-    """(n, choices) float32, the sum of the weights before they were normalised."""
+    """(n, O) float32, the sum of the weights before they were normalised."""
+    goal: Array
+    """(n, O) int64, the call whose goal the option has; −1: it has none."""
 
     def take(self, rows: Array) -> Near:
         """Return the neighbours of some observations."""
-        return Near(self.pieces[rows], self.weights[rows], self.distance[rows], self.total[rows])
+        parts = (self.pieces, self.weights, self.distance, self.total, self.goal)
+        return Near(*(part[rows] for part in parts))
 
 
 @dataclass(frozen=True)
@@ -96,6 +109,10 @@ class CallGraph:
 
     Where lengths are chosen, a call also counts as one of each shorter length: the steps inside say
     where it would have ended.
+
+    A skill with goals is chosen with a logged goal. Where the log has few of them, each is an
+    option as another skill would be. Where it has many, the goals of the nearest calls are the
+    options, and a call counts for another goal by the distance of start and goal.
 
     Args:
         log: the calls.
@@ -135,14 +152,20 @@ class CallGraph:
         places = compared_places(space, log.sees, log.before, log.next_obs)
         self.maps = feature_maps(space, features, places, known, log.skills)
         self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
-        self.known = np.array([len(rows) > 0 for rows in self._of_choice])
-        """(choices,) bool: the log has a call of the choice."""
         self.skill_of = np.arange(log.choices) // max(1, len(log.lengths))
+        self.goals = [_standard_goals(log, name) for name in log.skills]
+        """Of each skill, (C, G) float32 standardised goals of its calls; None: it has none."""
         starts = log.before[pieces.first]
         self._starts = [
             self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
             for skill, rows in zip(self.skill_of, self._of_choice, strict=True)
         ]
+        self._options = [self._options_of(c) for c in range(log.choices)]
+        counts = [options.count for options in self._options]
+        self.choice_of = np.repeat(np.arange(log.choices), counts)
+        """(O,) int64, the choice of each option."""
+        self.known = np.repeat([len(rows) > 0 for rows in self._of_choice], counts)
+        """(O,) bool: the log has a call of the option's choice."""
         last = pieces.then < 0
         steps, self._end_of = np.unique(pieces.stop[last] - 1, return_inverse=True)
         self._last = np.flatnonzero(last)
@@ -179,17 +202,33 @@ class CallGraph:
 
     def near_features(self, features: list[Array]) -> Near:
         """Return the nearest pieces to features of each skill, (n, F) each."""
-        n, k = len(features[0]), self.neighbours
-        shape = (n, self.log.choices, k)
-        pieces, distance = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
-        for c, rows in enumerate(self._of_choice):
-            if len(rows):
-                call = self.pieces.call[rows]
-                near, far = nearest(self._starts[c], features[self.skill_of[c]], k, call)
-                pieces[:, c], distance[:, c] = rows[near], far
+        return self._near([features[skill] for skill in self.skill_of])
+
+    def _near(self, features: list[Array], without: Array | None = None) -> Near:
+        """Return the nearest pieces to features for each choice, (n, F) each.
+
+        Args:
+            without: (n,) calls whose pieces do not count.
+        """
+        found = [
+            options.near(to, self.neighbours, without)
+            for options, to in zip(self._options, features, strict=True)
+        ]
+        pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))
         finite = np.where(np.isfinite(distance), distance, 1e9)
         total = (1.0 / (finite + SOFT)).sum(2)
-        return Near(pieces, weights_of(finite), distance[:, :, 0], total)
+        return Near(pieces, weights_of(finite), distance[:, :, 0], total, goal)
+
+    def _options_of(self, choice: int) -> Options:
+        """Return the options of a choice."""
+        rows, starts = self._of_choice[choice], self._starts[choice]
+        call, goals = self.pieces.call[rows], self.goals[self.skill_of[choice]]
+        if goals is None or not len(rows):
+            return Apart(rows, starts, call, np.zeros(len(rows), np.int64), np.array([-1]))
+        _, one, which = np.unique(goals[call], axis=0, return_index=True, return_inverse=True)
+        if len(one) <= MOST_APART and 2 * len(one) <= len(np.unique(call)):
+            return Apart(rows, starts, call, which.reshape(-1), call[one])
+        return ByGoal(rows, starts, call, goals[call])
 
     @property
     def after(self) -> Near:
@@ -207,20 +246,16 @@ class CallGraph:
 
     def _without_own(self, near: Near) -> Near:
         """Return the neighbours where no cut call is followed by its own pieces."""
-        for c, rows in enumerate(self._of_choice):
-            call = self.end_call[self._cut]
-            cut = self._cut[self.log.choice[call] == c]
-            if not len(cut):
-                continue
-            of = self.pieces.call[rows]
-            features = self._end_features[self.skill_of[c]][cut]
-            found, far = nearest(self._starts[c], features, self.neighbours + 1, of)
-            far[of[found] == self.end_call[cut][:, None]] = np.inf
-            order = np.argsort(far, axis=1, kind="stable")[:, : self.neighbours]
-            far = np.take_along_axis(far, order, 1)
-            finite = np.where(np.isfinite(far), far, 1e9)
-            near.pieces[cut, c] = rows[np.take_along_axis(found, order, 1)]
-            near.weights[cut, c], near.distance[cut, c] = weights_of(finite), far[:, 0]
+        cut = self._cut
+        if not len(cut):
+            return near
+        call = self.end_call[cut]
+        features = [self._end_features[skill][cut] for skill in self.skill_of]
+        others = self._near(features, call)
+        # Only the cut skill may follow.
+        rows, options = np.nonzero(self.choice_of == self.log.choice[call][:, None])
+        for name in ("pieces", "weights", "distance", "goal"):
+            getattr(near, name)[cut[rows], options] = getattr(others, name)[rows, options]
         return near
 
     def judge(
@@ -284,18 +319,19 @@ class CallGraph:
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
             caution: share by which a value falls for each unit of distance to the nearest piece.
-            novel: (choices,), the distance from which on each choice is new, and worth ``bonus``;
-                None: none is.
+            novel: (O,), the distance from which on each option is new, and worth ``bonus``; None:
+                none is.
             bonus: its value.
         """
         count = judged.reward.shape[1]
         value = np.zeros((len(self.end), count), np.float32)
         trust = trust_in(near.distance, caution)
-        choices = [c for c in range(self.log.choices) if self.known[c] or novel is not None]
+        options = np.flatnonzero(self.known | (novel is not None)).tolist()
+        may = may[:, self.choice_of]
         for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
             worth = self._worth(judged, value)
             best = np.full_like(value, -np.inf)
-            for c in choices:
+            for c in options:
                 q = np.zeros_like(value)
                 for k in range(self.neighbours):
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
@@ -338,6 +374,120 @@ class CallGraph:
         if self.skills is not None and self.skills.restricts:
             may = self.skills.startable(end)
         return (self.after if same else self.near_features(features)), may
+
+
+class Options:
+    """The options of one choice: the calls of a skill, perhaps with goals.
+
+    Args:
+        rows: (m,) the choice's pieces.
+        starts: (m, F) float32, the features of their starts.
+        call: (m,) the call of each.
+    """
+
+    count: int
+    """The number of options."""
+
+    def __init__(self, rows: Array, starts: Array, call: Array) -> None:
+        self._rows, self._starts, self._call = rows, starts, call
+
+    def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
+        """Return the nearest pieces to features ``to`` (n, F).
+
+        Args:
+            k: how many, each of another call.
+            without: (n,) calls whose pieces do not count; None: all count.
+
+        Returns:
+            Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
+            the calls whose goals the options have, (n, options), −1: none.
+        """
+        raise NotImplementedError
+
+    def _nearest(
+        self, mine: Array, to: Array, k: int, without: Array | None
+    ) -> tuple[Array, Array]:
+        """Return the nearest of the places ``mine`` (m,), (n, k), and distances (n, k)."""
+        if not len(mine):
+            return np.zeros((len(to), k), np.int64), np.full((len(to), k), np.inf, np.float32)
+        call = self._call[mine]
+        more = k if without is None else k + 1
+        near, far = nearest(self._starts[mine], to, more, call)
+        if without is not None:
+            far[call[near] == without[:, None]] = np.inf
+            order = np.argsort(far, axis=1, kind="stable")[:, :k]
+            near, far = np.take_along_axis(near, order, 1), np.take_along_axis(far, order, 1)
+        return mine[near], far
+
+
+class Apart(Options):
+    """Options whose calls do not count for one another: one, or a few goals.
+
+    Args:
+        which: (m,) the option of each piece.
+        goal: (options,) a call with the goal of each; −1: it has none.
+    """
+
+    def __init__(self, rows: Array, starts: Array, call: Array, which: Array, goal: Array) -> None:
+        super().__init__(rows, starts, call)
+        self.count, self._goal = len(goal), goal
+        self._mine = [np.flatnonzero(which == option) for option in range(len(goal))]
+
+    def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
+        """Return the nearest pieces of each goal; see ``Options.near``."""
+        found = [self._nearest(mine, to, k, without) for mine in self._mine]
+        places, far = (np.stack(part, 1) for part in zip(*found, strict=True))
+        pieces = self._rows[places] if len(self._rows) else places
+        return pieces, far, np.repeat(self._goal[None], len(to), axis=0)
+
+
+class ByGoal(Options):
+    """The goals of the nearest calls, whose calls count for one another by start and goal.
+
+    Args:
+        goals: (m, G) float32, the standardised goals of the pieces.
+    """
+
+    def __init__(self, rows: Array, starts: Array, call: Array, goals: Array) -> None:
+        super().__init__(rows, starts, call)
+        self.count, self._goals = CANDIDATES, goals
+        self._all = np.arange(len(rows))
+
+    def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
+        """Return the pieces that are nearest by start and goal; see ``Options.near``."""
+        shape = (len(to), CANDIDATES, k)
+        pieces, far = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
+        goal = np.full(shape[:2], -1)
+        step = max(1, BLOCK // CANDIDATES**2)
+        for first in range(0, len(to), step):
+            some = slice(first, first + step)
+            skipped = None if without is None else without[some]
+            near, off = self._nearest(self._all, to[some], CANDIDATES, skipped)
+            goals = torch.from_numpy(self._goals[near])
+            apart = torch.cdist(goals, goals).square().numpy()
+            both = np.sqrt(off[:, None] ** 2 + apart)  # (n, candidates, calls)
+            least = np.argsort(both, axis=2, kind="stable")[:, :, :k]
+            most = least.shape[2]
+            far[some, :, :most] = np.take_along_axis(both, least, 2)
+            own = np.take_along_axis(near[:, None].repeat(CANDIDATES, 1), least, 2)
+            pieces[some, :, :most] = self._rows[own]
+            missing = ~np.isfinite(off)
+            far[some][missing] = np.inf
+            goal[some] = np.where(missing, -1, self._call[near])
+        return pieces, far, goal
+
+
+def _standard_goals(log: CallLog, skill: str) -> Array | None:
+    """Return the goals of all calls, standardised by those of a skill's calls, (C, G) float32."""
+    goals, mine = log.goals.get(skill), log.skill == log.number(skill)
+    if goals is None:
+        return None
+    if not mine.any():
+        return np.zeros(goals.shape, np.float32)
+    mean, deviation = goals[mine].mean(0), goals[mine].std(0)
+    varies = deviation > CONSTANT * np.maximum(1.0, np.abs(mean))
+    scaled = np.where(varies, (goals - mean) / np.where(varies, deviation, 1.0), 0.0)
+    return np.where(mine[:, None], scaled, 0.0).astype(np.float32)
 
 
 def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:

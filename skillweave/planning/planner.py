@@ -29,6 +29,7 @@ from skillweave.planning.task import Task, as_task
 from skillweave.planning.tried import Tried
 from skillweave.selectors.base import ReadySelector
 from skillweave.skills.foreign_policy import checksum
+from skillweave.skills.goal_spaces import from_numbers, numbers_in
 from skillweave.types import Array, Memory, Step
 
 MOST_GOALS = 256
@@ -72,6 +73,9 @@ class Planner(ReadySelector):
     follows at its end: the best choice there, by the K nearest logged calls of each choice. At a
     decision the choice is best whose nearest calls are worth most. Calls of the running episode
     count as well, so a call that failed is not repeated forever.
+
+    A skill with goals is called with goals of its nearest logged calls; calls count for one another
+    by start and goal. Where the log has few different goals, each is as another skill would be.
 
     Args:
         log: calls of these skills in this environment.
@@ -117,11 +121,6 @@ class Planner(ReadySelector):
         check_features(features, "Planner")
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
-        if log.goals:
-            raise DeclarationError(
-                f"Planner: the log has calls of skills with goals ({', '.join(log.goals)}), which "
-                "cannot be planned with yet: train a selector, or declare a skill for each goal"
-            )
         self.log, self.task = log, as_task(task, predicates)
         self.lengths = log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.pays:
@@ -191,16 +190,46 @@ class Planner(ReadySelector):
             state: (n, 1 + H) of the task; None: its start.
 
         Returns:
-            Values; −infinity for choices of which the log has no call.
+            Values, of a skill with goals that of its best goal; −infinity for choices of which the
+            log has no call.
         """
         state = self.machine.start(len(obs)) if state is None else state
-        return self._values(self.graph.near(obs), obs, state)
+        values = self._values(self.graph.near(obs), obs, state)
+        first = np.searchsorted(self.graph.choice_of, np.arange(self.log.choices))
+        best: Array = np.maximum.reduceat(values, first, axis=1)
+        return best
+
+    def choices(self, obs: Array, state: Array, may: Array) -> tuple[Array, Array]:
+        """Return the best choices in observations, without what an episode has tried.
+
+        Args:
+            obs: (n, *obs_shape).
+            state: (n, 1 + H) of the task.
+            may: (n, choices) bool, what may be chosen.
+
+        Returns:
+            The choices (n,), and the logged calls whose goals they have, (n,); −1: none.
+        """
+        near = self.graph.near(obs)
+        option = self._choose(self._values(near, obs, state), may, None)
+        return self.graph.choice_of[option], near.goal[np.arange(len(obs)), option]
+
+    def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
+        """Return the goals of choices (n,) from logged calls (n,), as ``with_goals`` takes them."""
+        found, skill = {}, self.graph.skill_of[choice]
+        for name, space in self.goal_spaces.items():
+            rows = np.flatnonzero((skill == self.log.number(name)) & (call >= 0))
+            found[name] = rows, from_numbers(space, self.log.goals[name][call[rows]])
+        return found
+
+    def _goal_advice(self, name: str) -> str:
+        return f"the log has no call of {name!r}, so record some"
 
     def _values(self, near: Near, obs: Array, state: Array) -> Array:
         if not isinstance(self.task, GoalTask):
             return self._values_in(self.plan, near, state)
         goals = self.task.of(obs)
-        values = np.empty((len(obs), self.log.choices), np.float32)
+        values = np.empty(near.distance.shape, np.float32)
         unique, which = np.unique(goals, axis=0, return_inverse=True)
         for i, goal in enumerate(unique):
             rows = np.flatnonzero(which.reshape(-1) == i)
@@ -209,7 +238,7 @@ class Planner(ReadySelector):
 
     def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
         place, share = self.states.corners(state)
-        # (n, choices, K, J): the worth of each neighbour at each corner.
+        # (n, O, K, J): the worth of each neighbour at each corner.
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
         q = np.where(q > 0, q * trust_in(near.distance, self.caution), q)
@@ -268,10 +297,25 @@ class Planner(ReadySelector):
         """Return a copy for these spaces; ``who`` begins messages.
 
         Raises:
-            RunError: the log has other observations.
+            RunError: the log has other observations, or other goals.
+            DeclarationError: it would guide a selector of one skill with goals.
         """
         self.log.check_spaces(observation_space, self.log.action_space)
-        return super().bind(observation_space, action_space, who)
+        bound = super().bind(observation_space, action_space, who)
+        sizes = {name: goals.shape[1] for name, goals in self.log.goals.items()}
+        spaces = bound.goal_spaces
+        if not spaces and sizes and self.log.choices == 1:
+            raise DeclarationError(
+                f"{who}: the hierarchy has one skill, {self.log.skills[0]!r}, and a guide says "
+                "nothing about goals, so this planner would guide nothing: use it as the selector"
+            )
+        own = {name: numbers_in(space) for name, space in spaces.items()}
+        if spaces and own != sizes:
+            raise RunError(
+                f"{who}: the planner's log has goals of {_shown_sizes(sizes)}, but the hierarchy's "
+                f"skills have goals of {_shown_sizes(own)}; record a log of these skills"
+            )
+        return bound
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments: the task's state, and no call so far."""
@@ -292,26 +336,36 @@ class Planner(ReadySelector):
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
     ) -> tuple[Array, Memory]:
-        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` (n, choices) allows."""
+        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` (n, choices) allows.
+
+        Where it was bound to choices with goals, they have goals.
+        """
         may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
         features = [each(obs) for each in self.graph.maps]
         near, state = self.graph.near_features(features), _state(memory)
         logged, place = self._values(near, obs, state), self.states.place(state)
-        seen = self._tried.padded(features)
-        memory = memory | self._tried.end(memory, seen, logged, near, place, may)
-        q = self._tried.corrected(memory, seen, logged, near, place)
-        choice = self._choose(q, may, rng)
-        return choice, memory | self._tried.begin(memory, seen, choice, place)
+        seen, goals = self._tried.padded(features), self._tried.goals_of(near)
+        memory = memory | self._tried.end(memory, seen, goals, logged, near, place, may)
+        q = self._tried.corrected(memory, seen, goals, logged, near, place)
+        option, rows = self._choose(q, may, rng), np.arange(len(obs))
+        choice, call = self.graph.choice_of[option], near.goal[rows, option]
+        # A guide does not say which goal: that of the call is unknown.
+        goal = goals[rows, option] if self.goal_spaces else np.where(call < 0, 0.0, np.nan)[:, None]
+        memory = memory | self._tried.begin(memory, seen, goal, choice, place)
+        if not self.goal_spaces:
+            return choice, memory
+        return self.with_goals(choice, self.goals_at(choice, call), obs), memory
 
     def _choose(self, q: Array, may: Array, rng: np.random.Generator | None) -> Array:
-        """Return the best choices, or samples."""
+        """Return the best options of values (n, O), or samples; ``may``: (n, choices) bool."""
+        may = may[:, self.graph.choice_of]
         score = np.where(may, np.maximum(q, -1e30), -np.inf)  # one without a call comes last
         if self.temperature:
             largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max(1, keepdims=True)
             score = score / (self.temperature * np.maximum(largest, 1e-12))
             score = score + (rng or np.random.default_rng()).gumbel(size=q.shape)
-        choice: Array = score.argmax(1)
-        return choice
+        option: Array = score.argmax(1)
+        return option
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a ``step``: the task's state goes on."""
@@ -327,6 +381,12 @@ class Planner(ReadySelector):
         about = [digest, self.machine.state_names, self.gamma, self.caution, self.temperature]
         whole = json.dumps(about)
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
+
+
+def _shown_sizes(sizes: Mapping[str, int]) -> str:
+    """Return the numbers of goals by skill for messages."""
+    each = [f"{name} ({size} number{'s' * (size != 1)})" for name, size in sizes.items()]
+    return ", ".join(each) or "no skill"
 
 
 def _state(memory: Memory) -> Array:
@@ -363,4 +423,5 @@ def _own_end(task: Task, graph: CallGraph) -> Array | None:
 
 def _known_skills(graph: CallGraph) -> list[bool]:
     """Return whether the log has a call of each skill."""
-    return [bool(graph.known[graph.skill_of == i].any()) for i in range(len(graph.log.skills))]
+    skill = graph.skill_of[graph.choice_of]
+    return [bool(graph.known[skill == i].any()) for i in range(len(graph.log.skills))]

@@ -24,7 +24,7 @@ from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.skills.goal_spaces import GOAL, blank_choices, choice_space
+from skillweave.skills.goal_spaces import GOAL, blank_choices, choice_space, from_numbers
 from skillweave.spaces import same_space
 from skillweave.types import Array, Memory, Memoryless
 
@@ -132,6 +132,8 @@ def record_calls(
 class WithDrawnGoals(Memoryless):
     """A selector of skills alone, with goals that are drawn as for practice.
 
+    An ``Explorer`` also repeats goals of logged calls.
+
     Args:
         selector: chooses skills.
         skills: of which some have goals.
@@ -159,12 +161,18 @@ class WithDrawnGoals(Memoryless):
         """Return choices (n,) with goals."""
         rng = rng or np.random.default_rng()
         how: dict[str, Any] = {"deterministic": deterministic, "rng": rng}
-        number, memory = self._selector.act(memory, obs, mask, **how)
+        again: dict[str, tuple[Array, Array]] = {}
+        if isinstance(self._selector, Explorer):
+            number, again = self._selector.decide(obs, mask, rng)
+        else:
+            number, memory = self._selector.act(memory, obs, mask, **how)
         choice, skill = blank_choices(self._space, number), self._skills.skill_of(number)
         for i, (name, goals) in self._goals.items():
             mine = np.flatnonzero(skill == i)
             if len(mine):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
+        for name, (rows, numbers) in again.items():
+            choice[GOAL][name][rows] = from_numbers(self._space[GOAL][name], numbers)
         return choice, memory
 
 

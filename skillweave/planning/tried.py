@@ -29,22 +29,26 @@ SLACK = 0.03
 class Tried:
     """The latest calls of n episodes, as arrays of a selector's memory.
 
-    Each has the choice, the features of its start and its end (for every skill), its steps, what it
-    paid, γ^τ, the task's planning states before and after it, and what the log says at its end.
+    Each has the choice, its goal, the features of its start and its end (for every skill), its
+    steps, what it paid, γ^τ, the task's planning states before and after it, and what the log says
+    of each option at its end.
 
     Args:
         graph: the logged calls.
     """
 
     def __init__(self, graph: CallGraph) -> None:
-        self._skill_of, self._choices = graph.skill_of, graph.log.choices
+        self._skill_of, self._choice_of = graph.skill_of, graph.choice_of
+        self._goals = graph.goals
+        sizes = [goals.shape[1] for goals in graph.goals if goals is not None]
+        self._goal_size = max(sizes, default=1)
         self._lengths = np.array(graph.log.lengths)
         self._skills = len(graph.maps)
         self._size = max(each.size for each in graph.maps)
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` episodes without a call."""
-        calls = (n, LATEST)
+        calls, options = (n, LATEST), len(self._choice_of)
         return {
             "tried.count": np.zeros(n, np.int64),
             "tried.choice": np.full(calls, -1),
@@ -55,11 +59,24 @@ class Tried:
             "tried.discount": np.ones(calls),
             "tried.from": np.full(calls, -1),
             "tried.to": np.full(calls, -1),
-            "tried.q": np.zeros((*calls, self._choices), np.float32),
-            "tried.total": np.zeros((*calls, self._choices), np.float32),
-            "tried.far": np.zeros((*calls, self._choices), np.float32),
-            "tried.may": np.zeros((*calls, self._choices), bool),
+            "tried.q": np.zeros((*calls, options), np.float32),
+            "tried.total": np.zeros((*calls, options), np.float32),
+            "tried.far": np.zeros((*calls, options), np.float32),
+            "tried.may": np.zeros((*calls, options), bool),
+            "tried.goal": np.zeros((*calls, self._goal_size), np.float32),
+            "tried.goals": np.zeros((*calls, options, self._goal_size), np.float32),
         }
+
+    def goals_of(self, near: Near) -> Array:
+        """Return the standardised goals of options, (n, O, G); 0 where they have none."""
+        found = np.zeros((*near.goal.shape, self._goal_size), np.float32)
+        for skill, goals in enumerate(self._goals):
+            if goals is not None:
+                mine = np.flatnonzero(self._skill_of[self._choice_of] == skill)
+                call = near.goal[:, mine]
+                own = np.where(call[..., None] >= 0, goals[call], 0.0)
+                found[:, mine, : goals.shape[1]] = own
+        return found
 
     def padded(self, features: list[Array]) -> Array:
         """Return the features of each skill, (n, F) each, as one array (n, S, F)."""
@@ -68,13 +85,20 @@ class Tried:
             whole[:, skill, : some.shape[1]] = some
         return whole
 
-    def begin(self, memory: Memory, features: Array, choice: Array, place: Array) -> Memory:
-        """Add the calls that were chosen, (n,), in the task's planning states ``place`` (n,)."""
+    def begin(
+        self, memory: Memory, features: Array, goal: Array, choice: Array, place: Array
+    ) -> Memory:
+        """Add the calls that were chosen, (n,), in the task's planning states ``place`` (n,).
+
+        Args:
+            goal: (n, G) standardised; NaN: unknown, so that the call counts for none.
+        """
         rows, slot = np.arange(len(choice)), memory["tried.count"] % LATEST
         new = {
             "tried.choice": choice,
             "tried.steps": 0,
             "tried.start": features,
+            "tried.goal": goal,
             "tried.reward": 0.0,
             "tried.discount": 1.0,
             "tried.from": place,
@@ -90,9 +114,14 @@ class Tried:
         """
         rows, slot = np.arange(len(reward)), (memory["tried.count"] - 1) % LATEST
         discount = memory["tried.discount"][rows, slot]
-        steps = memory["tried.steps"][rows, slot] + 1
+        steps, chosen = memory["tried.steps"][rows, slot] + 1, memory["tried.choice"][rows, slot]
+        choice = self._called(chosen, steps, last)
+        with_goal = np.array([goals is not None for goals in self._goals])
+        other = (self._skill_of[np.maximum(chosen, 0)] != last.skill) & with_goal[last.skill]
+        goal = np.where(other[:, None], np.nan, memory["tried.goal"][rows, slot])
         new = {
-            "tried.choice": self._called(memory["tried.choice"][rows, slot], steps, last),
+            "tried.choice": choice,
+            "tried.goal": goal,
             "tried.steps": steps,
             "tried.reward": memory["tried.reward"][rows, slot] + discount * reward,
             "tried.discount": discount * gamma,
@@ -111,13 +140,15 @@ class Tried:
         return called
 
     def end(
-        self, memory: Memory, features: Array, q: Array, near: Near, place: Array, may: Array
-    ) -> Memory:
+        self, memory: Memory, features: Array, goals: Array, q: Array, near: Near, place: Array,
+        may: Array,
+    ) -> Memory:  # fmt: skip
         """Complete the latest calls, where they end in an observation.
 
         Args:
             features: (n, S, F) of the observation.
-            q: (n, choices), what the log says there.
+            goals: (n, O, G) of the options there.
+            q: (n, O), what the log says there.
             near: the nearest logged calls.
             place: (n,) planning states of the task.
             may: (n, choices) bool, what may be chosen.
@@ -130,18 +161,20 @@ class Tried:
             "tried.q": q[rows],
             "tried.total": near.total[rows],
             "tried.far": near.distance[rows],
-            "tried.may": may[rows],
+            "tried.may": may[rows][:, self._choice_of],
+            "tried.goals": goals[rows],
         }
         return _put(memory, new, rows, slot[rows])
 
     def corrected(
-        self, memory: Memory, features: Array, q: Array, near: Near, place: Array
+        self, memory: Memory, features: Array, goals: Array, q: Array, near: Near, place: Array
     ) -> Array:
-        """Return values (n, choices) for which the episode's own calls count as logged ones.
+        """Return values (n, O) for which the episode's own calls count as logged ones.
 
         Args:
             features: (n, S, F) of the present observation.
-            q: (n, choices), what the log says there.
+            goals: (n, O, G) of the options there.
+            q: (n, O), what the log says there.
             near: the nearest logged calls.
             place: (n,) planning states of the task.
         """
@@ -153,16 +186,20 @@ class Tried:
         skill = self._skill_of[np.maximum(choice, 0)]
         to = where[np.arange(n)[:, None], :, skill].swapaxes(1, 2)  # (n, ends, calls, F)
         start = memory["tried.start"][np.arange(n)[:, None], np.arange(LATEST), skill]
-        far = np.sqrt(np.square(to - start[:, None]).sum(3))
-        # The distance of the nearest logged call of the same choice, (n, ends, calls).
+        far = np.sqrt(np.square(to - start[:, None]).sum(3))[..., None]
+        if any(own is not None for own in self._goals):
+            # (n, ends, calls, O): an option counts by its goal, too.
+            known = np.concatenate([memory["tried.goals"], goals[:, None]], 1)
+            off = known[:, :, None] - memory["tried.goal"][:, None, :, None]
+            far = np.sqrt(far**2 + np.square(off).sum(4))
+        # The distance of the nearest logged call of each option, (n, ends, O).
         nearest = np.concatenate([memory["tried.far"], near.distance[:, None]], 1)
-        logged_far = np.take_along_axis(nearest, np.maximum(choice, 0)[:, None], 2)
-        same &= far <= logged_far + SLACK
-        if not same[:, -1].any():
+        of = choice[:, None, :, None] == self._choice_of
+        counts = same[..., None] & of & (far <= nearest[:, :, None] + SLACK)
+        if not counts[:, -1].any():
             return q
-        weight = np.where(same, TRUST / (far + SOFT), 0.0)
-        one_hot = choice[:, :, None] == np.arange(self._choices)
-        own = np.einsum("nec,nck->nek", weight, one_hot)
+        weight = np.where(counts, TRUST / (far + SOFT), 0.0)
+        own = weight.sum(2)
         logged = np.concatenate([memory["tried.q"], q[:, None]], 1)
         total = np.concatenate([memory["tried.total"], near.total[:, None]], 1)
         known = np.isfinite(logged)
@@ -174,7 +211,7 @@ class Tried:
         value = _best(logged[:, :-1], may)
         for _ in range(LATEST):
             y = memory["tried.reward"] + memory["tried.discount"] * value
-            q_all = (base + np.einsum("nec,nck->nek", weight * y[:, None], one_hot)) / both
+            q_all = (base + np.einsum("neco,nc->neo", weight, y)) / both
             q_all = np.where(missing, -np.inf, q_all)
             value = _best(q_all[:, :-1], may)
         corrected: Array = q_all[:, -1].astype(np.float32)

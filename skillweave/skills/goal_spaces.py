@@ -214,6 +214,24 @@ def leaf_paths(space: gym.Space[Any], before: tuple[str, ...] = ()) -> list[tupl
     return [path for name, part in inner.items() for path in leaf_paths(part, (*before, name))]
 
 
+def numbers_in(space: gym.Space[Any]) -> int:
+    """Return how many numbers a goal of a space has."""
+    one = example_of(space)
+    return sum(part_at(one, path).size for path in leaf_paths(space))
+
+
+def from_numbers(space: gym.Space[Any], numbers: Array) -> Array:
+    """Return goals (n, *goal_shape) of a space from their numbers (n, G); see ``Goals.flat``."""
+    goals = np.repeat(example_of(space)[None], len(numbers), axis=0)
+    first = 0
+    for path in leaf_paths(space):
+        part = part_at(goals, path)
+        size = part[:1].size
+        part[...] = numbers[:, first : first + size].reshape(part.shape)
+        first += size
+    return goals
+
+
 @lru_cache(64)
 def joint_dtype(
     obs: np.dtype[Any], shape: tuple[int, ...], goal: np.dtype[Any], goal_shape: tuple[int, ...]

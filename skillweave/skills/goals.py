@@ -24,6 +24,7 @@ from skillweave.skills.goal_spaces import (
     example_of,
     joint_dtype,
     leaf_paths,
+    numbers_in,
     outside,
     part_at,
     parts_of,
@@ -62,7 +63,7 @@ class Goals:
             raise DeclarationError(f"{self._who}: {text}") from error
         self._one = example_of(space)
         self._bytes = self.dtype.fields is not None
-        self.size = sum(part_at(self._one, path).size for path in leaf_paths(space))
+        self.size = numbers_in(space)
         """The numbers of a goal."""
 
     def start(self, n: int) -> Array:

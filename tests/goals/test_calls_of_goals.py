@@ -9,7 +9,7 @@ import pytest
 from goals.worlds import SPACES, Rest, aim_of, declared, go_to, place_of
 
 import skillweave as sw
-from skillweave.planning import CallLog, Planner, join
+from skillweave.planning import CallLog, join
 
 
 def walk(self: Any, obs: Any, goal: Any) -> Any:
@@ -91,12 +91,6 @@ def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
     found = run.report(tmp_path / "report.html", episodes=2)
     assert not any("success()" in sentence for sentence in found["missing"])
     assert "go_to" in (tmp_path / "report.html").read_text()
-
-
-def test_a_planner_says_that_it_chooses_no_goals() -> None:
-    log = ready().log_calls(100, num_envs=2)
-    with pytest.raises(sw.DeclarationError, match=r"skills with goals \(go_to\)"):
-        Planner(log, lambda obs: obs[:, 0] > 0.5)
 
 
 def test_logs_with_other_goals_are_not_joined() -> None:

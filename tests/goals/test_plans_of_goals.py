@@ -1,0 +1,211 @@
+"""Plans on logged calls of skills with goals: which skill, and which goal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from goals.test_calls_of_goals import ready
+from goals.worlds import SPACES, Rest, declared, go_to
+from planning.logs import log_of
+from planning.steps import step_to
+
+import skillweave as sw
+from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
+from skillweave.selectors import LastCall
+from skillweave.skills.goal_spaces import choice_space, draw_from, from_numbers, numbers_in
+from skillweave.skills.goals import goals_of
+
+GAMMA = 0.9
+LINE: Any = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+
+def near(*place: float) -> Predicate:
+    """The predicate that the point is at a place."""
+
+    def there(obs: Any) -> Any:
+        return np.abs(obs - np.float32(place)).max(1) < 0.3
+
+    return Predicate(there, f"near {place}", "obs")
+
+
+def at(*places: float) -> Predicate:
+    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
+
+
+MISSION = Mission(near(1.4, 0.3), near(0.3, 1.4))
+
+
+def jumps(goals: Any, starts: Any = range(11)) -> CallLog:
+    """A log of one skill with goals: from each start it goes three steps towards each goal."""
+    calls, given = [], []
+    for start in starts:
+        for goal in goals:
+            inside = np.clip(np.arange(1, 4) * np.sign(goal - start), *sorted((0, goal - start)))
+            calls.append((start, [(0, (start + inside).tolist(), True, "limit")]))
+            given.append([goal])
+    log = log_of(["go"], calls)
+    log.goals["go"] = np.array(given, np.float64)
+    return log
+
+
+def bound(planner: Planner, space: Any) -> Planner:
+    """The planner for a skill ``go`` with goals of a space."""
+    choices = choice_space(1, {"go": space}, ["go"])
+    return planner.among(("go",)).bind(planner.log.observation_space, choices, "selector")
+
+
+@pytest.mark.parametrize("goals", [(0, 10), range(11)])
+def test_values_are_those_of_a_skill_for_each_goal(goals: Any) -> None:
+    """With few goals and with many: the best goal from each start is known on a line."""
+    log = jumps(goals, np.repeat(np.arange(11), 3))  # every call three times
+    planner = Planner(log, Mission(at(9), at(1)), neighbours=1, gamma=GAMMA, caution=0.0)
+    obs = np.float32([[p] for p in range(11)])
+    reached = GAMMA ** (np.abs(9 - np.arange(11)) - 1.0)
+    there_and_back = (reached + reached * GAMMA**8) / 2
+    values = planner.values(obs)[:, 0]
+    for place in (0, 3, 6):  # where three steps end at 9
+        assert values[place] == pytest.approx(there_and_back[place], abs=3e-3)
+    acting = bound(planner, LINE)
+    choice, _ = acting.act(acting.start(11), obs)
+    assert (choice["skill"] == 0).all()
+    aims = choice["goal"]["go"][:, 0]
+    assert (aims[:9] > np.arange(9)).all()
+    assert aims[10] < 10
+
+
+def test_calls_count_for_one_another_by_start_and_goal() -> None:
+    """At the same start, the goal that leads to 5 is worth most, and near goals a part of it."""
+    goals = np.linspace(-1, 1, 40)
+    ends = np.where(goals > 0.5, 5, -5)
+    log = log_of(["go"], [(0, [(0, [end], True, "end")]) for end in ends.tolist()])
+    log.goals["go"] = goals[:, None]
+    planner = Planner(log, at(5), neighbours=3, caution=0.0)
+    assert planner.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0, abs=1e-3)
+    option = planner.graph.near(np.zeros((1, 1), np.float32))
+    aims = goals[option.goal[0]]
+    worth = (planner.plan.worth[option.pieces[0], 0] * option.weights[0]).sum(1)
+    assert (worth[aims > 0.6] > 0.99).all()
+    assert (worth[aims < 0.4] < 0.01).all()
+    assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbour differs
+
+
+def test_a_goal_that_failed_is_not_repeated_forever() -> None:
+    """The log says that goals above lead to 3; now there is a wall."""
+    log = jumps((0, 10), np.repeat(np.arange(11), 3))
+    planner = bound(Planner(log, at(9), neighbours=1, gamma=GAMMA), LINE)
+    memory, obs, aims = planner.start(1), np.float32([[2]]), []
+    for _ in range(6):
+        choice, memory = planner.act(memory, obs)
+        aims.append(float(choice["goal"]["go"][0, 0]))
+        before, obs = obs, np.float32([[2]]) if aims[-1] > 2 else np.float32([[0]])
+        last = LastCall(np.zeros(1, int), np.full(1, 2, np.int8), np.zeros(1, bool))
+        for _ in range(3):
+            memory = planner.watch(memory, step_to(obs, before), last)
+        if aims[-1] == 0:
+            break
+    assert aims[0] == 10
+    assert aims[-1] == 0
+    assert len(aims) <= 4
+
+
+def test_a_mission_of_places_that_no_training_saw() -> None:
+    run = ready()
+    log = run.log_calls(4_000, num_envs=8)
+    planned = run.plan(MISSION, log)
+    found = planned.evaluate(20, quiet=True)
+    assert np.mean(np.array(found.returns) > 0.99) >= 0.9
+    random = run.evaluate(20, quiet=True)
+    assert np.mean(np.array(random.returns) > 0.99) < 0.5
+
+
+def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
+    run = ready()
+    log = run.log_calls(1_500, num_envs=8)
+    skills = run.hierarchy.skills
+    other = declared(skills, selector=Planner(log, near(1.4, 0.3)))
+    played = other.train(tmp_path / "run", quiet=True)
+    calls = played.log_calls(300, choose=played.policy.selector, num_envs=2)
+    there = near(1.4, 0.3).at(calls.next_obs)
+    arrived = [there[calls.episode[calls.owner] == e].any() for e in np.unique(calls.episode)]
+    assert len(arrived) >= 10
+    assert np.mean(arrived) >= 0.9
+
+
+def test_another_log_s_goals_are_refused(tmp_path: Any) -> None:
+    log = ready().log_calls(300, num_envs=4)
+    run = ready("number")
+    with pytest.raises(sw.RunError, match="changed since the log"):
+        run.plan(near(1.4, 0.3), log)
+    other = declared(run.hierarchy.skills, selector=Planner(log, near(1.4, 0.3)))
+    with pytest.raises(sw.RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
+        other.train(tmp_path / "run", quiet=True)
+
+
+def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
+    skills = [go_to(policy=ready().hierarchy.skills[0].policy)]
+    run = declared(skills).train(quiet=True)
+    log = run.log_calls(300, num_envs=4)
+    guide = sw.Guide(Planner(log, near(1.4, 0.3)), restrict=False, target_kl=0.1)
+    with pytest.raises(sw.DeclarationError, match="says nothing about goals"):
+        declared(skills, selector=sw.PPO(), guide=guide).train(quiet=True)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_goals_from_their_numbers(space: str) -> None:
+    """Goals of every space are their numbers, and back."""
+    goals: Any = goals_of(go_to(space))
+    drawn = draw_from(SPACES[space], 5, np.random.default_rng(0))
+    numbers = goals.flat(drawn)
+    assert numbers.shape == (5, numbers_in(SPACES[space]))
+    back = from_numbers(SPACES[space], numbers)
+    assert back.dtype == drawn.dtype
+    assert back.tobytes() == drawn.tobytes()
+
+
+@pytest.mark.parametrize("space", ["number", "numbers", "dict", "tuple", "bits"])
+def test_plans_with_goals_of_other_kinds(space: str) -> None:
+    run = ready(space)
+    log = run.log_calls(1_500, num_envs=8)
+    mine = log.end[log.succeeded & (log.skill == 0)]
+    place = mine[len(mine) // 2]  # a goal leads there
+    found = run.plan(near(*place.tolist()), log).evaluate(10, quiet=True)
+    assert np.mean(np.array(found.returns) > 0.99) >= 0.8
+
+
+def test_exploring_draws_goals_for_new_calls() -> None:
+    run = ready()
+    log = run.log_calls(600, choose=Explorer(every=150), num_envs=4)
+    mine = log.skill == 0
+    assert (np.abs(log.goals["go_to"][mine]) <= 1).all()
+    # Calls that are not new repeat goals of the log.
+    assert 10 < len(np.unique(log.goals["go_to"][mine], axis=0)) < mine.sum()
+
+
+def test_hand_over_and_chains_go_by_skill() -> None:
+    log = ready().log_calls(1_000, num_envs=4)
+    rate, count = log.hand_over().of("go_to", after="go_to")
+    assert 0 < rate <= 1
+    assert count > 5
+    assert 0 < log.chain("go_to", "go_to").estimate <= 1
+
+
+def test_lengths_are_chosen_with_goals() -> None:
+    run = ready(selector=sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1),
+                call_steps=sw.Lengths(2, 4, 8))  # fmt: skip
+    log = run.log_calls(4_000, num_envs=8)
+    assert log.lengths == (2, 4, 8)
+    found = run.plan(near(1.4, 0.3), log).evaluate(20, quiet=True)
+    assert np.mean(np.array(found.returns) > 0.99) >= 0.9
+
+
+def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
+    run = ready()
+    log = run.log_calls(300, num_envs=4)
+    rests = log.take(np.flatnonzero(log.skill == 1))
+    with pytest.warns(UserWarning, match="no call of 'go_to'"):
+        planned = run.plan(lambda obs: obs[:, 0] > -5, rests)
+    assert planned.evaluate(3, quiet=True).mean == 1.0
+    assert isinstance(Rest(), sw.Skill)
