@@ -11,8 +11,9 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
+from skillweave.planning.compared import compared_places
 from skillweave.planning.hand_over import START, before_each, calls_done, wilson
-from skillweave.planning.neighbours import compared_places, feature_maps, nearest
+from skillweave.planning.neighbours import feature_maps, nearest
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
@@ -148,7 +149,7 @@ def blame(
     )
     if after == START or len(rows) < LEAST:
         return unknown
-    places = compared_places(log.observation_space, log.sees, log.before, log.next_obs)
+    places = compared_places(log)
     maps = feature_maps(log.observation_space, features, places, log.start, log.skills)
     at = np.ascontiguousarray(maps[number](log.start[rows]))
     score = _predicted(at, won[rows])

@@ -21,13 +21,13 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
+from skillweave.planning.compared import compared_places
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
 from skillweave.planning.neighbours import (
     BLOCK,
     CONSTANT,
     SOFT,
-    compared_places,
     feature_maps,
     nearest,
     weights_of,
@@ -116,11 +116,12 @@ class CallGraph:
 
     Args:
         log: the calls.
-        features: for all skills or by skill: places, or a function of observations; None: what each
-            skill sees, and what changes in most steps.
+        features: for all skills or by skill: places, or a function of observations; None: see
+            ``compared_places``.
         neighbours: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
+        task: that will be planned, as far as it is known; see ``compared_places``.
 
     Raises:
         RunError: the log has less than two calls.
@@ -133,6 +134,7 @@ class CallGraph:
         features: Any = None,
         neighbours: int = 5,
         skills: SkillSet | None = None,
+        task: RewardMachine | None = None,
     ) -> None:
         if len(log) < 2:
             raise RunError(
@@ -149,7 +151,7 @@ class CallGraph:
         self.pieces = pieces = _pieces(log, skills)
         known = np.concatenate([log.start, log.end])
         space = log.observation_space
-        places = compared_places(space, log.sees, log.before, log.next_obs)
+        places = compared_places(log, task)
         self.maps = feature_maps(space, features, places, known, log.skills)
         self._of_choice = [np.flatnonzero(pieces.choice == c) for c in range(log.choices)]
         self.skill_of = np.arange(log.choices) // max(1, len(log.lengths))

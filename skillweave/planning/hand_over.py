@@ -14,9 +14,10 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
+from skillweave.planning.compared import compared_places
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import compared_places, feature_maps, nearest, weights_of
+from skillweave.planning.neighbours import feature_maps, nearest, weights_of
 from skillweave.planning.predicates import as_event
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
@@ -241,9 +242,7 @@ def chain(
                 "random"
             )
     known = np.concatenate([log.start, log.end])
-    space = log.observation_space
-    places = compared_places(space, log.sees, log.before, log.next_obs)
-    maps = feature_maps(space, features, places, known, log.skills)
+    maps = feature_maps(log.observation_space, features, compared_places(log), known, log.skills)
     # From the last skill back: the chance that the rest of the chain is done after each call.
     chance = won[rows[-1]].astype(np.float64)
     for i in reversed(range(len(skills) - 1)):

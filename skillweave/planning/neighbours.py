@@ -20,8 +20,6 @@ SOFT = 0.01
 """Distance that is added before weights are inverse distances: two equal calls count equally."""
 AHEAD = 8
 """Points that are looked at for each one that is wanted, as several may be of one group."""
-MOST_STEPS = 0.5
-"""The share of steps in which a number has to change to be compared, if a skill does not see it."""
 CONSTANT = 1e-6
 """A feature whose deviation is less, relative to its size, is constant."""
 
@@ -140,28 +138,6 @@ class FeatureMap:
                 "each once, or a function of observations"
             )
         return [int(p) for p in whole]
-
-
-def compared_places(
-    space: gym.Space[Any], sees: Sequence[Sequence[int] | None], before: Array, after: Array
-) -> tuple[Sequence[int] | None, ...]:
-    """Return the places by which calls of each skill are compared: those that it sees, and others.
-
-    The others change in most steps, as a position does. They say where a call ends, though the
-    skill does not see them: behind which wall, for example.
-
-    Args:
-        space: of the observations.
-        sees: the places that each skill sees; None: all.
-        before: (T, *obs_shape), observations before logged steps.
-        after: (T, *obs_shape), those after them.
-    """
-    if all(places is None for places in sees):
-        return tuple(sees)
-    codec = obs_codec(space)
-    first, then = (codec.split(to_tensor(x))[0].reshape(len(x), -1) for x in (before, after))
-    moves = np.flatnonzero((first != then).float().mean(0).numpy() > MOST_STEPS).tolist()
-    return tuple(None if p is None else sorted({*p, *moves}) for p in sees)
 
 
 def feature_maps(

@@ -86,7 +86,9 @@ class Planner(ReadySelector):
             nothing is compared, and initiation sets are those that were recorded.
         features: by what calls are near one another: places in the flat observation, or a function
             of observations (n, …) to (n, F); or a dict of these by skill. None: what each skill
-            sees, and what changes in most steps. They are standardised by the log.
+            sees, and what changes in most steps, without numbers that never change within an
+            episode, if they do not help to predict where calls end and the task does not read them;
+            ``compared`` has the places. They are standardised by the log.
         neighbours: K.
         gamma: γ of one step.
         caution: the share by which a value falls for each unit of distance to the nearest call.
@@ -133,6 +135,7 @@ class Planner(ReadySelector):
             features,
             whole_number(neighbours, "Planner: neighbours", 1),
             _skill_set(log, skills),
+            self.task if isinstance(self.task, RewardMachine) else None,
         )
         self.gamma, self.caution, self.temperature = gamma, caution, temperature
         self._tried = Tried(self.graph)
@@ -221,6 +224,12 @@ class Planner(ReadySelector):
             rows = np.flatnonzero((skill == self.log.number(name)) & (call >= 0))
             found[name] = rows, from_numbers(space, self.log.goals[name][call[rows]])
         return found
+
+    @property
+    def compared(self) -> dict[str, list[int] | None]:
+        """The places in the flat observation that count, by skill; None: a function does."""
+        places = (each.places for each in self.graph.maps)
+        return dict(zip(self.log.skills, places, strict=True))
 
     def _goal_advice(self, name: str) -> str:
         return f"the log has no call of {name!r}, so record some"

@@ -1,0 +1,130 @@
+"""The numbers of observations by which calls are compared, where nobody names any."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from skillweave.planning.columns import CallColumns
+from skillweave.planning.lacking import read_log
+from skillweave.planning.machine import RewardMachine
+from skillweave.planning.neighbours import CONSTANT, nearest
+from skillweave.spaces import obs_codec, to_tensor
+from skillweave.types import Array
+
+MOST_STEPS = 0.5
+"""The share of steps in which a number has to change to be compared, if a skill does not see it."""
+FEWEST = 30
+"""Calls of a skill from which on it is measured whether a number says where they end."""
+MOST = 2_000
+"""The most calls that this is measured by."""
+NEIGHBOURS = 5
+BETTER = 0.95
+"""The error of predicted ends, relative to that without some numbers, below which they help."""
+READ = 2_000
+"""The steps by which it is measured whether a task reads a number."""
+
+Places = Sequence[int] | None
+
+
+def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tuple[Places, ...]:
+    """Return the places by which calls of each skill are compared; None: all.
+
+    They are the places that the skill sees, and those that change in most steps, as a position
+    does: these say where a call ends though the skill does not see them, behind which wall, for
+    example. A number that differs between episodes and never changes within one, as the place of a
+    goal, only divides the log: it counts where it helps to predict where the skill's calls end, or
+    where the task reads it.
+
+    Args:
+        log: the calls.
+        task: that is planned; None: the numbers are for any.
+    """
+    space = log.observation_space
+    codec = obs_codec(space)
+    if codec.images:
+        return tuple(log.sees)
+    before, after = (
+        codec.split(to_tensor(x))[0].reshape(len(x), -1).numpy() for x in (log.before, log.next_obs)
+    )
+    changes = (before != after).mean(0)
+    varies = before.std(0) > CONSTANT * np.maximum(1.0, np.abs(before.mean(0)))
+    fixed = np.flatnonzero((changes == 0) & varies).tolist()
+    moves = np.flatnonzero(changes > MOST_STEPS).tolist()
+    if fixed and task is not None and _reads_fixed(task, log):
+        fixed = []
+    start, end = before[log.offset[:-1]], after[log.offset[1:] - 1]
+    places: list[Places] = []
+    for skill, seen in enumerate(log.sees):
+        whole = range(codec.size) if seen is None else sorted({*seen, *moves})
+        doubtful = [place for place in whole if place in fixed]
+        rest = [place for place in whole if place not in fixed and varies[place]]
+        if doubtful and rest and not _help(log, skill, start, end, rest, doubtful):
+            places.append([place for place in whole if place not in fixed])
+        else:
+            places.append(seen if seen is None else whole)  # type: ignore[arg-type]
+    return tuple(places)
+
+
+def _help(
+    log: CallColumns, skill: int, start: Array, end: Array, rest: list[int], more: list[int]
+) -> bool:
+    """Return whether ``more`` numbers beside ``rest`` help to predict where a skill's calls end."""
+    rows = np.flatnonzero((log.skill == skill) & ~log.was_cut)  # a time limit cuts anywhere
+    if len(rows) < FEWEST:
+        return True
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(np.int64)]
+    moved = _standard(end[rows][:, rest].astype(np.float64) - start[rows][:, rest])
+    goal = log.goals.get(log.skills[skill])
+    own = np.zeros((len(rows), 0)) if goal is None else goal[rows]
+
+    def error(places: Collection[int]) -> float:
+        seen = np.concatenate([start[rows][:, list(places)], own], 1)
+        points = _standard(seen.astype(np.float64)).astype(np.float32)
+        near, _ = nearest(points, points, NEIGHBOURS + 1, np.arange(len(rows)))
+        others = near != np.arange(len(rows))[:, None]
+        mean = (moved[near] * others[..., None]).sum(1) / others.sum(1)[:, None]
+        return float(np.square(mean - moved).mean())
+
+    return error([*rest, *more]) < BETTER * error(rest)
+
+
+def _standard(values: Array) -> Array:
+    """Return values (n, F) with deviation 1; constant ones are 0."""
+    mean, deviation = values.mean(0), values.std(0)
+    varies = deviation > CONSTANT * np.maximum(1.0, np.abs(mean))
+    scaled: Array = np.where(varies, (values - mean) / np.where(varies, deviation, 1.0), 0.0)
+    return scaled
+
+
+def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:
+    """Return whether a task is another one with another episode's fixed numbers.
+
+    Raises:
+        RunError: see ``read_log``.
+    """
+    rng = np.random.default_rng(0)
+    calls = rng.permutation(len(log))
+    few = log.take(calls[: np.searchsorted(np.cumsum(log.tau[calls]), READ) + 1])
+    start, inside = few.start.copy(), few.next_obs.copy()
+    other = few.next_obs[rng.permutation(few.steps)]
+    for own, new in ((start, other[few.offset[:-1]]), (inside, other)):
+        arrays = (log.before, log.next_obs, own, new)
+        for first, then, mine, others in zip(*map(_leaves, arrays), strict=True):
+            np.copyto(mine, others, where=(first == then).all(0))
+    changed = read_log(task, replace(few, start=start, next_obs=inside))
+    known = read_log(task, few)
+    return not (
+        np.array_equal(known.events, changed.events)
+        and np.array_equal(known.values, changed.values)
+    )
+
+
+def _leaves(obs: Array) -> Iterator[Array]:
+    """Yield the innermost parts of observations (n, …), which share their memory."""
+    for name in obs.dtype.names or ():
+        yield from _leaves(obs[name])
+    if obs.dtype.names is None:
+        yield obs
