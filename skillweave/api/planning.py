@@ -29,7 +29,6 @@ from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
 from skillweave.seeding import Seeds
-from skillweave.skills.goal_spaces import choice_space
 from skillweave.training.imitation import imitate
 from skillweave.types import Policy
 
@@ -45,10 +44,8 @@ def planned(declared: D, policy: Policy, planner: Planner) -> tuple[D, Hierarchy
     """
     assert isinstance(policy, HierarchyPolicy)
     skills = replace(policy.skills, interruption=None)
-    names = tuple(s.name for s in skills.skills)
-    goals = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
-    spaces = policy.selector.observation_space, choice_space(skills.choices, goals, names)
-    selector: Any = planner.among(names).bind(*spaces, SELECTOR)
+    spaces = policy.selector.observation_space, skills.choice_space
+    selector: Any = planner.among(tuple(s.name for s in skills.skills)).bind(*spaces, SELECTOR)
     hierarchy = copy.copy(declared)
     spec = untasked(declared.spec)
     hierarchy.env = tasked(spec, planner)
@@ -91,7 +88,8 @@ def to_train(
     view = OwnView(spec.spaces.observation)
     skills = own_skills(replace(policy.skills, interruption=None), view, observed.spaces[0])
     guide = None
-    if target_kl is not None:
+    # A guide says nothing about goals, so one of a single skill would say nothing at all.
+    if target_kl is not None and (policy.skills.choices > 1 or not planner.log.goals):
         guide = Guide(OwnSelector(planner, view), restrict=False, target_kl=target_kl)
     return {
         "env": observed,
@@ -128,11 +126,16 @@ def start_of(
     obs, state = planner.situations(PAIRS, GOALS, (seeds / "pairs").numpy())
     may = policy.skills.startable(obs)
     may |= ~may.any(axis=1, keepdims=True)
-    chosen = np.where(may, planner.values(obs, state), -np.inf).argmax(1)
+    chosen, call = planner.choices(obs, state, may)
     chances = np.exp(as_logits(np.eye(log.choices, dtype=np.float32)[chosen], may)) * may
     view = OwnView(log.observation_space)
     seen = view.joined(obs, planner.machine.observe(state))
-    selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds)
+    with_goals = None
+    if log.goals:
+        space = policy.skills.choice_space
+        bound = planner.among(log.skills).bind(log.observation_space, space, SELECTOR)
+        with_goals = space, bound.with_goals(chosen, bound.goals_at(chosen, call), obs)
+    selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds, with_goals)
     names = tuple(skill.name for skill in policy.skills.skills)
     sha256 = selector.source()["sha256"]
     return {SELECTOR: Learnt(selector, sha256, log.steps, None, (names, log.lengths))}

@@ -21,6 +21,8 @@ from skillweave.planning.task_env import OwnView
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.foreign_policy import source_of
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -31,6 +33,7 @@ class OwnPolicy:
         policy: made for the environment's own observations.
         view: returns these.
         space: of the observations that hold the task's state.
+        goals: of the skill whose policy it is, which then also observes a goal; None: it has none.
     """
 
     not_exported = (
@@ -38,9 +41,12 @@ class OwnPolicy:
         "that its skills are from"
     )
 
-    def __init__(self, policy: Policy, view: OwnView, space: gym.Space[Any]) -> None:
-        self.policy, self._view = policy, view
-        self.observation_space, self.action_space = space, policy.action_space
+    def __init__(
+        self, policy: Policy, view: OwnView, space: gym.Space[Any], goals: Goals | None = None
+    ) -> None:
+        self.policy, self._view, self._goals = policy, view, goals
+        self.observation_space = space if goals is None else with_goal(space, goals.space)
+        self.action_space = policy.action_space
         self.labels = policy.labels
         self.start, self.acting = policy.start, policy.acting
 
@@ -55,7 +61,10 @@ class OwnPolicy:
     ) -> tuple[Array, Memory]:
         """Return the policy's actions (n, …)."""
         how: Any = {"deterministic": deterministic, "rng": rng}
-        return self.policy.act(memory, self._view.obs(obs), mask, **how)
+        if self._goals is None:
+            return self.policy.act(memory, self._view.obs(obs), mask, **how)
+        own = self._goals.join(self._view.obs(obs[OBSERVATION]), obs[GOAL])
+        return self.policy.act(memory, own, mask, **how)
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Let the policy notice a step."""
@@ -145,7 +154,10 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
         view: returns these.
         space: of the observations that hold the task's state.
     """
-    policies = tuple(_own_policy(policy, view, space) for policy in skills.policies)
+    policies = tuple(
+        _own_policy(policy, view, space, goals_of(skill))
+        for skill, policy in zip(skills.skills, skills.policies, strict=True)
+    )
     cuts = skills.interruption
     return replace(
         skills,
@@ -159,9 +171,11 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
     )
 
 
-def _own_policy(policy: Policy, view: OwnView, space: gym.Space[Any]) -> Policy:
+def _own_policy(
+    policy: Policy, view: OwnView, space: gym.Space[Any], goals: Goals | None
+) -> Policy:
     if not isinstance(policy, HierarchyPolicy):
-        return OwnPolicy(policy, view, space)
+        return OwnPolicy(policy, view, space, goals)
     selector: Any = policy.selector
     spaces = space, selector.action_space
     if isinstance(selector, ReadySelector):
@@ -191,6 +205,11 @@ def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
         for method in ("reward", "termination", "success")
         if skill.defines(method)
     }
+    if skill.goal_space is not None:
+        attributes["goal_space"] = skill.goal_space
+        attributes["goals"] = lambda self, obs, rng: skill.goals(view.obs(obs), rng)
+    if skill.defines("clip_goal"):
+        attributes["clip_goal"] = lambda self, obs, goal: skill.clip_goal(view.obs(obs), goal)
     if skill.defines("initiation"):
         attributes["initiation"] = lambda self, obs: skill.initiation(view.obs(obs))
     kind = type(type(skill).__name__, (Skill,), attributes | {"policy": policy})

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.call_end import Interruption
@@ -11,6 +13,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.errors import SkillError
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, asked, path_of
+from skillweave.skills.goal_spaces import choice_space
 from skillweave.types import Array, Policy
 
 
@@ -45,6 +48,12 @@ class SkillSet:
     def choices(self) -> int:
         """The number of choices: the first skill with each length, then the next skill."""
         return len(self.skills) * max(1, len(self.lengths))
+
+    @property
+    def choice_space(self) -> gym.Space[Any]:
+        """The space of choices; where skills have goals, a choice has some."""
+        goal_spaces = {s.name: s.goal_space for s in self.skills if s.goal_space is not None}
+        return choice_space(self.choices, goal_spaces, [s.name for s in self.skills])
 
     def mask(self, obs: Array, age: Array | None = None) -> Array | None:
         """Return the allowed choices, (n, choices) bool; None: all, everywhere.

@@ -16,7 +16,7 @@ from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.seeding import Seeds
-from skillweave.skills.goal_spaces import GOAL, SKILL, choice_space
+from skillweave.skills.goal_spaces import GOAL, SKILL
 from skillweave.skills.goals import as_goals
 from skillweave.spaces import pack, unpack
 from skillweave.spaces.choices import ChoiceSpace
@@ -52,10 +52,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.skills = skills
         self.num_envs = engine.num_envs
         self.single_observation_space = engine.observation_space
-        names = tuple(skill.name for skill in skills.skills)
-        spaces = {skill.name: skill.goal_space for skill in skills.skills}
-        goal_spaces = {name: space for name, space in spaces.items() if space is not None}
-        self.single_action_space = choice_space(skills.choices, goal_spaces, names)
+        self.single_action_space = skills.choice_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)

@@ -334,6 +334,14 @@ class ChoiceHead:
             entropy = entropy + torch.where(counts, spread, 0.0)
         return log_prob, entropy
 
+    def of_goals(self, dist_params: Tensor, log_std: Tensor | None, action: Tensor) -> Tensor:
+        """Compute log π(g | k) of choices (…, W), (…); 0 where the chosen skill has no goals."""
+        log_prob = torch.zeros_like(dist_params[..., 0])
+        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)[1]):
+            one = head.stats(params, std, None, self.codec.units(action, i))[0]
+            log_prob = log_prob + torch.where(chosen(action[..., 0], self._owners[i]), one, 0.0)
+        return log_prob
+
     def surplus(self, dist_params: Tensor, log_std: Tensor | None) -> Tensor | None:
         """Compute the cost of too much entropy of goals; see ``ActionHead``."""
         _, goals = self._split(dist_params, log_std)

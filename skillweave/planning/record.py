@@ -24,7 +24,7 @@ from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.skills.goal_spaces import GOAL, blank_choices, choice_space, from_numbers
+from skillweave.skills.goal_spaces import GOAL, blank_choices, from_numbers
 from skillweave.spaces import same_space
 from skillweave.types import Array, Memory, Memoryless
 
@@ -177,9 +177,7 @@ class WithDrawnGoals(Memoryless):
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
-    names = tuple(s.name for s in skills.skills)
-    goal_spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
-    choices: gym.Space[Any] = choice_space(skills.choices, goal_spaces, names)
+    names, choices = tuple(s.name for s in skills.skills), skills.choice_space
     chooses: Any = None
     if isinstance(choose, str) and choose == "random":
         chooses = RandomChoice(skills.choices)
@@ -189,7 +187,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     elif isinstance(choose, RandomChoice):
         chooses = choose
     if chooses is not None:
-        return WithDrawnGoals(chooses, skills, choices) if goal_spaces else chooses
+        return WithDrawnGoals(chooses, skills, choices) if goals_in(skills) else chooses
     if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
         if (ready := ready_selector(choose, names)) is not None:
             return ready.bind(engine.observation_space, choices, "selector")

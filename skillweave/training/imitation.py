@@ -28,7 +28,13 @@ RATE = 1e-3
 
 
 def imitate(
-    config: Any, obs: Array, may: Array, chances: Array, space: gym.Space[Any], seeds: Seeds
+    config: Any,
+    obs: Array,
+    may: Array,
+    chances: Array,
+    space: gym.Space[Any],
+    seeds: Seeds,
+    with_goals: tuple[gym.Space[Any], Array] | None = None,
 ) -> AgentPolicy:
     """Return a policy whose choices are as likely as given ones, by cross-entropy.
 
@@ -39,11 +45,13 @@ def imitate(
         chances: (n, choices), the probability of each choice.
         space: of ``obs``.
         seeds: of the network's first weights and of the order of rows.
+        with_goals: where skills have goals, the space of choices, and choices (n,) whose goals are
+            to be likely; None: they have none.
 
     Raises:
         DeclarationError: the network has a memory.
     """
-    choices = gym.spaces.Discrete(may.shape[1])
+    choices = gym.spaces.Discrete(may.shape[1]) if with_goals is None else with_goals[0]
     algorithm: Any = make_algorithm(config, space, choices)
     if algorithm.memory_size:
         raise DeclarationError(
@@ -53,6 +61,9 @@ def imitate(
     state = algorithm.init([seeds])
     rows = to_tensor(np.ascontiguousarray(pack(space, obs)))[None]
     mask, wanted = torch.from_numpy(may)[None], torch.from_numpy(np.float32(chances))[None]
+    action = None
+    if with_goals is not None:
+        action = torch.from_numpy(algorithm.head.codec.from_env(with_goals[1]))[None]
     rng = (seeds / "rows").torch()
     with torch.enable_grad(), torch_threads(1):
         algorithm.update_obs_stats(state, rows)
@@ -60,9 +71,12 @@ def imitate(
             some = torch.randint(len(obs), (min(BATCH, len(obs)),), generator=rng)
             leaves = algorithm.layout.leaves(state.params)
             params = algorithm.learning_params(state)
-            logits = algorithm.actor_net(leaves, algorithm.inputs(params, rows[:, some]))
-            logits = mask_logits(logits, mask[:, some])
+            found = algorithm.actor_net(leaves, algorithm.inputs(params, rows[:, some]))
+            logits = mask_logits(found[..., : may.shape[1]], mask[:, some])
             loss = -(wanted[:, some] * logits.log_softmax(-1)).sum(-1).mean(1)
+            if action is not None:
+                std = leaves.get("actor.log_std")
+                loss = loss - algorithm.head.of_goals(found, std, action[:, some]).mean(1)
             gradient = algorithm.layout.gradient(loss, leaves)
             rate = torch.full_like(loss.detach(), RATE * (1.0 - step / GRADIENT_STEPS))
             adam_(state.params, gradient, state.mu, state.nu, state.count, rate)

@@ -111,6 +111,7 @@ def test_a_goal_that_failed_is_not_repeated_forever() -> None:
     assert len(aims) <= 4
 
 
+@pytest.mark.slow
 def test_a_mission_of_places_that_no_training_saw() -> None:
     run = ready()
     log = run.log_calls(4_000, num_envs=8)
@@ -121,6 +122,7 @@ def test_a_mission_of_places_that_no_training_saw() -> None:
     assert np.mean(np.array(random.returns) > 0.99) < 0.5
 
 
+@pytest.mark.slow
 def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
     run = ready()
     log = run.log_calls(1_500, num_envs=8)
@@ -165,7 +167,13 @@ def test_goals_from_their_numbers(space: str) -> None:
     assert back.tobytes() == drawn.tobytes()
 
 
-@pytest.mark.parametrize("space", ["number", "numbers", "dict", "tuple", "bits"])
+@pytest.mark.parametrize(
+    "space",
+    [
+        "number",
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("numbers", "dict", "tuple", "bits")),
+    ],
+)
 def test_plans_with_goals_of_other_kinds(space: str) -> None:
     run = ready(space)
     log = run.log_calls(1_500, num_envs=8)
@@ -192,6 +200,7 @@ def test_hand_over_and_chains_go_by_skill() -> None:
     assert 0 < log.chain("go_to", "go_to").estimate <= 1
 
 
+@pytest.mark.slow
 def test_lengths_are_chosen_with_goals() -> None:
     run = ready(selector=sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1),
                 call_steps=sw.Lengths(2, 4, 8))  # fmt: skip
@@ -209,3 +218,23 @@ def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
         planned = run.plan(lambda obs: obs[:, 0] > -5, rests)
     assert planned.evaluate(3, quiet=True).mean == 1.0
     assert isinstance(Rest(), sw.Skill)
+
+
+@pytest.mark.slow
+def test_a_trained_selector_starts_from_a_plan_with_goals(tmp_path: Any) -> None:
+    run = ready()
+    log = run.log_calls(3_000, num_envs=8)
+    planned = run.plan(near(1.4, 0.3), log)
+    config = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1, learning_rate=1e-9)
+    declared_again = planned.with_selector(config, steps=32)
+    trained = declared_again.train(tmp_path / "run", quiet=True)
+    rate = trained.evaluate(20, quiet=True).success_rate
+    untaught = planned.with_selector(config, steps=32)
+    untaught._starts = type(untaught)._starts
+    other = untaught.train(tmp_path / "other", quiet=True).evaluate(20, quiet=True).success_rate
+    assert rate is not None
+    assert other is not None
+    assert rate >= 0.6
+    assert other <= 0.2
+    again = declared_again.load(tmp_path / "run")
+    assert again.evaluate(3, quiet=True).returns == trained.evaluate(3, quiet=True).returns
