@@ -45,6 +45,12 @@ CANDIDATES = 32
 """The nearest calls of a skill with goals, whose goals are the options."""
 MOST_APART = 64
 """Goals up to which each is an option of its own everywhere, as another skill would be."""
+FURTHER = 2.0
+"""A neighbour counts only if it is at most so many times as far as the nearest, or no further than
+usual: where the log has few calls, others are often behind a wall, and a small chance to pass it
+would grow with each call that is tried again."""
+SAMPLED = 500
+"""Starts by which it is measured what is usual."""
 MOST_SWEEPS = 2_000
 TOLERANCE = 1e-4
 """Value iteration ends where no value changes by more than this share of the largest."""
@@ -422,6 +428,16 @@ class Options:
         return mine[near], far
 
 
+def _sampled(places: Array) -> Array:
+    """Return some places (m,), at equal distances."""
+    return places[np.linspace(0, len(places) - 1, min(len(places), SAMPLED)).astype(np.int64)]
+
+
+def _without_far(far: Array, usual: float) -> Array:
+    """Return distances (…, k), infinite where they are too far to count."""
+    return np.where(far <= np.maximum(FURTHER * far[..., :1], usual), far, np.float32(np.inf))
+
+
 class Apart(Options):
     """Options whose calls do not count for one another: one, or a few goals.
 
@@ -434,13 +450,27 @@ class Apart(Options):
         super().__init__(rows, starts, call)
         self.count, self._goal = len(goal), goal
         self._mine = [np.flatnonzero(which == option) for option in range(len(goal))]
+        self._usual: dict[int, list[float]] = {}
 
     def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
         """Return the nearest pieces of each goal; see ``Options.near``."""
-        found = [self._nearest(mine, to, k, without) for mine in self._mine]
+        if k not in self._usual:
+            self._usual[k] = [self._usually(mine, k) for mine in self._mine]
+        found = []
+        for mine, usual in zip(self._mine, self._usual[k], strict=True):
+            places, far = self._nearest(mine, to, k, without)
+            found.append((places, _without_far(far, usual)))
         places, far = (np.stack(part, 1) for part in zip(*found, strict=True))
         pieces = self._rows[places] if len(self._rows) else places
         return pieces, far, np.repeat(self._goal[None], len(to), axis=0)
+
+    def _usually(self, mine: Array, k: int) -> float:
+        """Return the median distance of a start's k-th neighbour among others."""
+        some = _sampled(mine)
+        if not len(some):
+            return np.inf
+        far = self._nearest(mine, self._starts[some], k, self._call[some])[1]
+        return float(np.median(far[:, -1]))
 
 
 class ByGoal(Options):
@@ -454,9 +484,19 @@ class ByGoal(Options):
         super().__init__(rows, starts, call)
         self.count, self._goals = CANDIDATES, goals
         self._all = np.arange(len(rows))
+        self._usual: dict[int, float] = {}
 
     def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
         """Return the pieces that are nearest by start and goal; see ``Options.near``."""
+        if k not in self._usual:
+            some = _sampled(self._all)
+            usual = self._near(self._starts[some], k, self._call[some])[1][:, :, -1]
+            self._usual[k] = float(np.median(usual))
+        pieces, far, goal = self._near(to, k, without)
+        return pieces, _without_far(far, self._usual[k]), goal
+
+    def _near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
+        """Return what ``near`` does, with those that are too far to count."""
         shape = (len(to), CANDIDATES, k)
         pieces, far = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
         goal = np.full(shape[:2], -1)
