@@ -249,6 +249,7 @@ class Rollout:
     call_start: Tensor | None = None  # (P, T, B) bool, a call starts here; for critics of skills
     env_reward: Tensor | None = None  # (P, T, B), the environment's own, where it is needed
     reference: Reference | None = None  # the policy that the learner stays near
+    rehearsal: Rehearsal | None = None  # observations in which it keeps what it did
     progress: float = 0.0  # share of the budget that is spent, for schedules
 
 
@@ -259,6 +260,15 @@ class Reference:
     params: Any | None  # ``ActingParams`` of P members; None: ``Rollout.guide`` is its choice
     coef: Tensor  # (P,), the cost of one nat of KL from it
     target_kl: float = 0.0  # the KL from it that the cost is adapted to
+
+
+@dataclass(slots=True)
+class Rehearsal:
+    """K observations, not of the rollout, in which a learner keeps what an earlier policy did."""
+
+    obs: Tensor  # (P, K, *obs_shape)
+    dist_params: Tensor  # (P, K, H), of the earlier policy there, without a mask
+    log_std: Tensor | None  # (P, 1, A), of the earlier policy; None: no parameter of its own
 
 
 @dataclass(slots=True)

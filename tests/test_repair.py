@@ -14,10 +14,12 @@ import pytest
 from small_runs import assert_same
 
 import skillweave as sw
+from skillweave.algorithms import ppo
 from skillweave.api import Run
+from skillweave.collecting import skill_collector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
-from skillweave.planning import HandOver, Mission
+from skillweave.planning import HandOver, Mission, record_calls
 from skillweave.runs.directory import RunDirectory
 
 
@@ -161,6 +163,34 @@ def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: P
     assert sw.load(run.path, declare()).info()["stages"] == run.info()["stages"]
     with pytest.raises(DeclarationError, match="there is nothing to repair"):
         repaired(new, tmp_path / "newer")
+
+
+@pytest.mark.parametrize("rehearses", [True, False])
+def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rehearses: bool
+) -> None:
+    # All episodes start after the other skill, so nothing else keeps what was learnt at the start.
+    monkeypatch.setattr(skill_collector, "NAMED_SHARE", 1.0)
+    if not rehearses:
+        monkeypatch.setattr(ppo, "REHEARSAL_COST", 0.0)
+    (result,) = repaired(run, tmp_path / "new").repairs
+    assert result.later.of("press", "flip")[0] > 0.9
+    assert result.before.of("press")[0] > 0.9
+    kept = result.later.of("press")[0]
+    assert kept > 0.9 if rehearses else kept < 0.5
+
+
+def test_observations_of_done_calls_are_rehearsed(run: Run) -> None:
+    log = record_calls(SPEC, run.policy, 600, num_envs=4)
+    skill = run.hierarchy.skill("press")
+    obs = repair.rehearsed_obs(log, skill, "flip", None)
+    assert obs is not None
+    assert (obs[:, 0] == 1).all(), "after the flip no call is done"
+    done = log.succeeded & (log.skill == 0)
+    assert len(obs) == log.tau[done].sum()
+    assert repair.rehearsed_obs(log, skill, "press", None) is not None
+    failed = log.take(np.flatnonzero(~log.succeeded))
+    assert repair.rehearsed_obs(failed, skill, "flip", None) is None
 
 
 def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:

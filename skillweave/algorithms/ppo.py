@@ -22,7 +22,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_now
 from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Report, Rollout
+from skillweave.experience import Reference, Rehearsal, Report, Rollout
 from skillweave.networks.heads import head_of
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
@@ -38,6 +38,8 @@ from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
+REHEARSAL_COST = 1.0
+"""Cost of a nat of KL in the rehearsal's observations, where advantages have a deviation of 1."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
@@ -175,6 +177,7 @@ class PPOAlgorithm(Algorithm):
         count = samples.count
         limited = self._kl_limit is not None
         names = REPORT if terms.reference is None else (*REPORT, "reference_kl")
+        names = names if terms.rehearsal is None else (*names, "rehearsal_kl")
         steps = torch.zeros_like(rate)
         sums = rate.new_zeros(len(names), len(rate))
         compiles = cfg.compile and not self.memory_size
@@ -184,6 +187,9 @@ class PPOAlgorithm(Algorithm):
         active = count > 0
         all_learn = not limited and samples.valid is None
         for minibatch in minibatches(samples, rng, cfg.update_epochs, cfg.batch_size):
+            if batch.rehearsal is not None:
+                size = minibatch.advantage.shape[1]
+                terms.rehearsal = self._drawn(state, batch.rehearsal, size, rng)
             report, learns = learn(state, leaves, minibatch, terms, None if all_learn else active)
             steps = steps + active
             sums.addcmul_(torch.stack([report[k] for k in names]), active.float())
@@ -277,7 +283,31 @@ class PPOAlgorithm(Algorithm):
             divergence = self.head.kl(dist_params, log_std, batch.reference, other, batch.mask)
             report["reference_kl"] = masked_mean(divergence, acted)
             total = total + terms.reference.coef * report["reference_kl"]
+        if terms.rehearsal is not None:
+            report["rehearsal_kl"] = self.rehearsal_kl(views, log_std, terms.rehearsal)
+            total = total + REHEARSAL_COST * report["rehearsal_kl"]
         return total, {k: v.detach() for k, v in report.items()}
+
+    def rehearsal_kl(
+        self, views: Views, log_std: Tensor | None, rehearsal: RehearsalRows
+    ) -> Tensor:
+        """Return the mean KL(earlier ‖ present policy) in a rehearsal's observations, (P,).
+
+        As in kickstarting (Schmitt et al. 2018), with the earlier policy as the teacher.
+        """
+        present = self.actor_net(views, rehearsal.inputs)
+        earlier = rehearsal.dist_params, rehearsal.log_std
+        return self.head.kl(*earlier, present, log_std, None).mean(1)
+
+    def _drawn(
+        self, state: State, rehearsal: Rehearsal, count: int, rng: Sequence[torch.Generator]
+    ) -> RehearsalRows:
+        """Draw ``count`` observations of a rehearsal for each member."""
+        size = rehearsal.obs.shape[1]
+        rows = torch.stack([torch.randint(size, (count,), generator=g, device="cpu") for g in rng])
+        rows = rows.to(rehearsal.obs.device)
+        inputs = self.inputs(self.learning_params(state), take_rows(rehearsal.obs, rows))
+        return RehearsalRows(inputs, take_rows(rehearsal.dist_params, rows), rehearsal.log_std)
 
     def run(
         self,
@@ -303,6 +333,15 @@ class PPOAlgorithm(Algorithm):
         return raw.squeeze(-1) * state.return_scale + state.return_mean
 
 
+@dataclass(slots=True)
+class RehearsalRows:
+    """B observations of a rehearsal for each of P members."""
+
+    inputs: Inputs
+    dist_params: Tensor  # (P, B, H), of the earlier policy
+    log_std: Tensor | None  # (P, 1, A), of the earlier policy
+
+
 @dataclass
 class Terms:
     """The loss terms of one update that schedules and the stage determine."""
@@ -310,6 +349,7 @@ class Terms:
     rate: Tensor  # (P,), Adam's step size
     ent_coef: Tensor  # (P,)
     reference: Reference | None
+    rehearsal: RehearsalRows | None = None  # of the present minibatch
 
     @classmethod
     def of(cls, config: PPO, state: Any, rollout: Rollout) -> Terms:

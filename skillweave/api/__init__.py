@@ -909,10 +909,12 @@ class Run:
     ) -> Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
-        Half of the episodes begin after a call of the other skill; the others as usual, so that the
-        skill does not forget. Before and after, calls are recorded, and the hand-overs counted: the
-        new weights are kept if this one is clearly better and no other one clearly worse. All other
-        weights stay as they are. What was done is in ``Run.repairs``.
+        Half of the episodes begin after a call of the other skill, the others as usual. A skill of
+        PPO without a memory also rehearses: the KL from its earlier policy has a cost in the
+        observations of its calls that were done elsewhere (kickstarting, Schmitt et al. 2018), so
+        that it does not forget. Before and after, calls are recorded, and the hand-overs counted:
+        the new weights are kept if this one is clearly better and no other one clearly worse. All
+        other weights stay as they are. What was done is in ``Run.repairs``.
 
         Args:
             skill: the skill that fails, by its path.

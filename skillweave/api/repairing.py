@@ -24,6 +24,7 @@ from skillweave.hierarchy.repair import (
     Measured,
     matrix_to_json,
     measure,
+    rehearsed_obs,
     repair_stage,
 )
 from skillweave.hierarchy.roles import Roles, roles_of
@@ -32,7 +33,9 @@ from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.callback import Callback
+from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
+from skillweave.types import Array
 
 D = TypeVar("D", bound=Declaration)
 
@@ -105,7 +108,11 @@ def repair(
     reason = str(found.log.blame(name_of(skill), name_of(after), done))
     entry["repair"]["blame"] = reason
     content |= {"stages": [entry], "seed": seed}
-    base = Base(entries, partial(_write, policies=policies), "repair")
+    rehearsal = None
+    if can_rehearse(learnt.algorithm):
+        rehearsal = rehearsed_obs(found.log, roles[skill].skill, name_of(after), done)
+    write = partial(_write, policies=policies, stage=entry["name"], rehearsal=rehearsal)
+    base = Base(entries, write, "repair")
     return begin(
         declared,
         content,
@@ -264,7 +271,9 @@ def _content(
     return content, entries, policies
 
 
-def _write(run: RunDirectory, policies: Policies) -> None:
-    """Write the policies of the stages that are done."""
-    for stage, by_name in policies.items():
-        run.save_policies(stage, by_name)
+def _write(run: RunDirectory, policies: Policies, stage: str, rehearsal: Array | None) -> None:
+    """Write the policies of the stages that are done, and the observations of a rehearsal."""
+    for name, by_name in policies.items():
+        run.save_policies(name, by_name)
+    if rehearsal is not None:
+        save_rehearsal(run, stage, rehearsal)

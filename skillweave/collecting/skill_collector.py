@@ -56,6 +56,7 @@ class SkillCollector(Collector):
         episode_calls: the most calls of the skill in an episode.
         start_after: names among ``starters``; in half of the episodes a call of one of them comes
             last before the skill starts.
+        call_limit: the most steps of a call of the skill; None: its ``max_steps``.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class SkillCollector(Collector):
         search_steps: int | None = None,
         episode_calls: int = 1,
         start_after: tuple[str, ...] = (),
+        call_limit: int | None = None,
     ) -> None:
         super().__init__(engine)
         if acting is not None:
@@ -76,6 +78,9 @@ class SkillCollector(Collector):
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
+        self._call_limit = call_limit
+        if call_limit is None and skill is not None:
+            self._call_limit = skill.max_steps
         n = self.num_envs
         self._never = np.zeros(n, bool)
         size = 0 if acting is None else acting.memory_size
@@ -118,7 +123,9 @@ class SkillCollector(Collector):
         """Return a collector of the same kind over other environments."""
         starters = self._starters.skills if self._searches else None
         how = self._start_calls, self._search_steps, self._episode_calls, self._start_after
-        return SkillCollector(engine, acting, self.skill, self.reflexes, starters, *how)
+        return SkillCollector(
+            engine, acting, self.skill, self.reflexes, starters, *how, self._call_limit
+        )
 
     def _prepare(self, request: Request) -> None:
         self.acting.begin(request)
@@ -263,8 +270,8 @@ class SkillCollector(Collector):
     ) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
         end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
-        if skill is not None and skill.max_steps is not None:
-            end[elapsed >= skill.max_steps] = LIMIT
+        if self._call_limit is not None:
+            end[elapsed >= self._call_limit] = LIMIT
         if skill is not None and step is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
             if len(rows):

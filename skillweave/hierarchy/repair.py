@@ -15,8 +15,11 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.paths import level_of, name_of
 from skillweave.planning import CallLog, HandOver, join, record_calls
+from skillweave.planning.hand_over import before_each, calls_done
 from skillweave.planning.record import RandomChoice
 from skillweave.runs.directory import RunDirectory
+from skillweave.skills import Skill
+from skillweave.skills.goals import goals_of
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
@@ -72,6 +75,7 @@ def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
 
     def learning_task(policies: Policies) -> LearningTask:
         others = {p: policy_at(roles, policies, p) for p in level.skills if p != path}
+        whole = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
         return skill_task(
             role,
             level.reflexes,
@@ -79,6 +83,8 @@ def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
             0 if calls is None else START_CALLS,
             level.apart.search_steps,
             start_after=(name_of(repair["after"]),),
+            # Calls are what counts, and steps beyond their limit would take steps from the starts.
+            call_limit=whole.limit(list(level.skills).index(path)),
         )
 
     assert role.config is not None
@@ -192,6 +198,30 @@ def measure(
 def _sum(one: HandOver, other: HandOver) -> HandOver:
     counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "cut")}
     return replace(one, **counts)
+
+
+def rehearsed_obs(
+    log: CallLog, skill: Skill, after: str, done: Mapping[str, Any] | None
+) -> Array | None:
+    """Return the observations in which a skill keeps what it does while it is repaired, (n, …).
+
+    They are those inside its calls that were done; not after the skill after which it is repaired,
+    as there it is to change. None: there are none.
+
+    Args:
+        log: its calls, each with the call before it.
+        done: as for ``hand_over``.
+    """
+    won = calls_done(log, done)
+    before = before_each(log, won)
+    calls = won & (log.skill == log.number(skill.name)) & (before != log.number(after) + 1)
+    steps = calls[log.owner]
+    if not steps.any():
+        return None
+    obs, goals = log.before[steps], goals_of(skill)
+    if goals is None:
+        return obs
+    return goals.join(obs, goals.from_flat(log.goals[skill.name])[log.owner[steps]])
 
 
 def matrix_to_json(matrix: HandOver) -> dict[str, Any]:

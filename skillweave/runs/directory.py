@@ -10,6 +10,7 @@ calls.safetensors            calls of the skills (``planning/run_log.py``)
 policies/<stage>.safetensors policies of finished stages
 states/<name>.safetensors    states of learners that continue in a later stage, until that is done
 starts/<name>.safetensors    initial policies from another run, until their learner's stage is done
+starts/<stage>.safetensors   observations of a repair's rehearsal, until the repair is done
 final/<stage>.safetensors    final states, from which finished stages can train for more steps
 policies/<skill>.*           copies of ready policies: .onnx; a torch module's weights
 .lock                        locked by the process that trains the run; its number and machine

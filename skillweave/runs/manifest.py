@@ -154,6 +154,8 @@ class RepairEntry(TypedDict):
     """Skills whose calls were judged by an event that the caller gave."""
     blame: str
     """A sentence on the reason of the failure."""
+    rehearsal: NotRequired[str]
+    """Checksum of the file of its rehearsal's observations."""
     before: Matrix
     later: NotRequired[Matrix]
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from skillweave.algorithms.base import ActingParams
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
-from skillweave.experience import Batch, Reference
+from skillweave.experience import Batch, Reference, Rehearsal
 from skillweave.seeding import Seeds
 from skillweave.types import Array, prefixed, unprefixed
 
@@ -101,6 +101,8 @@ class RolloutLearner:
         self._store = RolloutStore(stack.members, quota, stack.state.params.device)
         self.reference: Reference | None = None
         """The reference policy that it stays near; None: without one."""
+        self.rehearsal: Rehearsal | None = None
+        """Observations in which it keeps what an earlier policy did; None: it may change all."""
         self._progress = 0.0  # at the start of the rollout, so that the first has the whole rate
         self._resumed: ActingParams | None = None  # of the first request after a checkpoint
 
@@ -131,6 +133,7 @@ class RolloutLearner:
         rollout = self._store.rollout(gamma, self._progress, reference)
         if rollout is None:
             return {}
+        rollout.rehearsal = self.rehearsal
         seeds = member_seeds(self._seeds, "learn", stack.members, update)
         generators = [s.torch() for s in seeds]
         with torch.enable_grad():  # the user may have switched gradients off

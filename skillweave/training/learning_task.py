@@ -86,6 +86,7 @@ def skill_task(
     search_steps: int | None = None,
     episode_calls: int = 1,
     start_after: tuple[str, ...] = (),
+    call_limit: int | None = None,
 ) -> LearningTask:
     """Return the learning task of a skill's stage, or of a plain agent's.
 
@@ -96,8 +97,9 @@ def skill_task(
         search_steps: reset an episode in which the skill cannot start within this many steps.
         episode_calls: the most calls of the skill in an episode.
         start_after: names among ``starters``; half of the episodes start after a call of one.
+        call_limit: the most steps of a call; None: the skill's own limit.
     """
-    search = start_calls, search_steps, episode_calls, start_after
+    search = start_calls, search_steps, episode_calls, start_after, call_limit
     spec, skill = role.spec, role.skill
 
     def collector(

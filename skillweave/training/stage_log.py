@@ -21,6 +21,7 @@ from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.keep_best import KeepBest
+from skillweave.training.rehearsal import remove_rehearsal
 
 ENOUGH = 20
 """Episodes after which a logged key of ``info`` that never occurred is reported."""
@@ -294,6 +295,7 @@ class StageLog:
         self.run.drop_checkpoints()
         drop_states(self.run, entry["name"])
         remove_initial_policies(self.run, entry["name"])
+        remove_rehearsal(self.run, entry)
         for listener in self.listeners:
             listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
 

@@ -32,6 +32,7 @@ from skillweave.training.learning_task import LearningTask
 from skillweave.training.logged_calls import begin_calls, save_logged
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.rehearsal import rehearse, remove_rehearsal
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import START, Listener, StageLog, resumed
@@ -117,6 +118,7 @@ class OneAgent:
             goes_on_at=log.at["steps"],
         )
         keep_to_guide(learner, stage.entry.get("guide_kl"))
+        rehearse(learner, stage.run, stage.entry, stage.policies.get(stage.learner))
         starts = stage.entry.get("starts", {})
         learnt_before = stage.learner in stage.policies or stage.name in starts
         if learnt_before and isinstance(learner, ReplayLearner):
@@ -318,6 +320,7 @@ def train_stage(
     entry = run.stage(stage.name)
     if entry["status"] == "done":
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
+        remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
     earlier = policies or {}
     learning_task = stage.learning_task(earlier)

@@ -11,8 +11,8 @@ from toys import Toy, learn
 
 from skillweave import PPO, Network
 from skillweave.algorithms.parameters import epsilon_now
-from skillweave.algorithms.policy import make_algorithm
-from skillweave.algorithms.ppo import Terms, samples_of
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.ppo import RehearsalRows, Terms, samples_of
 from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Rollout
 from skillweave.networks.heads import ActionHead
@@ -20,6 +20,7 @@ from skillweave.ops.distributions import with_epsilon
 from skillweave.seeding import Seeds
 from skillweave.spaces import action_codec
 from skillweave.training.learner import adapted
+from skillweave.training.rehearsal import rehearsal_of
 
 SEEN = gym.spaces.Box(-1, 1, (3,), np.float32)
 SMALL = Network(hidden=(8,))
@@ -91,6 +92,55 @@ def test_divergence_of_heads_is_that_of_their_distributions():
         Independent(Normal(a, std.exp()), 1), Independent(Normal(b, other.exp()), 1)
     )
     torch.testing.assert_close(box.kl(a, std, b, other, None), want)
+
+
+@pytest.mark.parametrize(
+    ("space", "earlier", "present", "log_std", "want"),
+    [
+        # Probabilities 1/4 and 3/4, then 1/2 each: 1/4 ln(1/2) + 3/4 ln(3/2).
+        (gym.spaces.Discrete(2), (0.0, np.log(3.0)), (0.0, 0.0), None, 0.1308),
+        # Means 1 apart, deviations 1 and 2: ln 2 + (1 + 1) / (2 · 4) − 1/2.
+        (gym.spaces.Box(-1, 1, (1,), np.float32), (1.0,), (0.0,), (0.0, np.log(2.0)), 0.4431),
+    ],
+    ids=["choices", "numbers"],
+)
+def test_a_rehearsal_costs_the_divergence_from_the_earlier_policy(
+    space, earlier, present, log_std, want
+):
+    algorithm = make_algorithm(PPO(network=SMALL, normalize_obs=False), SEEN, space)
+    state = algorithm.init([Seeds(0)])
+    views = algorithm.layout.views(state.params)
+    views[f"{algorithm.actor_net.head}.weight"].zero_()
+    views[f"{algorithm.actor_net.head}.bias"].copy_(torch.tensor(present))
+    before, now = (None, None) if log_std is None else torch.tensor(log_std).view(2, 1, 1, 1)
+    rows = RehearsalRows(
+        algorithm.inputs(algorithm.learning_params(state), torch.zeros(1, 5, 3)),
+        torch.tensor(earlier).expand(1, 5, len(earlier)),
+        before,
+    )
+    found = algorithm.rehearsal_kl(views, now, rows)
+    torch.testing.assert_close(found, torch.tensor([want]), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)])
+def test_a_rehearsed_observation_keeps_its_actions_and_others_do_not(space):
+    config = PPO(network=SMALL, update_epochs=8, learning_rate=1e-2, batch_size=32)
+    algorithm, moved = make_algorithm(config, SEEN, space), []
+    for rehearses in (False, True):
+        state = algorithm.init([Seeds(0)])
+        algorithm.update_obs_stats(state, rollout_of(algorithm, state).obs.flatten(1, 2))
+        policy = AgentPolicy.of(algorithm, state)
+        seen = torch.randn(32, 3, generator=torch.Generator().manual_seed(9)) + 3.0
+        kept = rehearsal_of(policy, seen, torch.device("cpu"))
+        for update in range(8):
+            rollout = rollout_of(algorithm, state, update, rehearsal=kept if rehearses else None)
+            _, report = algorithm.update(state, rollout, [Seeds(update).torch()])
+            assert ("rehearsal_kl" in report.metrics) == rehearses
+        params = algorithm.learning_params(state)
+        now = algorithm.inputs(params, kept.obs)
+        rows = RehearsalRows(now, kept.dist_params, kept.log_std)
+        moved.append(algorithm.rehearsal_kl(params.views, params.views.get("actor.log_std"), rows))
+    assert moved[1] < 0.2 * moved[0]
 
 
 def rollout_of(algorithm, state, seed=0, **more):
