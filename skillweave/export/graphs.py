@@ -22,8 +22,10 @@ from torch import Tensor, nn
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import MissingExtra, PolicyError
+from skillweave.networks.heads import ChoiceHead
 from skillweave.ops.device import BOOL, FLOAT
-from skillweave.spaces import obs_dtype, obs_shape
+from skillweave.spaces import ActionCodec, ChoiceCodec, ChoiceSpace, obs_dtype, obs_shape
+from skillweave.spaces.choices import NumberedChoiceCodec
 from skillweave.spaces.packing import parts
 
 OPSET = 18
@@ -65,6 +67,42 @@ def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:
     return [leaf for k, part in inner.items() for leaf in leaves_of(part, f"{name}.{k}")]
 
 
+def inputs_of(space: gym.Space[Any]) -> list[list[Any]]:
+    """Return for each leaf its name, its fields in the packed array, and its keys."""
+
+    def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
+        inner = parts(space)
+        if inner is None:
+            return [[".".join(["obs", *fields]), fields, keys]]
+        places = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
+        return [
+            leaf
+            for (name, part), key in zip(inner.items(), places, strict=True)
+            for leaf in within(part, [*fields, name], [*keys, key])
+        ]
+
+    leaves = within(space, [], [])
+    assert [name for name, _, _ in leaves] == [leaf.name for leaf in leaves_of(space)]
+    return leaves
+
+
+def dtype_to_json(dtype: np.dtype[Any]) -> Any:
+    """Return a dtype as JSON that ``numpy.dtype`` reads."""
+    if dtype.subdtype is not None:
+        base, shape = dtype.subdtype
+        return f"({','.join(map(str, shape))},){base.str}"
+    if dtype.names is None:
+        return dtype.str
+    assert dtype.fields is not None
+    fields = [dtype.fields[name][:2] for name in dtype.names]
+    return {
+        "names": list(dtype.names),
+        "formats": [dtype_to_json(d) for d, _ in fields],
+        "offsets": [at for _, at in fields],
+        "itemsize": dtype.itemsize,
+    }
+
+
 class _Acting(nn.Module):
     """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
 
@@ -80,10 +118,14 @@ class _Acting(nn.Module):
         left = list(given)
         obs: Any = [left.pop(0)[None] for _ in range(self.leaves)]
         mask = left.pop(0)[None] if self.inputs.choices else None
+        if mask is not None and isinstance(algorithm.codec, NumberedChoiceCodec):
+            mask = mask[..., torch.from_numpy(algorithm.codec.number_of_choice)]
         memory = left.pop(0)[None] if self.inputs.memory else None
         noise: Any = left[0][None] if left else None
         if self.inputs.noise and self.inputs.noise[0][0] == "random":
             noise = (noise, left[1] if len(left) > 1 else None)
+        elif len(left) > 1:
+            noise = torch.cat(left, dim=-1)[None]
         action, _, after = algorithm.act(self.policy.params, obs, mask, noise, memory)
         done = in_env_units(algorithm, action[0])
         return (done,) if after is None else (done, after[0])
@@ -118,6 +160,8 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
     algorithm = policy.algorithm
     leaves = leaves_of(policy.observation_space)
     choices = algorithm.codec.size if algorithm.codec.discrete else 0
+    if isinstance(policy.action_space, ChoiceSpace):
+        choices = policy.action_space.choices
     noise = _noise_of(algorithm) if sampled else ()
     graph = Graph(b"", choices, algorithm.memory_size, noise)
     given = {leaf.name: leaf.example() for leaf in leaves}
@@ -142,12 +186,29 @@ def worth_graph(critic: AgentPolicy, where: str) -> Graph:
 
 
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
-    """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``."""
-    codec = algorithm.codec
-    space = algorithm.action_space
+    """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``.
+
+    A choice of a skill with its goal becomes a row of numbers, ``ChoiceSpace.rows``.
+    """
+    codec, head = algorithm.codec, getattr(algorithm, "head", None)
+    if isinstance(codec, NumberedChoiceCodec):
+        space: Any = codec.space
+        return torch.from_numpy(space.rows(codec.table))[action]
+    if not isinstance(codec, ChoiceCodec):
+        return _in_env_units(codec, action, getattr(head, "squash", False))
+    assert isinstance(head, ChoiceHead)
+    parts = [action[..., :1]]
+    for i, goal in enumerate(head.goals):
+        in_env = _in_env_units(goal.codec, codec.units(action, i), goal.squash)
+        parts.append(in_env.reshape(1, -1))
+    return torch.cat([x.double() for x in parts], dim=1)
+
+
+def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:
+    space = codec.space
     shape = (1, *(space.shape or ()))
     dtype = torch.from_numpy(np.empty(0, space.dtype)).dtype
-    if getattr(getattr(algorithm, "head", None), "squash", False):
+    if squash:
         action = action.tanh()
     if codec.discrete:
         action = action if codec.low is None else action + torch.from_numpy(np.asarray(codec.low))
@@ -170,6 +231,8 @@ def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
     """Return the noise that an algorithm's ``act`` takes, for one observation."""
     noise = algorithm.noise([torch.Generator()], 1, 1)[0]
     if isinstance(noise, Tensor):
+        if isinstance(algorithm.codec, ChoiceCodec):
+            return algorithm.head.noises
         kind = "gumbel" if algorithm.codec.discrete else "standard_normal"
         return ((kind, noise.numel()),)
     uniform, normal = noise  # DQN's: of ε, and of the weights

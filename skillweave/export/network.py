@@ -15,7 +15,8 @@ from skillweave.settings import Check
 from skillweave.skills.mapping import Part, PolicyMapping, Source
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.plan import leaves_of
-from skillweave.types import Array
+from skillweave.spaces import ChoiceSpace
+from skillweave.types import Array, Memory
 
 FileName = Annotated[
     str,
@@ -69,6 +70,32 @@ class ExportedNetwork(OnnxPolicy):
             state=tuple((name, f"{name}.after") for name in entry["memory"]),
         )
         super().__init__(content, file, None, observation_space, action_space, mapping)
+
+    def fit_mapping(self) -> None:
+        """Fit the mapping to the spaces; choices with goals are rows of numbers in the file."""
+        space = self.action_space
+        if isinstance(space, ChoiceSpace):
+            self.action_space = gym.spaces.Box(-np.inf, np.inf, (space.row_size,), np.float64)
+        try:
+            super().fit_mapping()
+        finally:
+            self.action_space = space
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+        goal: Array | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return actions, or choices; see ``MappedPolicy``."""
+        how: Any = {"deterministic": deterministic, "rng": rng, "goal": goal}
+        action, memory = super().act(memory, obs, mask, **how)
+        space = self.action_space
+        return space.of_rows(action) if isinstance(space, ChoiceSpace) else action, memory
 
     def more_inputs(
         self, n: int, mask: Array | None, rng: np.random.Generator | None

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +30,8 @@ from skillweave.settings import AtLeastOne, Check, Count, NonNegative
 from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum
+from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, checked_goal
 from skillweave.skills.onnx_file import OnnxPolicy
@@ -64,6 +66,8 @@ class CodeEntry(TypedDict):
     """A function of observations; kind "Code"."""
 
     code: str
+    with_goal: NotRequired[Literal["goal", "second"] | None]
+    """How the function takes the goal of its skill: by this name, or as its second argument."""
 
 
 class StateEntry(TypedDict):
@@ -95,6 +99,17 @@ class ModelEntry(TypedDict):
     sampled: bool
 
 
+class GoalEntry(TypedDict):
+    """The goals of a skill."""
+
+    space: dict[str, Any]
+    """Their range."""
+    clip: str | None
+    """The function that moves a goal into it, in an observation."""
+    joined: bool
+    """The policy observes observation and goal as one; else it takes the goal beside it."""
+
+
 class SkillEntry(TypedDict):
     """A skill of a hierarchy."""
 
@@ -105,6 +120,8 @@ class SkillEntry(TypedDict):
     initiation: str | None
     termination: str | None
     success: str | None
+    goal: NotRequired[GoalEntry | None]
+    """None: it has no goals."""
 
 
 class HierarchyEntry(TypedDict):
@@ -124,6 +141,8 @@ class FunctionEntry(TypedDict):
     """A function as a selector; kind "Function"."""
 
     code: str
+    goals: NotRequired[list[str]]
+    """The skills that have goals: the function returns goals, too."""
 
 
 class AutomatonEntry(TypedDict):
@@ -132,6 +151,8 @@ class AutomatonEntry(TypedDict):
     start: Count
     skills: list[list[Count]]
     transitions: list[tuple[Count, Count, str, str | None]]
+    goals: NotRequired[list[tuple[Count, Count, Any, str | None]]]
+    """State, skill, and its goal there: fixed, or by the name of a function."""
 
 
 def read_policy(
@@ -192,23 +213,40 @@ class _Reading:
         return policy
 
     def _space(self, field: str) -> gym.Space[Any]:
-        try:
-            return space_from_json(self.content[field])  # type: ignore[literal-required]
-        except RunError as error:
-            raise RunError(f"{self.file}: {field}: {error}") from error
+        return self._space_of(self.content[field], field)  # type: ignore[literal-required]
 
-    def _policy(self, entry: dict[str, Any], path: str) -> Policy:
-        """Return the policy of an entry of the file at ``path``."""
+    def _space_of(self, data: Any, path: str) -> gym.Space[Any]:
+        try:
+            return space_from_json(data)
+        except RunError as error:
+            raise RunError(f"{self.file}: {path}: {error}") from error
+
+    def _policy(
+        self, entry: dict[str, Any], path: str, goals: Goals | None = None, joined: bool = True
+    ) -> Policy:
+        """Return the policy of an entry of the file at ``path``.
+
+        Args:
+            goals: of the skill whose policy it is; None: it has none.
+            joined: it observes them with the observation, else beside it.
+        """
+        if goals is not None and joined:
+            whole = self.spaces
+            self.spaces = with_goal(whole[0], goals.space), whole[1]
+            try:
+                return self._policy(entry, path)
+            finally:
+                self.spaces = whole
         match entry.get("kind"):
             case "Code":
                 name = self._fit(CodeEntry, entry, path)["code"]
-                function = self._function(name, path)
-                acts: Policy = self._bound(ScriptedPolicy(function, *self.spaces), path)
+                scripted = ScriptedPolicy(self._function(name, path), *self.spaces)
+                acts: Policy = self._bound(scripted, path, goals=goals)
                 return acts
             case "Network":
                 return self._network(entry, path, self.spaces[1])
             case "Model":
-                return self._model(entry, path)
+                return self._model(entry, path, goals)
             case "Hierarchy":
                 return self._hierarchy(entry, path)
         raise RunError(
@@ -227,15 +265,22 @@ class _Reading:
             )
         return function
 
-    def _bound(self, policy: Any, path: str, action_space: gym.Space[Any] | None = None) -> Any:
+    def _bound(
+        self,
+        policy: Any,
+        path: str,
+        action_space: gym.Space[Any] | None = None,
+        goals: Goals | None = None,
+    ) -> Any:
         """Return a policy for the spaces; errors name its place in the file."""
         space = self.spaces[1] if action_space is None else action_space
+        spaces = self.spaces[0], space, f"{self.file}: {path}"
         try:
-            return policy.bind(self.spaces[0], space, f"{self.file}: {path}")
+            return policy.bind(*spaces) if goals is None else policy.bind_with_goals(*spaces, goals)
         except SkillweaveError as error:
             raise RunError(str(error)) from error
 
-    def _model(self, entry: dict[str, Any], path: str) -> MappedPolicy:
+    def _model(self, entry: dict[str, Any], path: str, goals: Goals | None = None) -> MappedPolicy:
         fitted: ModelEntry = self._fit(ModelEntry, entry, path)
         data = dict(entry)
         data["state"] = [
@@ -253,7 +298,7 @@ class _Reading:
                 raise RunError(f"{self.file}: {path} has neither file nor code")
             function = self._function(fitted["code"], path)
             scripted = ScriptedPolicy(function, *self.spaces, mapping)
-            return self._bound(scripted, path)  # type: ignore[no-any-return]
+            return self._bound(scripted, path, goals=goals)  # type: ignore[no-any-return]
         if mapping.sees is None:
             mapping = replace(mapping, sees=leaf_inputs(self.spaces[0]))
         file, content = self._content(fitted["file"], path)
@@ -261,7 +306,7 @@ class _Reading:
             policy = OnnxPolicy(content, file, fitted["output"], *self.spaces, mapping)
         except PolicyError as error:
             raise RunError(f"{self.file}: {path}: {error}") from error
-        bound: MappedPolicy = self._bound(policy, path)
+        bound: MappedPolicy = self._bound(policy, path, goals=goals)
         for given, (shape, _) in zip(fitted["state"], bound.states(), strict=True):
             if int(np.prod(given["shape"])) != int(np.prod(shape)):
                 raise RunError(
@@ -302,13 +347,18 @@ class _Reading:
         skills = []
         policies = []
         for i, one in enumerate(fitted["skills"]):
-            policies.append(self._policy(one["policy"], f"{path}.skills[{i}].policy"))
             skills.append(self._skill(one, f"{path}.skills[{i}]"))
+            goal = one.get("goal") or {"joined": True}
+            own = goals_of(skills[-1]), goal["joined"]
+            policies.append(self._policy(one["policy"], f"{path}.skills[{i}].policy", *own))
         names = tuple(skill.name for skill in skills)
-        choices = gym.spaces.Discrete(len(skills) * max(1, len(fitted["lengths"])))
+        plain = gym.spaces.Discrete(len(skills) * max(1, len(fitted["lengths"])))
+        spaces = {skill.name: skill.goal_space for skill in skills}
+        with_goals = {name: space for name, space in spaces.items() if space is not None}
+        choices = choice_space(int(plain.n), with_goals, names)
         interruption = None
         if fitted["critic"] is not None:
-            critic = self._network(dict(fitted["critic"]), f"{path}.critic", choices)
+            critic = self._network(dict(fitted["critic"]), f"{path}.critic", plain)
             interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
         skill_set = SkillSet(
@@ -322,7 +372,7 @@ class _Reading:
         )
         guide = None
         if fitted["guide"] is not None:
-            ready: Any = self._selector(fitted["guide"], f"{path}.guide", names, choices)
+            ready: Any = self._selector(fitted["guide"], f"{path}.guide", names, plain)
             guide = ActiveGuide(ready)
         selector = self._selector(fitted["selector"], f"{path}.selector", names, choices)
         return HierarchyPolicy(selector, skill_set, guide)
@@ -333,6 +383,10 @@ class _Reading:
             if (code := entry[name]) is not None:
                 function = self._function(code, path)
                 methods[name] = _method(function)
+        if goal := entry.get("goal"):
+            methods["goal_space"] = self._space_of(goal["space"], f"{path}.goal.space")
+            if goal["clip"] is not None:
+                methods["clip_goal"] = _method(self._function(goal["clip"], path))
         kind = type("Exported", (RecordedSkill,), methods | {"name": entry["name"]})
         skill: RecordedSkill = kind()
         skill.max_steps = entry["max_steps"]
@@ -374,13 +428,22 @@ class _Reading:
                 f"{self.file}: {path}.kind is {short(entry.get('kind'))}; it must be one of "
                 "Network, Function, Automaton"
             )
-        bound: Policy = self._bound(selector.among(names), path, gym.spaces.Discrete(len(names)))
+        if isinstance(choices, gym.spaces.Discrete):
+            choices = gym.spaces.Discrete(len(names))
+        bound: Policy = self._bound(selector.among(names), path, choices)
         return bound
 
     def _automaton(self, entry: AutomatonEntry, path: str, names: tuple[str, ...]) -> Automaton:
+        goals = {
+            (state, skill): fixed if code is None else self._function(code, path)
+            for state, skill, fixed, code in entry.get("goals", ())
+        }
         try:
             return Automaton(
-                {str(i): [names[k] for k in skills] for i, skills in enumerate(entry["skills"])},
+                {
+                    str(i): [(names[k], goals[i, k]) if (i, k) in goals else names[k] for k in ks]
+                    for i, ks in enumerate(entry["skills"])
+                },
                 {
                     (str(origin), str(target)): event
                     if code is None
@@ -396,8 +459,8 @@ class _Reading:
 def _method(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function as the method of a skill."""
 
-    def method(self: Any, about: Any) -> Any:
-        return function(about)
+    def method(self: Any, *about: Any) -> Any:
+        return function(*about)
 
     return method
 

@@ -53,7 +53,7 @@ class Runner:
     def act(self, obs: Any, reward: float = 0.0, info: Any = None, mask: Any = None) -> Any:
         """Return the action for an observation; ``mask`` marks the actions that are allowed."""
         self.obs = np.zeros((1, *self.entry["shape"]), self.dtype)
-        self.feeds = {}
+        self.feeds, self.goal = dict[str, Any](), None
         for name, fields, keys in self.entry["inputs"]:
             self.feeds[name] = reduce(getitem, fields, self.obs)
             self.feeds[name][0] = reduce(getitem, keys, obs)
@@ -71,10 +71,28 @@ class Runner:
         self.before = {"obs": self.obs, "action": np.array([action])}
         return action
 
-    def step(self, elapsed: int, timed_out: bool) -> Any:
+    def step(self, elapsed: int, timed_out: bool, goal: Any = None) -> Any:
         """Return the latest step, in arrays of one row, for a part that began ``elapsed`` ago."""
         rows = {"elapsed": elapsed, "timed_out": timed_out, "terminated": False, "truncated": False}
-        return SimpleNamespace(**self.latest, **{k: np.array([v]) for k, v in rows.items()})
+        one = {k: np.array([v]) for k, v in rows.items()}
+        return SimpleNamespace(**self.latest, **one, goal=goal)
+
+    def seeing(self, goal: Any, entry: Any, act: Any) -> Any:
+        """Return what a part does with a goal: in the observation (``joined``), or beside it."""
+        before = self.obs, self.feeds, self.goal
+        self.goal = goal
+        if entry["joined"]:
+            parts = {"observation": self.obs, "goal": goal}
+            kind = [(k, x.dtype, x.shape[1:]) for k, x in parts.items()]
+            self.obs = np.zeros(1, np.dtype(kind, align=True))
+            for name, part in parts.items():
+                self.obs[name] = part
+            self.feeds = {f"obs.observation{k[3:]}": x for k, x in self.feeds.items()}
+            self.feeds |= {k: reduce(getitem, fields, goal) for k, fields in entry["inputs"]}
+        try:
+            return act()
+        finally:
+            self.obs, self.feeds, self.goal = before
 
     def made(self, entry: Any) -> Any:
         """Return the part of the policy that an entry of ``policy.json`` describes."""
@@ -98,6 +116,44 @@ class Runner:
             value = np.reshape(value, shape)
             value = np.clip(value, *(x.reshape(shape) if x.ndim else x for x in (low, high)))
         return np.asarray(value, dtype).reshape(shape)[()]
+
+
+def blank(entry: Any) -> Any:
+    """Return a goal (1, ...) of zeros."""
+    return np.zeros((1, *entry["shape"]), np.dtype(entry["dtype"]))
+
+
+def leaves(goal: Any) -> list[Any]:
+    """Return the parts of a goal (1, ...) that have no parts themselves."""
+    names = goal.dtype.names
+    return [goal] if names is None else [x for name in names for x in leaves(goal[name])]
+
+
+def filled(goal: Any, value: Any) -> Any:
+    """Return a goal (1, ...) after a value, or one for each of its parts, was written into it."""
+    if (names := goal.dtype.names) is not None:
+        for i, name in enumerate(names):
+            filled(goal[name], value[i if isinstance(value, tuple | list) else name])
+        return goal
+    goal[...] = value = np.reshape(value, goal.shape)
+    if goal.dtype.kind in "iub" and (goal != value).any():
+        raise ValueError(f"the goal {value[0]} is not of {goal.dtype}")
+    return goal
+
+
+def inside(goal: Any, space: Any) -> bool:
+    """Return whether a goal (1, ...) is in a space."""
+    if (names := goal.dtype.names) is not None:
+        parts = [x[1] if space["type"] == "Dict" else x for x in space["spaces"]]
+        return all(inside(goal[name], part) for name, part in zip(names, parts, strict=True))
+    if space["type"] == "Box":
+        low, high = (np.array(wide(space[k]), goal.dtype) for k in ("low", "high"))
+        low, high = (x.reshape(space["shape"]) if x.ndim else x for x in (low, high))
+        finite = goal.dtype.kind != "f" or np.isfinite(goal).all()
+        return bool(finite and (goal >= low).all() and (goal <= high).all())
+    count = 2 if space["type"] == "MultiBinary" else np.array(space.get("nvec", space.get("n")))
+    goal = goal - np.array(space.get("start", 0))
+    return bool(((goal >= 0) & (goal < count)).all())
 
 
 def wide(bounds: Any) -> Any:
@@ -128,7 +184,14 @@ class _Code:  # a skill that is a function of observations; and what all parts h
         return mask[0]
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        return self.runner.action(self.runner.code[self.entry["code"]](self.runner.obs)[0])
+        return self.runner.action(self.result()[0])
+
+    def result(self) -> Any:
+        runner, how = self.runner, self.entry.get("with_goal")
+        function = runner.code[self.entry["code"]]
+        if how == "goal":
+            return function(runner.obs, goal=runner.goal)
+        return function(runner.obs, runner.goal) if how else function(runner.obs)
 
 
 class _Network(_Code):  # a graph of observations, perhaps with a mask, a memory and noise
@@ -195,7 +258,9 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
         function = self.runner.code[entry["code"]]
         single = entry["single_state"] or not self.state
         state: list[Any] = self.state if single else [tuple(self.state)]
-        if "" in given:
+        if entry["with_goal"]:
+            value = self.result()
+        elif "" in given:
             value = function(given[""], *state)
         else:
             value = function(**given, **({"state": state[0]} if state else {}))
@@ -220,7 +285,9 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
         if part["source"] == "function":
             return np.reshape(self.runner.code[part["function"]](obs), (1, -1))
         if part["source"] == "goal":
-            if isinstance(goal, dict):
+            if self.runner.goal is not None:
+                goal = np.concatenate([x.reshape(1, -1) for x in leaves(self.runner.goal)], axis=1)
+            elif isinstance(goal, dict):
                 goal = self.runner.code[goal["function"]](obs)
             low, high = (part.get(k) for k in ("low", "high"))
             goal = np.maximum(np.reshape(goal, (1, -1)), -np.inf if low is None else low)
@@ -292,7 +359,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.critic = entry["critic"] and runner.made(entry["critic"])
 
     def reset(self) -> None:
-        self.skill, self.why, self.succeeded = -1, EPISODE, False
+        self.skill, self.why, self.succeeded, self.goal = -1, EPISODE, False, None
         self.selector.reset()
         self.guide.reset()
 
@@ -309,23 +376,59 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             may = self.guide.allowed(self.may_start()[None], self).repeat(len(lengths))
             if not may.any():
                 raise ValueError(f"no skill may start in observation {runner.obs[0]}")
-            skill, length = divmod(int(self.selector.act(may[None], self)), len(lengths))
+            choice, goals = self.parted(self.selector.act(may[None], self))
+            skill, length = divmod(int(choice), len(lengths))
+            self.goal = self.fitted(self.skills[skill], goals.get(skill))
             if skill != self.skill:
                 self.policies[skill].reset()
             self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
             self.skill, self.elapsed, self.why = skill, 0, RUNNING
-        action = self.policies[self.skill].act(mask)
+        action = self.with_goal(lambda: self.policies[self.skill].act(mask))
         for condition, code, fixed in self.entry["reflexes"]:
             if runner.asks(condition, runner.obs):
                 action = runner.action(fixed if code is None else runner.code[code](runner.obs)[0])
         return action
 
+    def with_goal(self, act: Any) -> Any:
+        """Return what the running skill does, where it sees its goal."""
+        if self.goal is None:
+            return act()
+        return self.runner.seeing(self.goal, self.skills[self.skill]["goal"], act)
+
+    def parted(self, choice: Any) -> Any:
+        """Return the number of a choice, and goals by the places of skills."""
+        if isinstance(choice, tuple):
+            return choice
+        goals, row = {}, np.ravel(choice)  # of a network: the number, then the goals of all skills
+        at = 1
+        for i, skill in enumerate(self.skills if len(row) > 1 else ()):
+            if skill["goal"]:
+                goals[i] = blank(skill["goal"])
+                for part in leaves(goals[i]):
+                    part[...] = row[at : at + part.size].reshape(part.shape)
+                    at += part.size
+        return row[0], goals
+
+    def fitted(self, skill: Any, value: Any) -> Any:
+        """Return the goal (1, ...) of a call of a skill; None: it has no goals."""
+        if not (entry := skill["goal"]):
+            return None
+        if value is None:
+            raise ValueError(f"skill {skill['name']!r} has goals, but the selector gave none")
+        goal = filled(blank(entry), value)
+        if entry["clip"]:
+            clip = self.runner.code[entry["clip"]]
+            goal = filled(blank(entry), clip(self.runner.obs, goal))
+        if not inside(goal, entry["space"]):
+            raise ValueError(f"the goal {goal[0]} of skill {skill['name']!r} is out of its space")
+        return goal
+
     def observe(self, elapsed: int, timed_out: bool) -> None:
         runner = self.runner
         entry = self.skills[self.skill]
         self.elapsed = self.elapsed + 1
-        when = self.elapsed, self.elapsed >= (entry["max_steps"] or np.inf)
-        (below := self.policies[self.skill]).observe(*when)
+        when: Any = (self.elapsed, self.elapsed >= (entry["max_steps"] or np.inf), self.goal)
+        (below := self.policies[self.skill]).observe(*when[:2])
         stuck = below.why != RUNNING and not below.may_start().any()
         self.why = LIMIT if stuck or self.elapsed >= self.limit else RUNNING
         if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
@@ -345,13 +448,19 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
 
 class _Function(_Code):  # a selector: observations, perhaps how the last call ended, to a skill
     def act(self, mask: Any, last: Any = None) -> Any:
+        has_goals = self.entry["goals"]
         ended = {k: np.array([getattr(last, k)]) for k in ("skill", "why", "succeeded")}
         more = [SimpleNamespace(**ended)] * self.entry["asks_last"]
-        chosen = np.asarray(self.runner.code[self.entry["code"]](self.runner.obs, *more))[0]
-        return self.entry["names"].index(chosen) if isinstance(chosen, str) else chosen
+        chosen = self.runner.code[self.entry["code"]](self.runner.obs, *more)
+        chosen, goals = chosen if isinstance(chosen, tuple) and has_goals else (chosen, {})
+        names, chosen = self.entry["names"], np.asarray(chosen)[0]
+        if not isinstance(goals, dict) or (goals and not set(goals) & set(names)):
+            goals = {has_goals[0]: goals}  # of the only skill that has some
+        number = names.index(chosen) if isinstance(chosen, str) else chosen
+        return number, {names.index(name): goal for name, goal in goals.items()}
 
     def allowed(self, mask: Any, last: Any) -> Any:
-        return mask[0] & (np.arange(mask.shape[1]) == self.act(mask, last))
+        return mask[0] & (np.arange(mask.shape[1]) == self.act(mask, last)[0])
 
 
 class _Automaton(_Code):  # a selector: skills of each state, best first; transitions by events
@@ -359,7 +468,12 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
         self.state = self.entry["start"]
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        return next(skill for skill in self.entry["skills"][self.state] if mask[0, skill])
+        chosen = next(skill for skill in self.entry["skills"][self.state] if mask[0, skill])
+        code, obs = self.runner.code, self.runner.obs
+        goals = {skill: fixed if name is None else code[name](obs)
+                 for state, skill, fixed, name in self.entry["goals"]
+                 if (state, skill) == (self.state, chosen)}  # fmt: skip
+        return chosen, goals
 
     def allowed(self, mask: Any, last: Any) -> Any:
         return mask[0] & np.isin(np.arange(mask.shape[1]), self.entry["skills"][self.state])

@@ -5,6 +5,7 @@ Stands alone because it describes any policy; ``write`` makes one folder of the 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export.foreign import mapping_entry, model_of
-from skillweave.export.graphs import Graph, agent_graph, worth_graph
+from skillweave.export.graphs import Graph, agent_graph, dtype_to_json, inputs_of, worth_graph
 from skillweave.export.network import ExportedNetwork
 from skillweave.export.plans import plan_entry
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -28,6 +29,7 @@ from skillweave.skills.mapping import function_name as written_name
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.scripted import ScriptedPolicy
+from skillweave.spaces import obs_dtype, obs_shape, space_to_json
 from skillweave.types import Policy
 
 
@@ -67,28 +69,24 @@ class States:
             case ExportedNetwork():
                 return self._exported(policy, name)
             case ScriptedPolicy() if policy.mapping.is_identity:
-                acts: Any = policy.function
+                what = "observations (1, ...) to actions (1, ...)"
+                if policy.with_goal is not None:
+                    what = "observations (1, ...) and goals (1, ...) to actions (1, ...)"
+                code = self._asks(f"{name}.policy", policy.function, what)
+                return {"kind": "Code", "code": code, "with_goal": policy.with_goal}
             case MappedPolicy():
                 return self._model(policy, name, where, sampled)
-            case _:
-                acts = policy
         if policy.start(1):
             raise PolicyError(
                 f"{where} is a {type(policy).__name__}, whose memory cannot be written as "
                 "ONNX: train the skill, or give it an ONNX file"
             )
         what = "observations (1, ...) to actions (1, ...)"
-        return {"kind": "Code", "code": self._asks(f"{name}.policy", acts, what)}
+        code = self._asks(f"{name}.policy", policy, what)
+        return {"kind": "Code", "code": code, "with_goal": None}
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills = policy.skills
-        for skill in skills.skills:
-            if skill.goal_space is not None:
-                raise PolicyError(
-                    f"skill {prefix + skill.name!r} has goals, and hierarchies with goals cannot "
-                    "be exported yet; the skill's own policy can, as one that sees the observation "
-                    "and the goal: save_policy(run.policy.skills.policies[i], path)"
-                )
         cuts = policy.skills.interruption
         selector = policy.selector
         samples = sampled or not skills.greedy_selector
@@ -138,6 +136,23 @@ class States:
             "initiation": method("initiation", "observations (1, ...) to (1,) bool"),
             "termination": method("termination", "a Step to (1,) bool"),
             "success": method("success", "a Step to (1,) bool") if needs_success else None,
+            "goal": self._goal(skills, i, method),
+        }
+
+    def _goal(self, skills: SkillSet, i: int, method: Any) -> dict[str, Any] | None:
+        """Return the goals of a skill; None: it has none."""
+        space, policy = skills.skills[i].goal_space, skills.policies[i]
+        if space is None:
+            return None
+        # What takes the goal by an input of its own observes what the environment gives.
+        beside = isinstance(policy, MappedPolicy) and policy.has_goals
+        return {
+            "space": space_to_json(space),
+            "dtype": dtype_to_json(obs_dtype(space)),
+            "shape": list(obs_shape(space)),
+            "inputs": [[f"obs.goal{name[3:]}", fields] for name, fields, _ in inputs_of(space)],
+            "clip": method("clip_goal", "observations and goals (1, ...) to goals (1, ...)"),
+            "joined": not beside,
         }
 
     def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
@@ -186,10 +201,12 @@ class States:
             "single_state": policy.mapping.single_state,
             "logits": policy.logits,
             "sampled": sampled,
+            "with_goal": None,
         }
         if isinstance(policy, ScriptedPolicy):
             what = "its inputs to outputs (1, ...), as the mapping in policy.json says"
             entry["code"] = self._asks(f"{name}.policy", policy.function, what)
+            entry["with_goal"] = policy.with_goal
             entry["state"] = [
                 {
                     "input": None,
@@ -238,12 +255,14 @@ class States:
                 return self._automaton(selector, name)
             case FunctionSelector():
                 last = ", and the LastCall," if selector.takes_last_call else ""
-                what = f"observations (1, ...){last} to skills (1,)"
+                beside = " and goals" if selector.goal_spaces else ""
+                what = f"observations (1, ...){last} to skills (1,){beside}"
                 return {
                     "kind": "Function",
                     "code": self._asks(name, selector.function, what),
                     "names": list(selector.skills),
                     "asks_last": selector.takes_last_call,
+                    "goals": list(selector.goal_spaces),
                 }
             case Planner():
                 entry, content = plan_entry(selector, name, self._asks)
@@ -272,11 +291,20 @@ class States:
             transitions.append([origin, target, ends, code])
         order = [[int(i) for i in np.argsort(-rank, kind="stable") if rank[i]] for rank in ranks]
         start = selector.state_names.index(selector.start_state)
+        goals = []
+        for (state, skill), goal in selector.goals.items():
+            place = selector.state_names.index(state), selector.skills.index(skill)
+            code = None
+            if callable(goal):
+                what = "observations (1, ...) to goals (1, ...)"
+                code = self._asks(f"{name}.{function_name(goal)}", goal, what)
+            goals.append([*place, None if code else _as_json(goal), code])
         return {
             "kind": "Automaton",
             "start": start,
             "skills": order,
             "transitions": transitions,
+            "goals": goals,
         }
 
     def _asks(self, name: str, function: Any, what: str) -> str:
@@ -286,3 +314,12 @@ class States:
         self.functions[free] = function
         self.code[free] = what
         return free
+
+
+def _as_json(goal: Any) -> Any:
+    """Return a fixed goal as JSON."""
+    if isinstance(goal, Mapping):
+        return {name: _as_json(part) for name, part in goal.items()}
+    if isinstance(goal, tuple | list):
+        return [_as_json(part) for part in goal]
+    return np.asarray(goal).tolist()

@@ -8,16 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-
 from skillweave.envs.infos import observes_mask
-from skillweave.export.graphs import leaves_of
+from skillweave.export.graphs import dtype_to_json, inputs_of
 from skillweave.export.states import States
 from skillweave.runs.files import write_bytes
 from skillweave.skills.foreign_policy import checksum
 from skillweave.spaces import obs_dtype, obs_shape, space_to_json
-from skillweave.spaces.packing import parts
 from skillweave.terminal import printable
 from skillweave.types import Policy
 
@@ -72,9 +68,9 @@ def write_export(
         "origin": origin,
         "files": {name: checksum(data) for name, data in states.files.items()},
         "code": states.code,
-        "dtype": _dtype_to_json(obs_dtype(space)),
+        "dtype": dtype_to_json(obs_dtype(space)),
         "shape": list(obs_shape(space)),
-        "inputs": _inputs(space),
+        "inputs": inputs_of(space),
         "observation_space": space_to_json(space),
         "action_space": space_to_json(policy.action_space),
         "observed_mask": observes_mask(space, policy.action_space),
@@ -86,39 +82,3 @@ def write_export(
     for name, data in files.items():
         write_bytes(path / name, data)
     return Export(path, tuple(files), states.code, states.functions)
-
-
-def _inputs(space: gym.Space[Any]) -> list[list[Any]]:
-    """Return for each leaf its name, its fields in the packed array, and its keys."""
-
-    def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
-        inner = parts(space)
-        if inner is None:
-            return [[".".join(["obs", *fields]), fields, keys]]
-        places = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
-        return [
-            leaf
-            for (name, part), key in zip(inner.items(), places, strict=True)
-            for leaf in within(part, [*fields, name], [*keys, key])
-        ]
-
-    leaves = within(space, [], [])
-    assert [name for name, _, _ in leaves] == [leaf.name for leaf in leaves_of(space)]
-    return leaves
-
-
-def _dtype_to_json(dtype: np.dtype[Any]) -> Any:
-    """Return a dtype as JSON that ``numpy.dtype`` reads."""
-    if dtype.subdtype is not None:
-        base, shape = dtype.subdtype
-        return f"({','.join(map(str, shape))},){base.str}"
-    if dtype.names is None:
-        return dtype.str
-    assert dtype.fields is not None
-    fields = [dtype.fields[name][:2] for name in dtype.names]
-    return {
-        "names": list(dtype.names),
-        "formats": [_dtype_to_json(d) for d, _ in fields],
-        "offsets": [at for _, at in fields],
-        "itemsize": dtype.itemsize,
-    }

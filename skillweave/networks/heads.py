@@ -77,6 +77,11 @@ class ActionHead:
         return self.codec.discrete
 
     @property
+    def noises(self) -> tuple[tuple[str, int], ...]:
+        """Return the kinds and widths of the noise of ``act``, in its order."""
+        return (("gumbel" if self.discrete else "standard_normal", self.codec.size),)
+
+    @property
     def choices(self) -> int:
         """Return the number of logits of choices at the front, which a mask is for; 0: none."""
         return self.codec.size if self.discrete else 0
@@ -293,6 +298,11 @@ class ChoiceHead:
             for column in head.std_columns
         ]
 
+    @property
+    def noises(self) -> tuple[tuple[str, int], ...]:
+        """Return the kinds and widths of the noise of ``act``; see ``ActionHead``."""
+        return (("gumbel", self.choices), *(one for head in self.goals for one in head.noises))
+
     def _starts(self, widths: Sequence[int]) -> list[int]:
         """Return the first column of each goal, after the logits of the choices."""
         return [self.choices + sum(widths[:i]) for i in range(len(widths))]
@@ -403,8 +413,7 @@ class ChoiceHead:
     def _split_noise(self, noise: Tensor | None) -> list[Tensor] | None:
         if noise is None:
             return None
-        sizes = [self.choices, *(head.codec.size for head in self.goals)]
-        return list(noise.split(sizes, dim=-1))
+        return list(noise.split([size for _, size in self.noises], dim=-1))
 
 
 def head_of(

@@ -111,6 +111,11 @@ class MappedPolicy(Foreign):
         bound.fit_mapping()
         return bound
 
+    @property
+    def has_goals(self) -> bool:
+        """Return whether it is the policy of a skill with goals, and takes them by itself."""
+        return self._goals is not None
+
     advice = "write Goal() at its place in sees"
     """How the policy is given the goal, for messages."""
 

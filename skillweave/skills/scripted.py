@@ -95,6 +95,11 @@ class ScriptedPolicy(MappedPolicy):
         """Return whether the goal of a skill is an argument or an input of it."""
         return self._with_goal is not None or super().takes_goal
 
+    @property
+    def with_goal(self) -> Literal["goal", "second"] | None:
+        """Return how the function is given the goal of its skill; None: it is given none."""
+        return self._with_goal if self.has_goals else None
+
     advice = (
         "let the function take it by this name, policy(obs, goal), or write Goal() at its place in "
         "sees"
@@ -107,8 +112,8 @@ class ScriptedPolicy(MappedPolicy):
     def _actions(self, given: Array) -> Array:
         """Return what the function makes of its only input."""
         who, function = self._who, self.function
-        if self._with_goal is not None and self._goals is not None:
-            by_name = self._with_goal == GOAL
+        if self.with_goal is not None:
+            by_name = self.with_goal == GOAL
 
             def both(seen: Array) -> Any:
                 obs, goal = read_only(seen[OBSERVATION]), read_only(seen[GOAL])

@@ -1,0 +1,260 @@
+"""Hierarchies whose skills have goals act the same after export: the runner, and `load_policy`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from goals.worlds import SPACES, GoTo, Point, Rest, go_to, place_of
+from test_networks import agent
+
+import skillweave as sw
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.api.player import Player
+from skillweave.collecting.lengths import Lengths
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import RunError
+from skillweave.export.runner import Runner
+from skillweave.export.write import write_export
+from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.selectors import ready_selector
+from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.goals import goals_of
+
+pytest.importorskip("onnxscript")
+torch.set_num_threads(1)
+SMALL = sw.Network(hidden=(8,))
+PPO = sw.PPO(network=SMALL, normalize_obs=False)
+RECURRENT = sw.PPO(network=sw.Network(hidden=(8,), rnn=sw.RNN("gru", 4)))
+
+
+def mild(config: Any, *spaces: Any, seed: int) -> AgentPolicy:
+    """A random network that is seldom at the bounds of its actions."""
+    policy = agent(config, *spaces, seed=seed)
+    return AgentPolicy(
+        policy.algorithm, {k: v * (0.05 if "bias" in k else 0.6) for k, v in policy.weights.items()}
+    )
+
+
+def skills_of(env: Point, *skills: sw.Skill, config: Any = PPO, **how: Any) -> SkillSet:
+    """Skills with policies: their own, or random networks."""
+    policies = []
+    for i, skill in enumerate(skills):
+        goals = goals_of(skill)
+        seen: Any = env.observation_space
+        if goals is not None:
+            seen = with_goal(seen, goals.space)
+        declared = getattr(skill, "policy", None)
+        if declared is None:
+            policies.append(mild(config, seen, env.action_space, seed=i))
+            continue
+        own = declared if hasattr(declared, "bind") else sw.from_function(declared)
+        spaces = env.observation_space, env.action_space, f"skill {skill.name!r}"
+        policies.append(own.bind(*spaces) if goals is None else own.bind_with_goals(*spaces, goals))
+    return SkillSet(skills, tuple(policies), **{"call_steps": 4, **how})
+
+
+def selected(env: Point, skills: SkillSet, selector: Any) -> HierarchyPolicy:
+    names = tuple(skill.name for skill in skills.skills)
+    spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
+    choices = choice_space(skills.choices, spaces, names)
+    ready = None if hasattr(selector, "learning_rate") else ready_selector(selector, names)
+    if ready is None:
+        return HierarchyPolicy(mild(selector, env.observation_space, choices, seed=2), skills)
+    return HierarchyPolicy(ready.bind(env.observation_space, choices, "selector"), skills)
+
+
+class Walk(GoTo):
+    """Takes the goal beside the observation."""
+
+    def policy(self, obs, goal):
+        return np.clip(3 * (goal - place_of(obs)), -1, 1)
+
+
+class Reaching(GoTo):
+    """Moves goals into reach."""
+
+    def initiation(self, obs):
+        return place_of(obs)[:, 0] > -1.5
+
+    def clip_goal(self, obs, goal):
+        return np.clip(goal, place_of(obs) - 0.3, place_of(obs) + 0.3).clip(-1, 1)
+
+
+class Elsewhere(GoTo):
+    """A network of the observation and the goal, made elsewhere."""
+
+    torch.manual_seed(0)
+    policy = sw.from_torch(torch.nn.Linear(4, 2), sees=(0, sw.Goal(low=-0.5), 1))
+
+
+class Told(GoTo):
+    """A function behind a mapping, which takes the goal as its second argument."""
+
+    policy = sw.from_function(lambda obs, goal: goal - obs, acts=sw.Acts(scale=2.0, clip=(-1, 1)))
+
+
+class Side(GoTo):
+    """Has two goals, and the name of another skill than ``GoTo``."""
+
+    goal_space = SPACES["number"]
+
+
+def far(obs: Any) -> Any:
+    return np.full(len(obs), "go_to"), np.full((len(obs), 2), 0.9) * np.sign(place_of(obs) + 0.01)
+
+
+def parts(obs: Any) -> Any:
+    at = np.tanh(3 * place_of(obs)).astype(np.float32)
+    return np.full(len(obs), "go_to"), {"at": at, "side": (at[:, 0] > 0).astype(int)}
+
+
+def each(obs: Any, last: Any) -> Any:
+    names = np.where(last.skill == 0, "side", "go_to")
+    return names, {"go_to": -place_of(obs) / 2, "side": 2 + (place_of(obs)[:, 0] > 0).astype(int)}
+
+
+PATROL = sw.Automaton(
+    states={"out": ("go_to", (0.8, 0.8)), "back": [("go_to", lambda obs: -obs / 2), "rest"]},
+    transitions={("out", "back"): lambda step: step.elapsed > 3, ("back", "out"): "success"},
+)
+
+
+def made(*skills: Any, selector: Any = PPO, env: Any = None, **how: Any) -> Any:
+    env = env or Point()
+    skills = tuple(s if isinstance(s, sw.Skill) else s() for s in skills)
+    for skill in skills:
+        if isinstance(skill, GoTo) and type(skill).__name__ not in ("GoTo", "Side"):
+            skill.name = "go_to"
+    return env, selected(env, skills_of(env, *skills, **how), selector)
+
+
+def nested() -> Any:
+    env, inner = made(go_to(), Rest)
+
+    class Inner(sw.Skill):
+        max_steps = 9
+        policy = inner
+
+    skills = SkillSet((Inner(), Rest()), (inner, made(Rest)[1].skills.policies[0]), call_steps=9)
+    return env, selected(env, skills, PPO)
+
+
+CASES: dict[str, Any] = {
+    "ppo": lambda: made(go_to(), Rest),
+    "lengths": lambda: made(go_to(), Rest, call_steps=Lengths(2, 5)),
+    "recurrent": lambda: made(go_to(), Rest, selector=RECURRENT, config=RECURRENT),
+    "squashed": lambda: made(
+        go_to("box of float64"), Rest, selector=sw.PPO(network=SMALL, squash_actions=True)
+    ),
+    "numbers": lambda: made(go_to("numbers"), Rest, go_to("bits", name="bits")),
+    "number": lambda: made(go_to("number"), Rest, selector=RECURRENT),
+    "dqn": lambda: made(go_to("number"), Rest, selector=sw.DQN(network=SMALL)),
+    "clipped": lambda: made(Reaching, Rest),
+    "function": lambda: made(Walk, selector=far),
+    "elsewhere": lambda: made(Elsewhere, Rest),
+    "told": lambda: made(Told, selector=far),
+    "automaton": lambda: made(Walk, Rest, selector=PATROL),
+    "two": lambda: made(go_to(), Side(), selector=each),
+    "dict": lambda: made(go_to("dict"), Rest, selector=parts),
+    "images": lambda: made(go_to("dict"), selector=parts, env=Point(as_dict=True)),
+    "nested": nested,
+    "discrete": lambda: made(go_to(), env=Point(discrete=True)),
+}  # fmt: skip
+
+
+def numbers_of(goal: Any) -> list[Any]:
+    if goal is None:
+        return []
+    return [np.ravel(goal[k]) for k in goal.dtype.names] if goal.dtype.names else [np.ravel(goal)]
+
+
+def episodes(env: Point, policy: HierarchyPolicy, runner: Runner, other: Any) -> list[Any]:
+    """Whole episodes, in which all three act alike; of each step the skill, goal and action."""
+    players, told = (Player(policy), Player(other)), []
+    for seed in range(3):
+        obs, info = env.reset(seed=seed)
+        for one in (*players, runner):
+            one.reset()
+        reward, over = 0.0, False
+        while not over:
+            action, *others = (p.act(obs, reward=reward, info=info) for p in (*players, runner))
+            for theirs in others:
+                np.testing.assert_allclose(theirs, action, atol=1e-5)
+            memory = players[0].memory
+            goal, below = policy.goal_now(memory), runner.root
+            while hasattr(below.policies[below.skill], "policies"):
+                below = below.policies[below.skill]
+            assert (goal is None) == (below.goal is None)
+            for mine, theirs in zip(*map(numbers_of, (goal, below.goal)), strict=True):
+                np.testing.assert_allclose(theirs, mine, atol=1e-5)
+            told.append((int(memory["skill"][0]), str(goal), np.round(action, 3).tolist()))
+            obs, reward, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+    return told
+
+
+@pytest.mark.fast_cases(3)
+@pytest.mark.parametrize("make", CASES.values(), ids=CASES)
+def test_a_hierarchy_with_goals_acts_the_same_elsewhere(make: Any, tmp_path: Path) -> None:
+    env, policy = make()
+    export = write_export(tmp_path / "a", policy, "point")
+    loaded = sw.load_policy(tmp_path / "a", code=export.functions)
+    runner = Runner(tmp_path / "a", export.functions)
+    told = episodes(env, policy, runner, loaded)
+    assert len({goal for _, goal, _ in told}) > 2  # so that goals are compared
+    assert len({str(action) for _, _, action in told}) > 2
+    again = write_export(tmp_path / "b", loaded, "point")
+    copied = Runner(tmp_path / "b", again.functions)
+    assert episodes(env, policy, copied, loaded) == told
+
+
+def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
+    env, policy = made(go_to(), Rest, greedy_selector=False)
+    export = write_export(tmp_path, policy, "point")
+    entry = json.loads((tmp_path / "policy.json").read_text())["policy"]
+    assert entry["selector"]["noise"] == [["gumbel", 2], ["standard_normal", 2]]
+    obs, goals = env.reset(seed=0)[0], []
+    for seed in range(20):
+        runner = Runner(tmp_path, export.functions, seed=seed)
+        runner.act(obs)
+        goals.append(str(runner.root.goal))
+    assert len(set(goals)) > 2  # the other skill, and several goals
+
+
+def test_the_range_of_goals_is_in_the_file(tmp_path: Path) -> None:
+    _, policy = made(Reaching, Rest)
+    export = write_export(tmp_path, policy, "point")
+    assert "go_to.clip_goal" in export.code
+    file = tmp_path / "policy.json"
+    content = json.loads(file.read_text())
+    goal = content["policy"]["skills"][0]["goal"]
+    assert goal["space"] == {
+        "type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0
+    }  # fmt: skip
+    loaded = sw.load_policy(tmp_path, code=export.functions)
+    assert loaded.skills.skills[0].goal_space == GoTo.goal_space
+    goal["space"]["low"] = 3.0
+    file.write_text(json.dumps(content))
+    with pytest.raises(RunError, match=r"policy.skills\[0\].goal.space: not a space"):
+        sw.load_policy(tmp_path, code=export.functions)
+
+
+@pytest.mark.parametrize(
+    ("returned", "says"),
+    [
+        (lambda obs: np.full(len(obs), "go_to"), "has goals, but the selector gave none"),
+        (lambda obs: (np.full(len(obs), "go_to"), np.full((1, 2), 3.0)), "is out of its space"),
+        (lambda obs: (np.full(len(obs), "go_to"), np.full((1, 2), np.nan)), "is out of its space"),
+    ],
+)
+def test_wrong_goals_are_said_by_the_runner(returned: Any, says: str, tmp_path: Path) -> None:
+    env, policy = made(Walk, selector=far)
+    export = write_export(tmp_path, policy, "point")
+    functions = export.functions | {"selector": returned}
+    with pytest.raises(ValueError, match=says):
+        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
