@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from skillweave.collecting.cluster import Ray
     from skillweave.collecting.lengths import Lengths
     from skillweave.envs.make import EnvSpec
-    from skillweave.envs.pool import PoolWrapper, envpool
+    from skillweave.envs.pool import PoolWrapper, envpool, one_of
     from skillweave.errors import (
         DeclarationError,
         EnvError,
@@ -144,6 +144,7 @@ _HOME = {
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
     "normalise": "ops.moments",
+    "one_of": "envs.pool",
     "plot_curves": "reporting.curves_figure",
     "register_algorithm": "algorithms.registry",
     "register_encoder": "networks.encoders",
@@ -236,6 +237,7 @@ __all__ = [
     "mask_logits",
     "masked_mean",
     "normalise",
+    "one_of",
     "plot_curves",
     "register_algorithm",
     "register_encoder",

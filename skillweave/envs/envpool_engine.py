@@ -17,6 +17,7 @@ from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.errors import EnvError, MissingExtra
+from skillweave.spaces import pack
 from skillweave.types import Array
 
 RENEW_AFTER = 100_000
@@ -179,7 +180,7 @@ class EnvPoolEngine:
     def _begin(self, ids: Array) -> Array:
         def reset(pool: Any, part: Array) -> tuple[Any, ...]:
             obs, info = pool.reset(ids[part].astype(np.int32))
-            return np.asarray(obs), info
+            return pack(self.observation_space, obs), info
 
         obs, info = self._in_pools(ids, reset)
         self._masks.see(info, ids)
@@ -190,8 +191,8 @@ class EnvPoolEngine:
             action = action.astype(np.int32)
 
         def step(pool: Any, part: Array) -> tuple[Any, ...]:
-            result: tuple[Any, ...] = pool.step(action[part], ids[part].astype(np.int32))
-            return result
+            obs, *rest = pool.step(action[part], ids[part].astype(np.int32))
+            return pack(self.observation_space, obs), *rest
 
         # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
@@ -224,7 +225,7 @@ def _joined(parts: list[tuple[Array, Any]], n: int) -> Any:
     _, first = parts[0]
     if isinstance(first, dict):
         return {k: _joined([(rows, part[k]) for rows, part in parts], n) for k in first}
-    joined = np.empty((n, *first.shape[1:]), first.dtype)
+    joined = np.zeros((n, *first.shape[1:]), first.dtype)  # zeros between the parts of a Dict
     for rows, part in parts:
         joined[rows] = part
     return joined

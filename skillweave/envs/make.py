@@ -20,13 +20,14 @@ from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
-from skillweave.envs.pool import MakePool, envpool
+from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, error_text, short, shortened
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Check, check_fields
 from skillweave.spaces import obs_dtype, obs_shape, put_observation
+from skillweave.spaces.packing import parts
 
 MOST = 65_536
 """The most environments in one engine."""
@@ -348,7 +349,7 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         pool = make(num_envs=1, threads=1, seed=0)
     except MissingExtra:
         return False
-    if isinstance(pool, gym.vector.VectorEnv):
+    if isinstance(pool, gym.vector.VectorEnv) and not takes_ids(pool):
         raise EnvError(
             f"{spec.name}: pool made {short(pool)}, a VectorEnv, which steps all its environments "
             "at once; a pool must step some while the others do not change, as EnvPool does: omit "
@@ -357,6 +358,8 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
     for what in ("observation_space", "action_space"):
         theirs, ours = getattr(pool, what), getattr(reference, what)
         alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape
+        if alike and parts(ours):  # of a Dict it has the names, the shapes and the types
+            alike = obs_dtype(theirs) == obs_dtype(ours)
         if not alike or theirs.dtype != ours.dtype:
             raise EnvError(
                 f"{spec.name}: its pool's {what} is {short(theirs)}, but the environment's is "

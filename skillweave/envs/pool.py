@@ -1,18 +1,24 @@
-"""Many environments side by side, stepped as by EnvPool: ``Pool`` and its wrappers."""
+"""Many environments side by side, stepped as by EnvPool: ``Pool``, its wrappers, one of them."""
 
 from __future__ import annotations
 
+import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
 import gymnasium as gym
+import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import EnvError, MissingExtra
 from skillweave.messages import close_matches, short
+from skillweave.spaces import pack, unpack
 from skillweave.types import Array
+
+POOL_SEEDS = 2**30
+"""Seeds of pools are taken modulo this: EnvPool takes seeds below twice as much."""
 
 
 class Pool(Protocol):
@@ -107,6 +113,93 @@ class PoolWrapper:
         obs, reward, terminated, truncated, info = self.pool.step(action, ids)
         return self.see(obs, ids), reward, terminated, truncated, info
 
+    def render(self, ids: Array) -> Array:
+        """Return pictures of some environments; override it to draw them.
+
+        Args:
+            ids: (k,) int32, the environments.
+
+        Returns:
+            (k, H, W, 3) uint8. EnvPool draws them only if it was made with
+            ``render_mode="rgb_array"``.
+        """
+        pictures: Array = self.pool.render(ids)
+        return pictures
+
+
+class _OneOfPool(gym.Env[Any, Any]):
+    """The only environment of a pool; a reset to a seed makes a new pool."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium has it so, too
+
+    def __init__(self, make: MakePool, render_mode: str | None) -> None:
+        self.render_mode = render_mode
+        self._make = make
+        self._pool = make(num_envs=1, threads=1, seed=0)
+        self._seeded = False
+        self._ids = np.zeros(1, np.int32)
+        self.observation_space = self._pool.observation_space
+        self.action_space = self._pool.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        if seed is not None or not self._seeded:
+            new = int(self.np_random.integers(POOL_SEEDS)) if seed is None else seed % POOL_SEEDS
+            self._pool = self._make(num_envs=1, threads=1, seed=new)
+            self._seeded = True
+        obs, info = self._pool.reset(self._ids)
+        return self._seen(obs), _first(info)
+
+    def step(self, action: Any) -> Any:
+        many = np.asarray(action, self.action_space.dtype)[None]
+        if isinstance(self.action_space, gym.spaces.Discrete):
+            many = many.astype(np.int32)  # EnvPool's
+        obs, reward, terminated, truncated, info = self._pool.step(many, self._ids)
+        ends = bool(terminated[0]), bool(truncated[0])
+        return self._seen(obs), float(reward[0]), *ends, _first(info)
+
+    def render(self) -> Any:
+        return None if self.render_mode is None else self._pool.render(self._ids)[0]
+
+    def _seen(self, obs: Any) -> Any:
+        return unpack(self.observation_space, pack(self.observation_space, obs)[0])
+
+
+def _first(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the first row of each array."""
+    return {
+        k: _first(v) if isinstance(v, dict) else v[0] if np.ndim(v) else v for k, v in info.items()
+    }
+
+
+@checked_names
+def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
+    """Return a function that makes one environment of a pool, where Gymnasium has none like it.
+
+    ```python
+    import skillweave as sw
+
+    def pendulums(num_envs, threads, seed):
+        return sw.envpool("Pendulum-v1", num_envs, threads, seed)
+
+    spec = sw.EnvSpec(sw.one_of(pendulums), pool=pendulums)
+    ```
+
+    Its pictures are those of the pool's ``render``.
+
+    Args:
+        pool: makes the pool, as in ``EnvSpec(pool=)``.
+
+    Returns:
+        The function, for ``EnvSpec``. It has the name of ``pool``.
+    """
+
+    def one(render_mode: str | None = None) -> gym.Env[Any, Any]:
+        return _OneOfPool(pool, render_mode)
+
+    one.__name__ = str(getattr(pool, "__name__", type(pool).__name__))
+    return one
+
 
 @checked_names
 def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) -> Any:
@@ -136,6 +229,12 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
         )
         _ = pool.observation_space  # made on first use, with the warning
         return pool
+
+
+def takes_ids(pool: Any) -> bool:
+    """Return whether ``reset`` takes the environments to reset, as EnvPool's, also a VectorEnv."""
+    first = next(iter(inspect.signature(pool.reset).parameters.values()), None)
+    return first is not None and first.kind is not first.KEYWORD_ONLY
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from skillweave.envs.checks import longest_evaluation, time_limit
 from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
+from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
@@ -41,8 +42,6 @@ FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
 USUAL_ENVS = 16
 """Environments side by side in an evaluation where ``num_envs`` is not given."""
-POOL_SEEDS = 2**30
-"""A pool has the first episode's seed, modulo this: EnvPool takes seeds below twice as much."""
 
 
 @dataclass(frozen=True)

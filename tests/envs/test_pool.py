@@ -1,8 +1,11 @@
 """A user's own pools: EnvPool's environments seen otherwise, for training."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import skillweave as sw
 from skillweave.envs.make import make_engine, workers_for
@@ -144,3 +147,104 @@ def test_an_environment_that_envpool_does_not_have_is_told():
     says = r"EnvPool has no environment 'CartPool-v1'.* Close matches: .*CartPole-v1"
     with pytest.raises(EnvError, match=says):
         sw.envpool("CartPool-v1", 2, 1, 0)
+
+
+class Parts(Clock):
+    """Observations of two parts, and what only a pool has: pictures, and an info with rows."""
+
+    observation_space = gym.spaces.Dict(
+        time=gym.spaces.Box(0, 1000, (1,), np.float32), root=gym.spaces.Discrete(1000)
+    )
+
+    def seen(self, obs):
+        return {"root": np.full(len(obs), self.seed), "time": obs}
+
+    def reset(self, ids):
+        obs, _ = super().reset(ids)
+        return self.seen(obs), {"ids": ids, "inner": {"twice": 2 * obs}}
+
+    def step(self, action, ids):
+        obs, *rest = super().step(action, ids)
+        return self.seen(obs), *rest[:-1], {"ids": ids, "inner": {"twice": 2 * obs}}
+
+    def render(self, ids):
+        return np.full((len(ids), 4, 5, 3), self.time[ids][:, None, None, None], np.uint8)
+
+
+class Later(sw.PoolWrapper):
+    def see(self, obs, ids):
+        return obs | {"time": obs["time"] + 100}
+
+
+def later(num_envs, threads, seed):
+    return Later(Parts(num_envs, threads, seed % 1000))
+
+
+def test_observations_of_parts_come_out_of_a_pool_as_out_of_single_environments():
+    spec = sw.EnvSpec(sw.one_of(later), pool=later)
+    pool, single = make_engine(spec, N), make_engine(replace(spec, engine="sync"), N)
+    assert (type(pool).__name__, type(single).__name__) == ("EnvPoolEngine", "GymnasiumEngine")
+    obs, other = pool.reset(7), single.reset(7)
+    assert obs.dtype == other.dtype
+    rng, early = np.random.default_rng(0), np.array([4, 1])
+    for t in range(3):
+        np.testing.assert_array_equal(obs["time"], other["time"])
+        np.testing.assert_array_equal(obs["root"], np.full(N, 7))
+        action = rng.integers(2, size=N)
+        step, want = pool.step(action), single.step(action)
+        obs, other = step.next_obs, want.next_obs
+        np.testing.assert_array_equal(step.reward, np.full(N, 7.0))
+        assert obs["time"].min() > 100 + t
+    again, ended = make_engine(spec, N).restore(pool.state())
+    np.testing.assert_array_equal(again, obs)
+    assert not ended.size
+    assert pool.reset_some(early)["time"].tolist() == [[100.0], [100.0]]
+
+
+def test_one_environment_of_a_pool_is_one_of_gymnasium():
+    env = sw.one_of(later)("rgb_array")
+    check_env(env, skip_render_check=True)
+    obs, info = env.reset(seed=5)
+    assert (obs["root"], obs["time"]) == (5, [100.0])
+    assert info == {"ids": 0, "inner": {"twice": [0.0]}}
+    obs, reward, terminated, truncated, info = env.step(1)
+    assert (obs["time"], reward, terminated, truncated) == ([102.0], 5.0, False, False)
+    assert info["inner"]["twice"] == [4.0]
+    np.testing.assert_array_equal(env.render(), np.full((4, 5, 3), 2))
+    for _ in range(4):
+        terminated = env.step(1)[2]
+    assert terminated
+    assert env.reset()[0]["root"] == 5  # the same pool goes on
+    assert sw.one_of(later)().render() is None
+
+
+def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_without_a_seed():
+    assert sw.EnvSpec(sw.one_of(later), pool=later).name == "later"
+    assert sw.EnvSpec(sw.one_of(Clock), pool=Clock).name == "Clock"
+    starts = {int(sw.one_of(later)().reset()[0]["root"]) for _ in range(8)}
+    assert len(starts) > 1
+
+
+def test_a_pool_with_other_parts_is_told():
+    def other(num_envs, threads, seed):
+        space = gym.spaces.Dict(time=gym.spaces.Box(0, 1000, (2,)), root=gym.spaces.Discrete(1000))
+        return sw.PoolWrapper(Parts(num_envs, threads, seed), space)
+
+    with pytest.raises(EnvError, match=r"later: its pool's observation_space is Dict"):
+        make_engine(sw.EnvSpec(sw.one_of(later), pool=other), 2)
+
+
+def test_one_environment_of_envpool_plays_the_episodes_of_its_seed():
+    pytest.importorskip("envpool")
+
+    def poles(num_envs, threads, seed):
+        return sw.envpool("CartPole-v1", num_envs, threads, seed, max_episode_steps=12)
+
+    env = sw.one_of(poles)()
+    spec = sw.EnvSpec(sw.one_of(poles), pool=poles)
+    agent = sw.from_function(lambda obs: (obs[:, 2] + 0.5 * obs[:, 3] > 0).astype(int))
+    for engine in ("sync", "envpool"):
+        assert sw.evaluate(agent, spec, episodes=3, engine=engine).lengths == (12, 12, 12)
+    first = env.reset(seed=3)[0]
+    np.testing.assert_array_equal(env.reset(seed=3)[0], first)
+    assert np.abs(env.reset(seed=4)[0] - first).max() > 0
