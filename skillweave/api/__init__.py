@@ -78,6 +78,7 @@ from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.learnable import Learnable
+from skillweave.skills.own_part import ZERO, part_from_json
 from skillweave.terminal import printable
 from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
@@ -425,22 +426,29 @@ class Hierarchy(Declaration):
         """Return the hierarchy of a run's ``manifest``, without the user's code."""
         spec = spec_of(manifest)
         skills: dict[str, list[Skill]] = {}  # by the path of their level
+        rests: dict[str, Any] = {}  # as well
         for entry in reversed(manifest["skills"]):  # the skills of a hierarchy follow it
             path = entry["name"]
             attributes: dict[str, Any] = {
                 k: entry[k] for k in ("max_steps", "call_steps") if k in entry
             }
             attributes["name"] = name_of(path)
+            attributes |= part_from_json(entry)
+            rests[level_of(path)] = entry.get("rest", rests.get(level_of(path), ZERO))
             if "hierarchy" in entry:
-                attributes["policy"] = cls._recorded(spec, entry["hierarchy"], skills.pop(path))
+                attributes["policy"] = cls._recorded(
+                    spec, entry["hierarchy"], skills.pop(path), rests[path]
+                )
             skill = type(attributes["name"], (RecordedSkill,), attributes)()
             skills.setdefault(level_of(path), []).insert(0, skill)
-        return cls._recorded(spec, manifest, skills[""])
+        return cls._recorded(spec, manifest, skills[""], rests[""])
 
     @classmethod
-    def _recorded(cls, spec: EnvSpec, entry: dict[str, Any], skills: list[Skill]) -> Hierarchy:
+    def _recorded(
+        cls, spec: EnvSpec, entry: dict[str, Any], skills: list[Skill], rest: Any
+    ) -> Hierarchy:
         """Return a run's hierarchy, or one below it, from its entry and its skills."""
-        hierarchy = cls(spec, skills, call_steps=calls_from_json(entry))
+        hierarchy = cls(spec, skills, call_steps=calls_from_json(entry), rest=rest)
         hierarchy.recorded = True
         return hierarchy
 

@@ -13,7 +13,12 @@ from skillweave.errors import RunError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, Roles, roles_of
-from skillweave.hierarchy.weights import check_guided, check_selector, with_calls
+from skillweave.hierarchy.weights import (
+    check_guided,
+    check_same_part,
+    check_selector,
+    with_calls,
+)
 from skillweave.paths import SELECTOR
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.command_words import called_by
@@ -148,6 +153,7 @@ def _check_roles(roles: Roles, run: RunDirectory) -> None:
                 "this declaration, not in both; declare it as it was trained"
             )
         _check_goals(roles.skills[path], entry, f"{run.path}: skill {path!r}")
+        check_same_part(roles, path, entry, f"{run.path}: skill {path!r}")
         if "hierarchy" in entry:
             entries[path] = entry["hierarchy"]
     for path, level in roles.levels.items():

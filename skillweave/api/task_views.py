@@ -155,9 +155,10 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
         space: of the observations that hold the task's state.
     """
     policies = tuple(
-        _own_policy(policy, view, space, goals_of(skill))
-        for skill, policy in zip(skills.skills, skills.policies, strict=True)
+        _own_policy(policy, view, space, goals_of(skill)) if skills.part(i) is None else policy
+        for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True))
     )
+    parts = tuple(part and part.within(view.obs, space) for part in skills.parts)
     cuts = skills.interruption
     return replace(
         skills,
@@ -166,6 +167,7 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
             for skill, policy in zip(skills.skills, policies, strict=True)
         ),
         policies=policies,
+        parts=parts,
         reflexes=tuple(_own_reflex(reflex, view) for reflex in skills.reflexes),
         interruption=cuts and replace(cuts, worth=_of_own(cuts.worth, view)),
     )

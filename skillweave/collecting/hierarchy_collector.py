@@ -7,7 +7,9 @@ calls go on. A call that is open when the rows are full goes on in the next batc
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
@@ -325,9 +327,11 @@ class HierarchyCollector(Collector):
             other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
             ends[:-1] |= other
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals)
+        part = level.player.skills.part(level.skills.index(skill))
+        batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)
         if "action" not in batch:
-            batch = batch.replace(action=self._no_actions(trace.lead))
+            space = self.engine.action_space if part is None else part.action_space
+            batch = batch.replace(action=self._no_actions(trace.lead, space))
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]
@@ -336,9 +340,10 @@ class HierarchyCollector(Collector):
         before[:] = goes_on[-1]
         return batch.replace(recurrent_state=self._states[path], episode_start=starts)
 
-    def _no_actions(self, lead: tuple[int, int]) -> Array:
+    @staticmethod
+    def _no_actions(lead: tuple[int, int], space: gym.Space[Any]) -> Array:
         """Return the actions of a skill that has not acted, (T, N, …) in policy units."""
-        codec = action_codec(self.engine.action_space)  # all skills act in this space
+        codec = action_codec(space)
         units = codec.from_env(np.asarray(codec.space.sample())[None])
         return np.zeros((*lead, *units.shape[1:]), units.dtype)
 

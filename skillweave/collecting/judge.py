@@ -85,6 +85,11 @@ def judged_by(skill: Skill, spec: EnvSpec) -> JudgedBy:
             f"skill {path_of(skill)!r}: its reward changes for the same step (reward_changes), so "
             "steps cannot be judged by it again: let its reward depend on the step alone"
         )
+    if skill.sees is not None:
+        raise DeclarationError(
+            f"skill {path_of(skill)!r}: its rows hold only the part of observations that it sees "
+            "(sees), so they cannot be judged again: leave out sees"
+        )
     step = sample_step(spec)
     if (goals := goals_of(skill)) is not None:
         step = seen_by(skill, step, step.elapsed, goal=goals.start(1))

@@ -7,6 +7,8 @@ are named as follows; a hierarchy that is skill ``i`` has the same names under `
 - ``skill``: the running one, −1 where no call has started in the episode;
 - ``elapsed``: steps of its call; ``limit``: the length that was chosen, where one is;
 - ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
+- ``last_action``: the last action of the environment, as bytes, where it counts for a skill's own
+  part (``Rest``);
 - ``goal.i``: the goal of the latest call of skill ``i``, where it has goals;
 - ``i.<key>``: what the policy of skill ``i`` remembers;
 - ``selector.<key>``, ``guide.<key>``: the same of the selector and its guide; ``chances``: how
@@ -33,6 +35,7 @@ from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
 from skillweave.skills.goal_spaces import GOAL, SKILL
 from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.own_part import ZERO, Rest
 from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
 
@@ -49,6 +52,8 @@ class Turn:
     """(N,), steps of the episodes so far, for messages."""
     overridden: Array | None = None
     """(N,) bool, set where a reflex acts."""
+    last_action: Array | None = None
+    """(N, K), the last actions of the environments, as ``Rest.stored``; None: the player's own."""
     trace: TraceWriter | None = None
     """Where those who learn write what they choose; None: nothing is recorded."""
 
@@ -185,14 +190,14 @@ class Player:
         every = ((i, goals_of(skill)) for i, skill in enumerate(skills.skills))
         self.goals: dict[int, Goals] = {i: goals for i, goals in every if goals is not None}
         """The goals of skills that have some, by their place in the list."""
+        self._rest = Rest(ZERO, self.action_space) if skills.holds else None
         if isinstance(selector, LearnerActor) and self.goals:
             selector.widen = selector.acting.widened
 
     @property
     def action_space(self) -> gym.Space[Any]:
-        """The environment's; all skills act in it."""
-        space: gym.Space[Any] = self.skills.policies[0].action_space
-        return space
+        """The environment's."""
+        return self.skills.action_space
 
     @property
     def below(self) -> dict[int, Player]:
@@ -208,6 +213,8 @@ class Player:
         }
         if self.skills.lengths:
             memory["limit"] = np.zeros(n, np.int64)
+        if self._rest is not None:
+            memory["last_action"] = self._rest.start(n)
         memory |= {f"goal.{i}": goals.start(n) for i, goals in self.goals.items()}
         for i, actor in enumerate(self.actors):
             memory |= {f"{i}.{k}": v for k, v in actor.start(n).items()}
@@ -222,6 +229,8 @@ class Player:
         """Start new episodes in environments ``rows`` (k,): no call has started."""
         memory["skill"][rows] = -1
         memory["end"][rows] = EPISODE
+        if self._rest is not None:
+            memory["last_action"][rows] = self._rest.start(len(rows))
         chooses = {} if self.selector is None else self.selector.start(len(rows))
         fresh = {f"selector.{k}": v for k, v in chooses.items()}
         if self.guide is not None:
@@ -248,17 +257,17 @@ class Player:
     ) -> Array:
         """Return actions (k, …) as of ``act``, where calls run in all environments ``rows``."""
         running, actions = memory["skill"][rows], None
-        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden, turn.trace)
+        last = memory.get("last_action") if turn.last_action is None else turn.last_action
+        own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden, last, turn.trace)
         for i, actor in enumerate(self.actors):
             mine = np.flatnonzero(running == i)
             if not len(mine):
                 continue
             if len(mine) == len(rows):
-                seen = self._seen(memory, i, rows, obs)
-                actions = actor.act(self.of_skill(memory, i), rows, seen, mask, own)
+                actions = self._act_skill(memory, i, rows, obs, mask, own)
                 break
-            allowed, seen = allowed_rows(mask, mine), self._seen(memory, i, rows[mine], obs[mine])
-            some = actor.act(self.of_skill(memory, i), rows[mine], seen, allowed, own)
+            allowed = allowed_rows(mask, mine)
+            some = self._act_skill(memory, i, rows[mine], obs[mine], allowed, own)
             if actions is None:
                 actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
             actions[mine] = some
@@ -268,6 +277,21 @@ class Player:
             actions, holds = apply_reflexes(reflexes, obs, actions, self.action_space)
             if turn.overridden is not None:
                 turn.overridden[rows] |= holds
+        return actions
+
+    def _act_skill(
+        self, memory: Memory, i: int, rows: Array, obs: Array, mask: Array | None, turn: Turn
+    ) -> Array:
+        """Return the actions (k, …) of skill ``i`` in ``rows`` (k,), of which it may own a part."""
+        part, seen, below = self.skills.part(i), self._seen(memory, i, rows, obs), mask
+        if part is not None:
+            below = part.mask(mask)
+        actions: Array = self.actors[i].act(self.of_skill(memory, i), rows, seen, below, turn)
+        if part is None:
+            return actions
+        last = None if turn.last_action is None else turn.last_action[rows]
+        actions = part.write(actions, last)
+        part.check_mask(mask, actions)
         return actions
 
     def begin(
@@ -319,6 +343,8 @@ class Player:
                 skill sees the time of its own call.
         """
         memory["elapsed"][rows] += 1
+        if self._rest is not None:
+            memory["last_action"][rows] = self._rest.stored(step.action)
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
         end = np.zeros(len(rows), np.int8)
         if self.skills.lengths:
@@ -505,8 +531,9 @@ class Player:
         return None if goals is None else goals.read(memory[f"goal.{i}"][rows])
 
     def _seen(self, memory: Memory, i: int, rows: Array, obs: Array) -> Array:
-        """Return what skill ``i`` observes in ``rows`` (k,): ``obs`` (k, …), perhaps and a goal."""
-        goals = self.goals.get(i)
+        """Return what skill ``i`` sees in ``rows`` (k,): ``obs`` (k, …) or its part, and a goal."""
+        goals, part = self.goals.get(i), self.skills.part(i)
+        obs = obs if part is None else part.see(obs)
         if goals is None:
             return obs
         return goals.join(obs, goals.read(memory[f"goal.{i}"][rows]))

@@ -22,6 +22,7 @@ from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.skills.goals import goals_of
+from skillweave.skills.own_part import ZERO, OwnPart, Rest
 from skillweave.types import Array, Step
 
 PATIENCE = 5_000
@@ -57,6 +58,7 @@ class SkillCollector(Collector):
         start_after: names among ``starters``; in half of the episodes a call of one of them comes
             last before the skill starts.
         call_limit: the most steps of a call of the skill; None: its ``max_steps``.
+        part: the skill's own part of observations and actions; None: it has all.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class SkillCollector(Collector):
         episode_calls: int = 1,
         start_after: tuple[str, ...] = (),
         call_limit: int | None = None,
+        part: OwnPart | None = None,
     ) -> None:
         super().__init__(engine)
         if acting is not None:
@@ -94,6 +97,11 @@ class SkillCollector(Collector):
         self._draws = self._start_calls > 0 or bool(self._start_after)
         """Whether calls come first is drawn for each episode."""
         self._searches = self._restricted or self._draws
+        self._part = part
+        holds = (part is not None and part.holds) or (starters is not None and starters.holds)
+        self._rest = Rest(ZERO, engine.action_space) if holds else None
+        if self._rest is not None:
+            self.kept["last_action"] = self._rest.start(n)
         self._goals = goals_of(skill)
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
@@ -124,7 +132,7 @@ class SkillCollector(Collector):
         starters = self._starters.skills if self._searches else None
         how = self._start_calls, self._search_steps, self._episode_calls, self._start_after
         return SkillCollector(
-            engine, acting, self.skill, self.reflexes, starters, *how, self._call_limit
+            engine, acting, self.skill, self.reflexes, starters, *how, self._call_limit, self._part
         )
 
     def _prepare(self, request: Request) -> None:
@@ -144,11 +152,12 @@ class SkillCollector(Collector):
         if self._draws:
             self._draw_calls()
         obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
-        seen, goal = obs, None
+        goal, part = None, self._part
+        seen = obs if part is None else part.see(obs)
         if self._goals is not None:
             goal = self._choose_goals(playing)
-            seen = self._goals.join(obs, goal)
-        acted = self.acting.all(seen, mask, memory)
+            seen = self._goals.join(seen, goal)
+        acted = self.acting.all(seen, mask if part is None else part.mask(mask), memory)
         action, overridden = self._actions(obs, acted.action, mask, playing)
         out.write(
             obs=obs,
@@ -161,6 +170,8 @@ class SkillCollector(Collector):
             goal=goal,
         )
         raw = self.engine.step(action)
+        if self._rest is not None:
+            self.kept["last_action"][:] = self._rest.stored(action)
         self.kept["age"] += 1
         self.kept["elapsed"] += 1 if playing is None else playing
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
@@ -207,12 +218,19 @@ class SkillCollector(Collector):
             The actions, and where reflexes act, (N,) bool; None: there are none.
         """
         action, overridden = self.acting.to_env(chosen), None
+        last = self.kept.get("last_action")
+        if self._part is not None:
+            action = self._part.write(action, last)
+            rows = slice(None) if playing is None else playing
+            self._part.check_mask(None if mask is None else mask[rows], action[rows])
         if self.reflexes:
             space = self.engine.action_space
             action, overridden = apply_reflexes(self.reflexes, obs, action, space)
         if playing is not None:
             searching, action = np.flatnonzero(~playing), action.copy()
-            action[searching] = self._starters.act(searching, obs, mask, self._rng, self._last())
+            action[searching] = self._starters.act(
+                searching, obs, mask, self._rng, self._last(), last
+            )
         return action, overridden
 
     def _search(self, step: Step, searching: Array) -> None:
@@ -298,7 +316,8 @@ class SkillCollector(Collector):
         return steps.replace(valid=trace.get("valid")), found
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        batch = rows_of(trace, steps, "", trace["call_elapsed"], self._record, self._goals)
+        elapsed = trace["call_elapsed"]
+        batch = rows_of(trace, steps, "", elapsed, self._record, self._goals, self._part)
         if self._before is None:
             return {"": batch}
         starts = np.concatenate([self._starts[None], batch.ended[:-1]])
@@ -317,7 +336,10 @@ class SkillCollector(Collector):
         made = self.kept["calls_made"]
         ids = limited[made[limited] + 1 < self._episode_calls]
         age, calls = self.kept["age"][ids], made[ids] + 1
+        last = self.kept["last_action"][ids] if self._rest is not None else None
         self._forget(ids)
+        if last is not None:  # the episode goes on
+            self.kept["last_action"][ids] = last
         self.kept["age"][ids], made[ids] = age, calls
         return ids
 
@@ -337,6 +359,8 @@ class SkillCollector(Collector):
         keys = ("searched", "found", "sought")
         counted = {k: self.kept[k][ids] for k in keys if k in self.kept}
         super()._forget(ids)
+        if self._rest is not None:
+            self.kept["last_action"][ids] = self._rest.start(len(ids))
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
         if self._searches:

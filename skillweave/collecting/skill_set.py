@@ -14,6 +14,7 @@ from skillweave.errors import SkillError
 from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, asked, path_of
 from skillweave.skills.goal_spaces import choice_space
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Array, Policy
 
 
@@ -36,6 +37,9 @@ class SkillSet:
     """What a selector that learns pays for each call, in units of reward."""
     interruption: Interruption | None = None
     """When the selector cuts a call; None: never."""
+    parts: tuple[OwnPart | None, ...] = ()
+    """The own part of each skill's observations and actions, None: it has all; (): no skill has
+    one."""
     greedy_selector: bool = True
     """The selector is greedy where its caller asks for deterministic actions; else it samples."""
 
@@ -99,6 +103,23 @@ class SkillSet:
         if below is not None and below.restricts:
             may = may & below.startable(obs).any(axis=1)
         return may
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The environment's space of actions."""
+        part = next((part for part in self.parts if part is not None), None)
+        return self.policies[0].action_space if part is None else part.whole_action_space
+
+    def part(self, i: int) -> OwnPart | None:
+        """Return the own part of skill ``i``; None: it has all."""
+        return self.parts[i] if self.parts else None
+
+    @property
+    def holds(self) -> bool:
+        """True if the last action counts for some skill, here or in a hierarchy below."""
+        below = (skills_below(p) for p in self.policies)
+        own = any(part is not None and part.holds for part in self.parts)
+        return own or any(skills.holds for skills in below if skills is not None)
 
     def skill_of(self, choice: Array) -> Array:
         """The skills that choices (k,) are of."""

@@ -68,11 +68,13 @@ class StartPolicy:
         mask: Array | None,
         rng: np.random.Generator,
         last: Array | None = None,
+        last_action: Array | None = None,
     ) -> Array:
         """Return actions (k, …) in environments ``ids`` (k,); obs and mask are of all N.
 
         Args:
             last: (N,) bool, the next call is to be one of a named skill, if one may start.
+            last_action: as of ``Turn``.
         """
         if self.skills is None:
             return random_actions(self._space, len(ids), rng, allowed_rows(mask, ids))
@@ -81,7 +83,7 @@ class StartPolicy:
         called, free = ids[runs], ids[~runs]
         action: Array = np.empty((len(ids), *self._space.shape), self._space.dtype)  # type: ignore[misc]
         if len(called):
-            allowed, turn = allowed_rows(mask, called), Turn(rng=rng)
+            allowed, turn = allowed_rows(mask, called), Turn(rng=rng, last_action=last_action)
             action[runs] = self._player.act_in_calls(
                 self._calls, called, obs[called], allowed, turn
             )

@@ -20,6 +20,7 @@ from skillweave.skills import Skill
 from skillweave.skills.goal_read import check_reads_goal, is_unchecked
 from skillweave.skills.goals import Goals
 from skillweave.skills.info_words import missing_key
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26
@@ -166,6 +167,7 @@ def rows_of(
     elapsed: Array,
     record: Sequence[str],
     goals: Goals | None = None,
+    part: OwnPart | None = None,
 ) -> Batch:
     """Return the steps of a learner with all that it may learn from.
 
@@ -174,6 +176,7 @@ def rows_of(
         elapsed: (T, N) int64, steps of its calls so far.
         record: names of raw columns.
         goals: of the learner's skill: it observes them, too.
+        part: of observations and actions that the learner's skill has; None: it has all.
 
     Raises:
         EnvError: no environment gives a key of ``info`` that is wanted.
@@ -183,9 +186,12 @@ def rows_of(
     found = {k: _info_column(trace, k) if k.startswith(INFO) else trace.get(k) for k in names}
     if "call_elapsed" in record:
         found["call_elapsed"] = elapsed
+    if part is not None:
+        found |= {k: part.see(found[k]) for k in ("obs", "next_obs")}
+        found |= {k: part.mask(found[k]) for k in ("mask", "next_mask")}
     if goals is not None:
         goal = trace[path + "goal"]
-        found |= {k: goals.join(trace[k], goal) for k in ("obs", "next_obs")}
+        found |= {k: goals.join(found[k], goal) for k in ("obs", "next_obs")}
     found |= {k: trace.get(path + k) for k in own} | {"steps": np.ones(trace.lead, np.int64)}
     return steps.replace(**found)
 

@@ -16,6 +16,7 @@ from skillweave.paths import name_of
 from skillweave.selectors import Automaton
 from skillweave.settings import fitted
 from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import Target, target_of
 
 
@@ -115,6 +116,7 @@ def check_level(level: Level) -> None:
     _check_selection(level)
     _check_calls(level)
     _check_start_calls(level)
+    _check_rest(level)
 
 
 def _check_selection(level: Level) -> None:
@@ -184,6 +186,17 @@ def _check_calls(level: Level) -> None:
             )
 
 
+def _check_rest(level: Level) -> None:
+    """Raise a DeclarationError where ``rest`` is wrong, or means nothing."""
+    checked_rest(level.rest)
+    is_default = isinstance(level.rest, str) and level.rest == ZERO
+    if not is_default and all(skill.acts is None for skill in level.skills.values()):
+        raise DeclarationError(
+            f"rest is {short(level.rest)}, but no skill writes a part of the action alone: give a "
+            "skill acts, the part that it writes, or leave out rest"
+        )
+
+
 def _check_start_calls(level: Level) -> None:
     """Raise a DeclarationError where ``apart.start_calls`` names no skill of the level."""
     calls = level.apart.start_calls
@@ -221,6 +234,12 @@ def check_nested(roles: Roles) -> None:
                 f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
                 "attribute"
             )
+        for field in ("sees", "acts"):
+            if getattr(skill, field) is not None:
+                raise DeclarationError(
+                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give it to "
+                    "the skills in the hierarchy"
+                )
         for field, where in _ELSEWHERE.items():
             if getattr(skill, field) is not None:
                 raise DeclarationError(

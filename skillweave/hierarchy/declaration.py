@@ -30,6 +30,7 @@ from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
 from skillweave.skills import Reflex, Skill, is_trained
+from skillweave.skills.own_part import ZERO
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import EnvValue, check_env
 from skillweave.training.defaults import TrainDefaults
@@ -84,6 +85,11 @@ class Declaration(Nestable):
     selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
     reflexes: Sequence[Reflex] = ()
     """Rules that override the running skill's action, also while skills train."""
+    rest: Any = ZERO
+    """The numbers of an action that the running skill does not write (``Skill.acts``): "zero";
+    "hold", as they were in the last action, zero in an episode's first; a number; or a list with a
+    number or "hold" for each number of the action, a dict of these for a Dict action. Zero is what
+    pushes nothing where actions are forces or speeds; hold what is a place, or a grip."""
     apart: Apart = field(default_factory=Apart)
     """Settings of learning apart: budgets, and the start of skills."""
     together: Together = field(default_factory=Together)
@@ -138,6 +144,7 @@ class Declaration(Nestable):
             algorithm=self.algorithm,
             selector=self.selector,
             reflexes=tuple(self.reflexes),
+            rest=self.rest,
             apart=self.apart,
             together=self.together,
             selection=self.selection,

@@ -104,14 +104,17 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
     spaces = role.observation_space, role.action_space
+    env = role.spec.name
+    if role.part is not None:
+        env += ", of which the skill has a part (sees, acts),"
     goals, seen = goals_of(role.skill), policy.observation_space
     sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
     if goals is None:
-        return fitted(policy, *spaces, who, role.spec.name)
+        return fitted(policy, *spaces, who, env)
     if seen is not None and sees_goal:
         if says := other_goals(goal_part(seen), goals.space):
             raise PolicyError(f"{who}: its policy {says}")
-        return fitted(policy, *spaces, who, role.spec.name)
+        return fitted(policy, *spaces, who, env)
     if not isinstance(policy, Foreign):
         raise PolicyError(
             f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
@@ -123,7 +126,7 @@ def _fitted(policy: Policy, role: Role, who: str) -> Policy:
             "goal), or a policy from elsewhere with Goal() at its place in sees"
         )
     bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
-    return checked_fit(bound, *spaces, who, role.spec.name)
+    return checked_fit(bound, *spaces, who, env)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:

@@ -39,7 +39,7 @@ class HierarchyPolicy:
         self.guide = guide
         self.player = Player(skills, selector, guide)
         self.observation_space = selector.observation_space
-        self.action_space = skills.policies[0].action_space
+        self.action_space = skills.action_space
         self.labels = tuple(s.name for s in skills.skills)
 
     def source(self) -> dict[str, Any]:
@@ -62,6 +62,8 @@ class HierarchyPolicy:
         if self.guide is not None:
             guide = source_of(cast(Policy, self.guide.selector))
             checksums.append(["guide", guide.get("sha256")])
+        parts = (part for part in skill_set.parts if part is not None)
+        checksums += [["part", part.who, part.to_json()] for part in parts]
         call_steps = skill_set.lengths or skill_set.call_steps
         greedy = [skill_set.greedy, skill_set.greedy_selector]
         whole = json.dumps([checksums, skills, reflexes, call_steps, *greedy])
@@ -149,25 +151,42 @@ class SkillAlone:
         self.policy = skills.policies[at]
         self.reflexes = skills.reflexes
         self.goals = goals_of(self.skill)
+        self.part = skills.part(at)
         self.observation_space = self.policy.observation_space
         if self.goals is not None:
             self.observation_space = without_goal(self.observation_space)
-        self.action_space = self.policy.action_space
+        if self.part is not None:
+            self.observation_space = self.part.whole_observation_space
+        self.action_space = skills.action_space
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
         self.acting = self.policy.acting
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""
-        memory = self.policy.start(n)
-        return memory if self.goals is None else memory | {"goal": self.goals.start(n)}
+        return self.policy.start(n) | self._fresh(n)
+
+    def _fresh(self, n: int) -> Memory:
+        """Return what is remembered beside the skill's own policy, where episodes start."""
+        goal = {} if self.goals is None else {"goal": self.goals.start(n)}
+        if self.part is None or self.part.rest is None or not self.part.holds:
+            return goal
+        return goal | {"last_action": self.part.rest.start(n)}
+
+    def _divided(self, memory: Memory) -> tuple[Memory, Memory]:
+        """Return the memory of the skill's own policy, and what is remembered beside it."""
+        beside = self._fresh(0)
+        own = {k: v for k, v in memory.items() if k not in beside}
+        return own, {k: memory[k] for k in beside}
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Return the ``memory`` after a ``step``."""
-        if self.goals is None:
-            return self.policy.observe(memory, step)
-        own = {k: v for k, v in memory.items() if k != "goal"}
-        return self.policy.observe(own, step) | {"goal": memory["goal"]}
+        own, beside = self._divided(memory)
+        if "last_action" in beside:
+            assert self.part is not None
+            assert self.part.rest is not None
+            beside["last_action"] = self.part.rest.stored(step.action)
+        return self.policy.observe(own, step) | beside
 
     def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
         """Return its goal in ``row`` of the ``memory``; None: it has none."""
@@ -201,13 +220,16 @@ class SkillAlone:
     ) -> tuple[Array, Memory]:
         """Return the skill's actions, or a reflex's action where its condition holds."""
         how: Any = {"deterministic": deterministic, "rng": rng}
-        if self.goals is None:
-            action, memory = self.policy.act(memory, obs, mask, **how)
-        else:
-            goal = memory["goal"]
-            own = {k: v for k, v in memory.items() if k != "goal"}
-            seen = self.goals.join(obs, self.goals.read(goal))
-            action, memory = self.policy.act(own, seen, mask, **how)
-            memory = memory | {"goal": goal}
+        own, beside = self._divided(memory)
+        part, seen, allowed = self.part, obs, mask
+        if part is not None:
+            seen, allowed = part.see(obs), part.mask(mask)
+        if self.goals is not None:
+            seen = self.goals.join(seen, self.goals.read(beside["goal"]))
+        action, own = self.policy.act(own, seen, allowed, **how)
+        if part is not None:
+            action = part.write(action, beside.get("last_action"))
+            part.check_mask(mask, action)
+        memory = own | beside
         action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
         return action, memory

@@ -7,7 +7,7 @@ table, with choices as a run records them for example, is another table.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeVar, cast
@@ -26,6 +26,7 @@ from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.skills.learnable import Learnable
+from skillweave.skills.own_part import OwnPart, computed
 from skillweave.training.role import Role
 from skillweave.training.stage import Together
 from skillweave.types import Policy
@@ -92,6 +93,7 @@ class Level:
     algorithm: AlgorithmConfig
     selector: AlgorithmConfig | ReadyValue
     reflexes: tuple[Reflex, ...]
+    rest: Any
     apart: Apart
     together: Together
     selection: Selection
@@ -151,7 +153,9 @@ class Level:
         if self.reflexes or self.guide is not None or self.ready_selector is not None:
             return False
         skills = self.skills.values()
-        return not any(s.defines("termination") or s.defines("initiation") for s in skills)
+        computes = any(s.sees is not None and computed(s.sees, s.name) for s in skills)
+        asks = any(s.defines("termination") or s.defines("initiation") for s in skills)
+        return not (asks or computes)
 
     def skill_set(self, policies: Mapping[str, Policy]) -> SkillSet:
         """Return its skills that have a policy in ``policies``, by path, ready to be called."""
@@ -164,7 +168,13 @@ class Level:
             self.selection.greedy_skills is not False,
             self.selection.call_cost,
             greedy_selector=self.selection.greedy_selector is not False,
+            parts=self._parts(skills),
         )
+
+    def _parts(self, paths: Iterable[str]) -> tuple[OwnPart | None, ...]:
+        """Return the skills' own parts of observations and actions; (): none has one."""
+        parts = tuple(self.role_of_skill(path, self.spec).part for path in paths)
+        return parts if any(part is not None for part in parts) else ()
 
     def role_of_skill(self, path: str, spec: EnvSpec) -> Role:
         """Return the role of one of its skills, in the environment ``spec``."""
@@ -175,7 +185,7 @@ class Level:
         if isinstance(skill.policy, Learnable):
             config = skill.policy.learning_on(config, f"skill {path!r}")
         greedy = self.selection.greedy_skills is not False
-        return Role(path, "skill", spec, config, skill, greedy=greedy)
+        return Role(path, "skill", spec, config, skill, greedy=greedy, rest=self.rest)
 
     def deciding_roles(self, spec: EnvSpec) -> tuple[Role, Role]:
         """Return the roles of its selector and of its critic, in the environment ``spec``."""

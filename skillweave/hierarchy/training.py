@@ -24,6 +24,7 @@ from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
+from skillweave.skills.own_part import part_to_json, rest_to_json
 from skillweave.spaces import space_to_json
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.joint import agents_of
@@ -222,6 +223,9 @@ def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
         entry["call_steps"] = skill.call_steps
     if skill.goal_space is not None:
         entry["goal_space"] = space_to_json(skill.goal_space)
+    entry |= part_to_json(skill.sees, skill.acts, f"skill {path!r}")
+    if skill.acts is not None:
+        entry["rest"] = rest_to_json(roles[path].rest)
     if inner is not None:
         entry["hierarchy"] = _level_entry(roles, inner)
     return entry if policy is None else entry | {"policy": source_of(policy)}

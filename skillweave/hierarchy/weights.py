@@ -27,6 +27,7 @@ from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
+from skillweave.skills.own_part import part_to_json, rest_to_json
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 
@@ -75,10 +76,18 @@ def write_weights(
         "skills": list(roles.skills),
         **levels.pop(""),
         "hierarchies": levels,
+        **_own_parts(roles),
         "parts": trained,
         "ready": ready,
     }
     write_tensors(path, tensors, header)
+
+
+def _own_parts(roles: Roles) -> dict[str, Any]:
+    """Return the header entry of skills with a part of observations or actions, by path."""
+    parts = {path: roles[path].part for path in roles.skills}
+    content = {path: part.to_json() for path, part in parts.items() if part is not None}
+    return {"own_parts": content} if content else {}
 
 
 def _place(spec: EnvSpec) -> dict[str, Any]:
@@ -122,6 +131,8 @@ class HierarchyHeader(InnerHeader):
     recipe: str | None
     skills: list[str]
     parts: dict[str, dict[str, Any]]
+    own_parts: NotRequired[dict[str, dict[str, Any]]]
+    """``sees``, ``acts`` and ``rest`` of skills that have a part of their own, by path."""
     ready: dict[str, Source]
     """Sources of ready skills and selectors, by path."""
     hierarchies: dict[str, InnerHeader]
@@ -189,6 +200,9 @@ def read_weights(
             f"{path} is of skills {recorded_skills[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(roles.skills)} on {roles.spec.name}"
         )
+    recorded_parts = header.get("own_parts", {})
+    for name in roles.skills:
+        check_same_part(roles, name, recorded_parts.get(name, {}), f"{path}: skill {name!r}")
     roles = roles.changed(lambda level: with_calls(level, levels[level.path]))
     policies = _ready_parts(roles, tensors, header, path)
     for level in roles.levels.values():
@@ -227,6 +241,25 @@ def _ready_parts(
         where = f"{path}: the {name}"
         policies[name] = as_recorded(policy, recorded.get(name), lambda: None, where)
     return policies
+
+
+def check_same_part(roles: Roles, path: str, recorded: Mapping[str, Any], who: str) -> None:
+    """Raise a RunError where a skill had another part of observations or actions.
+
+    Args:
+        recorded: its ``sees``, ``acts`` and ``rest``, where it had some.
+    """
+    skill, rest = roles.skills[path], roles[path].rest
+    declared = part_to_json(skill.sees, skill.acts, f"skill {path!r}")
+    if skill.acts is not None and "rest" in recorded:
+        declared["rest"] = rest_to_json(rest)
+    for field in ("sees", "acts", "rest"):
+        then, now = recorded.get(field), declared.get(field)
+        if then != now:
+            raise RunError(
+                f"{who} was trained with {field} {shown(then)}, but now it is {shown(now)}: "
+                "declare it as it was, or train again"
+            )
 
 
 def with_calls(level: Level, entry: Mapping[str, Any]) -> Level:
@@ -274,20 +307,24 @@ def check_guided(is_guided: bool, recorded: bool, where: str) -> None:
 def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
     """Raise a RunError where a policy has not the spaces of its place.
 
-    Selectors choose among their skills; all skills have the spaces of the first. The environment
-    is not needed.
+    Selectors choose among their skills; all skills have the spaces of the first, or a part of the
+    environment's. Without parts the environment is not needed.
     """
-    first = policy.skills.policies[0]
-    seen = first.observation_space
-    if next(iter(roles.skills.values())).goal_space is not None:
+    first, whole = policy.skills.policies[0], policy.skills.part(0)
+    seen, acts = first.observation_space, policy.action_space
+    if whole is not None:
+        seen = whole.whole_observation_space
+    elif next(iter(roles.skills.values())).goal_space is not None:
         seen = without_goal(seen)
     for path, part in parts_of(roles, policy).items():
         role = roles.by_path.get(path)
         if role is None or role.kind == "critic":
             continue
-        action_space = first.action_space if role.choices is None else role.action_space
+        action_space = acts if role.choices is None else role.action_space
         goal_space = None if role.skill is None else role.skill.goal_space
         own = seen if goal_space is None else with_goal(seen, goal_space)
+        if role.part is not None:
+            own, action_space = role.observation_space, role.action_space
         spaces = {"observation_space": own, "action_space": action_space}
         for kind, space in spaces.items():
             actual = getattr(part, kind)

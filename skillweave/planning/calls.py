@@ -162,7 +162,10 @@ class CallLog(CallColumns):
                 f"the log is of calls with {_shown_lengths(self.lengths)}, but these are with "
                 f"{_shown_lengths(lengths)}; record a log of these calls"
             )
-        for skill, policy in zip(skills.skills, skills.policies, strict=True):
+        for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
+            if (part := skills.part(i)) is not None:
+                self.check_spaces(part.whole_observation_space, part.whole_action_space)
+                continue
             seen = policy.observation_space
             seen = seen if skill.goal_space is None else without_goal(seen)
             self.check_spaces(seen, policy.action_space)
@@ -288,6 +291,8 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
         reflexes = [reflex.name for reflex in skills.reflexes]
         goals = skills.skills[i].goal_space
         own = [] if goals is None else [str(goals)]
+        if (part := skills.part(i)) is not None:
+            own.append(str(part.to_json()))
         whole = repr([acts, skills.limit(i), skills.greedy, reflexes, *own])
         checksums.append(checksum(whole.encode()))
         if not isinstance(skills.skills[i], RecordedSkill):

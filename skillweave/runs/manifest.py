@@ -71,6 +71,11 @@ class SkillEntry(TypedDict):
     policy: NotRequired[Source]
     goal_space: NotRequired[dict[str, Any]]
     """The space of its goals, if it has some."""
+    sees: NotRequired[Any]
+    """The part of observations that it sees, and, below, of actions that it writes."""
+    acts: NotRequired[Any]
+    rest: NotRequired[Any]
+    """The other numbers of the action."""
     hierarchy: NotRequired[NestedEntry]
     """Its parts, if the skill is a hierarchy."""
 

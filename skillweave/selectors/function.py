@@ -23,7 +23,7 @@ from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.goals import as_goals
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.probing import probe
-from skillweave.skills.scripted import required_arguments
+from skillweave.skills.outputs import required_arguments
 from skillweave.types import Array, Memory, Step, read_only
 
 

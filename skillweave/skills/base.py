@@ -20,6 +20,7 @@ from skillweave.skills.answers import answer
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
 from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, Step
@@ -60,6 +61,13 @@ class Skill:
         target_success: the same for the share of successful episodes, from 0 to 1.
         goal_space: the space of its goals, any that observations may have; None: it has none. Its
             networks see the observation and the goal of the call, and ``step.goal`` holds it.
+        sees: the parts of the observation that its policy sees, as the ``sees`` of a policy from
+            elsewhere: a key, a place, a slice, a ``Part``, a function of observations, or a tuple
+            of these, joined in this order; a dict of them gives inputs with names. None: all.
+        acts: the part of the action that it writes: places of a Box, a MultiDiscrete or a
+            MultiBinary (``slice(0, 3)``, ``(3,)``), names of parts of a Dict (``"arm"``), or the
+            choices of a Discrete that it may make. The rest of the action is what
+            ``Hierarchy.rest`` says. None: all of it. Its methods see all, with or without these.
         policy: acts without training: a function of observations (n, *obs_shape), which needs no
             ``staticmethod``, or a method ``policy(self, obs)``, with a goal ``policy(self, obs,
             goal)``; a torch module;
@@ -82,6 +90,8 @@ class Skill:
     target_return: float | None = None
     target_success: Share | None = None
     goal_space: Space[Any] | None = None
+    sees: Any = None
+    acts: Any = None
     policy: Any = None
     needs_info: Sequence[str] | None = None
     reward_changes: bool = False
@@ -204,6 +214,10 @@ class Skill:
                 "needs_info = ('key',)"
             )
         self._check_goals(where)
+        if self.sees is not None:
+            declared_sees(self.sees, where)
+        if self.acts is not None:
+            declared_acts(self.acts, where)
         known = [
             *Skill.__annotations__.keys() - {"methods", "of_goals", "_path"},
             *self.methods,

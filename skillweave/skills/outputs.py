@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import fields
 from typing import Any, NoReturn
 
@@ -47,6 +48,16 @@ def called(
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
         raise kind(f"{who} raised {error_text(error)}{at_step(elapsed)}{given}{advice}") from error
+
+
+def required_arguments(function: Any) -> int:
+    """Return the number of required arguments of a function; 1 if Python has no signature."""
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of some functions written in C
+        return 1
+    return sum(p.kind in positional and p.default is p.empty for p in parameters)
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:

@@ -236,6 +236,19 @@ class Input:
             x = scaling(x)
         return x.reshape(len(x), *self.shape) if self.reshaped else x
 
+    @property
+    def leaves(self) -> list[tuple[Leaf | None, bool]]:
+        """Return the leaf that each piece reads, and True if it reads all of it as it is.
+
+        None: a piece reads no leaf.
+        """
+        return [
+            (p.leaf, p.whole or (p.places is None and not p.leaf.choices))
+            if isinstance(p, _Read)
+            else (None, False)
+            for p in self.pieces
+        ]
+
     def to_json(self, names: Mapping[int, str]) -> list[dict[str, Any]]:
         """Return its sources for files: each names one leaf, with its fields and choices.
 
@@ -430,7 +443,7 @@ class Plan:
         sizes = [leaf.size if part.one_hot else int(np.prod(leaf.shape)) for leaf in leaves]
         if not leaves:
             raise PolicyError(f"{where} reads {key!r}, which has images alone: name one of them")
-        places = _resolved(part.places, sum(sizes), f"{where}.places")
+        places = places_in(part.places, sum(sizes), f"{where}.places")
         first = np.concatenate([[0], np.cumsum(sizes)])
         owner = np.searchsorted(first, places, side="right") - 1
         cuts = np.flatnonzero(np.diff(owner)) + 1
@@ -495,7 +508,7 @@ def _share(part: Part, run: Array) -> Part:
     return replace(part, **share)
 
 
-def _resolved(places: slice | tuple[int, ...] | None, size: int, where: str) -> Array:
+def places_in(places: slice | tuple[int, ...] | None, size: int, where: str) -> Array:
     """Return places as an array; check that they are below ``size``."""
     if places is None:
         return np.arange(size)
@@ -664,7 +677,7 @@ class Outputs:
     def _places(self, acts: Acts, size: int) -> Array:
         where = f"{self.who}: acts.to"
         try:
-            return _resolved(acts.to, size, where)
+            return places_in(acts.to, size, where)
         except PolicyError:
             raise PolicyError(
                 f"{where} is {short(acts.to)}, a part of the action that does not exist: "

@@ -11,7 +11,8 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.goal_spaces import GOAL
-from skillweave.skills.scripted import from_function, required_arguments
+from skillweave.skills.outputs import required_arguments
+from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
 

@@ -22,7 +22,7 @@ from skillweave.skills.mapped import (
     state_shapes,
 )
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called
+from skillweave.skills.outputs import as_array, called, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.types import Array, Memory, read_only
 
@@ -159,16 +159,6 @@ def _takes_goal(function: Any) -> Literal["goal", "second"] | None:
 
 
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-
-
-def required_arguments(function: Any) -> int:
-    """Return the number of required arguments of a function; 1 if Python has no signature."""
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of some functions written in C
-        return 1
-    return sum(p.kind in positional and p.default is p.empty for p in parameters)
 
 
 @checked_names

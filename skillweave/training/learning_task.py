@@ -106,7 +106,9 @@ def skill_task(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(engine, acting, skill, tuple(reflexes), starters, *search)
+        return SkillCollector(
+            engine, acting, skill, tuple(reflexes), starters, *search, part=role.part
+        )
 
     return LearningTask(spec.name, role.observation_space, role.action_space, collector)
 

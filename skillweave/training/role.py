@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.own_part import OwnPart
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,8 @@ class Role:
     """Approximate environment steps of a row of its experience."""
     greedy: bool = True
     """It acts greedily in evaluations."""
+    rest: Any = "zero"
+    """Of a skill's hierarchy: the value of actions where the skill writes nothing."""
     margin: float | None = None
     """A critic's margin of interruption; None: it interrupts no call."""
     guide_kl: float | None = None
@@ -51,8 +55,8 @@ class Role:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """The space of what it observes: the environment's; of a skill with goals also the goal."""
-        space = self.spec.spaces.observation
+        """The space of what it observes: the environment's, or a skill's part; perhaps and a goal."""
+        space = self.spec.spaces.observation if self.part is None else self.part.observation_space
         if self.skill is None or self.skill.goal_space is None:
             return space
         return with_goal(space, self.skill.goal_space)
@@ -62,7 +66,21 @@ class Role:
         """The space of its actions, or of its choices."""
         if self.choices is not None:
             return choice_space(self.choices, self.goal_spaces, self.skills)
-        return self.spec.spaces.action
+        return self.spec.spaces.action if self.part is None else self.part.action_space
+
+    @cached_property
+    def part(self) -> OwnPart | None:
+        """A skill's own part of observations and actions; None: it has all.
+
+        Raises:
+            DeclarationError: it does not fit the environment's spaces.
+        """
+        skill = self.skill
+        if skill is None or (skill.sees is None and skill.acts is None):
+            return None
+        spaces = self.spec.spaces
+        who = f"skill {self.path!r}"
+        return OwnPart(skill.sees, skill.acts, self.rest, spaces.observation, spaces.action, who)
 
 
 def agent_role(spec: EnvSpec) -> Role:

@@ -1,0 +1,553 @@
+"""A skill's own part: what its policy sees of the observation, and what it writes of the action.
+
+A skill that declares ``sees`` or ``acts`` has an observation and an action space of its own. Who
+acts cuts observations to the part (``OwnPart.see``), and completes actions by what the hierarchy's
+``rest`` says (``OwnPart.write``). Skills judge whole observations and whole actions.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MethodType
+from typing import Any
+
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+
+from skillweave.arguments import meant
+from skillweave.errors import DeclarationError, PolicyError, SkillError
+from skillweave.messages import short
+from skillweave.skills.goal_spaces import example_of, leaf_paths, outside, part_at, parts_of
+from skillweave.skills.mapping import (
+    Acts,
+    Goal,
+    LastAction,
+    PolicyMapping,
+    mapping_of,
+    places_to_json,
+)
+from skillweave.skills.outputs import required_arguments
+from skillweave.skills.plan import Input, Plan, places_in
+from skillweave.types import Array
+
+HOLD, ZERO = "hold", "zero"
+"""Words for ``Hierarchy.rest``: the value of the last action, and zero."""
+
+
+# What is declared
+
+
+def declared_sees(sees: Any, who: str) -> PolicyMapping:
+    """Return a skill's ``sees`` as the mapping of its inputs.
+
+    Raises:
+        DeclarationError: it is no ``sees`` of a skill; ``who`` begins the message.
+    """
+    if isinstance(sees, MethodType) and required_arguments(sees.__func__) == 1:
+        sees = sees.__func__  # a function in a class's body becomes a method when it is looked up
+    mapping = mapping_of(who, sees=sees)
+    for source in mapping.sources():
+        if isinstance(source, Goal):
+            raise DeclarationError(
+                f"{who}: sees has Goal(), but the policy of a skill with a goal_space sees the "
+                "goal of its call already: leave it out"
+            )
+        if isinstance(source, LastAction):
+            raise DeclarationError(
+                f"{who}: sees has LastAction(), which only a policy from elsewhere takes, in its "
+                "own sees: leave it out"
+            )
+    return mapping
+
+
+def computed(sees: Any, who: str) -> bool:
+    """Return whether functions of the user are in a skill's ``sees``."""
+    return bool(declared_sees(sees, who).functions())
+
+
+def declared_acts(acts: Any, who: str) -> tuple[str, ...] | slice | tuple[int, ...]:
+    """Return a skill's ``acts``: names of parts of a Dict action, or places of another one.
+
+    Raises:
+        DeclarationError: it is neither; ``who`` begins the message.
+    """
+    names = (acts,) if isinstance(acts, str) else acts
+    if isinstance(names, list | tuple) and names and all(isinstance(x, str) and x for x in names):
+        if len(set(names)) != len(names):
+            raise DeclarationError(f"{who}: acts names a part of the action twice: {short(acts)}")
+        return tuple(names)
+    if isinstance(acts, int | np.integer) and not isinstance(acts, bool):
+        acts = (acts,)
+    if isinstance(acts, slice | range | list | tuple | np.ndarray):
+        try:
+            acts = Acts(to=acts)
+        except DeclarationError as error:
+            raise DeclarationError(f"{who}: acts: {error}") from None
+    if isinstance(acts, Acts) and acts.to is not None:
+        if acts.rest is not None:
+            raise DeclarationError(
+                f"{who}: acts has rest, but the rest of the action is the hierarchy's: write "
+                "Hierarchy(..., rest=...)"
+            )
+        if not acts.plain:
+            raise DeclarationError(
+                f"{who}: acts has a scale, an offset or a clip, which only the acts of a policy "
+                "from elsewhere has: give the places alone, acts = (0, 1, 2)"
+            )
+        to: slice | tuple[int, ...] = acts.to
+        return to
+    raise DeclarationError(
+        f"{who}: acts is {short(acts)}; it must be the places of its numbers in the action, "
+        "acts = (0, 1, 2) or slice(0, 3), or the names of parts of a Dict action: acts = 'arm'"
+    )
+
+
+def part_to_json(sees: Any, acts: Any, who: str) -> dict[str, Any]:
+    """Return the ``sees`` and ``acts`` of a skill as JSON for runs; {}: it has none."""
+    content: dict[str, Any] = {}
+    if sees is not None:
+        content["sees"] = declared_sees(sees, who).to_json()["sees"]
+    if acts is not None:
+        written = declared_acts(acts, who)
+        is_slice = isinstance(written, slice)
+        content["acts"] = places_to_json(written) if is_slice else list(written)
+    return content
+
+
+def part_from_json(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes ``sees`` and ``acts`` that ``part_to_json`` wrote, where it has some.
+
+    Raises:
+        DeclarationError: a value is wrong, or needs a function.
+    """
+    found: dict[str, Any] = {}
+    if "sees" in content:
+        inputs = PolicyMapping.from_json({"sees": content["sees"]}).sees or {}
+        found["sees"] = inputs[""] if set(inputs) == {""} else inputs
+    if "acts" in content:
+        acts = content["acts"]
+        found["acts"] = Acts(to=acts).to if isinstance(acts, str) else tuple(acts)
+    return found
+
+
+# The rest of the action
+
+
+def checked_rest(rest: Any) -> None:
+    """Raise a DeclarationError where ``Hierarchy.rest`` is none for any action space."""
+    if isinstance(rest, str) and rest not in (HOLD, ZERO):
+        raise DeclarationError(f"rest is {short(rest)}; {_REST}")
+    values = rest.values() if isinstance(rest, Mapping) else ()
+    for value in values:
+        checked_rest(value)
+    if rest is None or isinstance(rest, bool):
+        raise DeclarationError(f"rest is {short(rest)}; {_REST}")
+
+
+def rest_to_json(rest: Any) -> Any:
+    """Return ``Hierarchy.rest`` as JSON."""
+    if isinstance(rest, Mapping):
+        return {key: rest_to_json(value) for key, value in rest.items()}
+    if isinstance(rest, Sequence) and not isinstance(rest, str):
+        return [rest_to_json(value) for value in rest]
+    return rest.tolist() if isinstance(rest, np.ndarray | np.generic) else rest
+
+
+_REST = (
+    "it must be 'zero', 'hold', a number, or a list with a number or 'hold' for each number of the "
+    "action; of a Dict action a dict of these"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Leaf:
+    """The rest of one leaf of the action."""
+
+    path: tuple[str, ...]
+    fixed: Array  # (*shape), in the leaf's type
+    held: Array  # (*shape) bool, numbers that keep the value of the last action
+
+
+class Rest:
+    """The value of an action where the skill that acts writes nothing.
+
+    Args:
+        rest: "zero", "hold", a number, or a list with one or the other for each number; of a Dict
+            action a dict of these by its keys, zero where one is left out.
+        space: of actions.
+
+    Raises:
+        DeclarationError: it does not fit the space.
+    """
+
+    def __init__(self, rest: Any, space: Space[Any]) -> None:
+        from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
+
+        checked_rest(rest)
+        self.space = space
+        self._leaves = _leaves(rest, space, "rest", ())
+        self.holds = any(bool(leaf.held.any()) for leaf in self._leaves)
+        """The last action counts."""
+        self._dtype, self._shape = obs_dtype(space), obs_shape(space)
+        self._one = np.zeros((1, *self._shape), self._dtype)
+        for leaf in self._leaves:
+            part_at(self._one, leaf.path)[...] = leaf.fixed
+        self._first = np.array(example_of(space))[None]
+        self._bytes = self._one.nbytes
+
+    def start(self, n: int) -> Array:
+        """Return what is stored before the first action of n episodes: zeros."""
+        return self.stored(self._first.repeat(n, axis=0))
+
+    def stored(self, action: Array) -> Array:
+        """Return actions (n, …) as a memory stores them: as bytes (n, K)."""
+        action = np.ascontiguousarray(action, self._dtype)
+        return action.reshape(-1).view(np.uint8).reshape(len(action), self._bytes)
+
+    def filled(self, n: int, last: Array | None) -> Array:
+        """Return n new actions that hold the rest everywhere.
+
+        Args:
+            last: (n, K), the last actions as ``stored``; None: nothing is held.
+        """
+        action = self._one.repeat(n, axis=0)
+        if self.holds and last is not None:
+            before = np.ascontiguousarray(last).view(self._dtype).reshape(n, *self._shape)
+            for leaf in self._leaves:
+                if leaf.held.any():
+                    held = part_at(before, leaf.path)
+                    part_at(action, leaf.path)[...] = np.where(leaf.held, held, leaf.fixed)
+        return action
+
+
+def _leaves(rest: Any, space: Space[Any], where: str, path: tuple[str, ...]) -> list[_Leaf]:
+    inner = parts_of(space)
+    if inner is None:
+        return [_leaf(rest, space, where, path)]
+    if isinstance(rest, Mapping):
+        for key in rest:
+            if key not in inner:
+                hint = meant(str(key), list(inner), "it has")
+                raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
+        by_name = {name: rest.get(name, ZERO) for name in inner}
+    elif isinstance(rest, str):
+        by_name = dict.fromkeys(inner, rest)
+    else:
+        raise DeclarationError(
+            f"{where} is {short(rest)}, but the action is {short(space)}: give a dict by its keys"
+        )
+    return [
+        leaf
+        for name, part in inner.items()
+        for leaf in _leaves(by_name[name], part, f"{where}[{name!r}]", (*path, name))
+    ]
+
+
+def _leaf(rest: Any, space: Space[Any], where: str, path: tuple[str, ...]) -> _Leaf:
+    zero, shape = example_of(space), tuple(space.shape or ())
+    if isinstance(rest, str):
+        return _Leaf(path, zero, np.full(shape, rest == HOLD))
+    wrong = DeclarationError(
+        f"{where} is {short(rest)}, but the action has {zero.size} numbers ({short(space)}); {_REST}"
+    )
+    entries = np.empty(1, object)
+    if isinstance(rest, Sequence | np.ndarray) and np.ndim(np.asarray(rest, object)) > 0:
+        entries = np.asarray(rest, object).reshape(-1)
+    else:
+        entries[0] = rest
+    if isinstance(rest, Mapping) or entries.size not in (1, zero.size):
+        raise wrong
+    if entries.size == 1:
+        entries = entries.repeat(zero.size)
+    held = np.array([isinstance(x, str) and x == HOLD for x in entries], bool)
+    zeros = np.array([isinstance(x, str) and x == ZERO for x in entries], bool)
+    numbers = entries[~(held | zeros)]
+    if not all(isinstance(x, int | float | np.number) for x in numbers):
+        raise wrong
+    fixed = zero.reshape(-1).copy()
+    fixed[~(held | zeros)] = numbers.astype(np.float64)
+    if fixed.dtype.kind in "iu" and (fixed[~(held | zeros)] != numbers.astype(np.float64)).any():
+        raise DeclarationError(f"{where} is {short(rest)}, but {short(space)} has whole numbers")
+    fixed = fixed.reshape(shape)
+    if outside(space, fixed[None]) is not None:
+        raise DeclarationError(f"{where} is {short(rest)}, which is out of {short(space)}")
+    return _Leaf(path, fixed, held.reshape(shape))
+
+
+# A part of an action
+
+
+@dataclass(frozen=True, eq=False)
+class _Written:
+    """What a skill writes of an action of some space."""
+
+    space: Space[Any]
+    """Of its own actions."""
+    places: Array | None = None
+    """Of its numbers in the flat action; of a Discrete action its choices, from 0."""
+    paths: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
+    """Of a Dict action: the names that lead to a leaf in it, and in the skill's own action."""
+    columns: Array | None = None
+    """Of its choices among those that a mask lists."""
+
+
+def _written(acts: Any, space: Space[Any], who: str) -> _Written:
+    named = isinstance(acts, tuple) and isinstance(acts[0], str)
+    if isinstance(space, Dict | Tuple):
+        if not named:
+            names = ", ".join(map(repr, parts_of(space) or ()))
+            raise DeclarationError(
+                f"{who}: acts is {short(acts)}, but the action has parts with names ({names}): "
+                "name them, acts = ('arm',)"
+            )
+        return _named(acts, space, who)
+    if named:
+        raise DeclarationError(
+            f"{who}: acts names {acts[0]!r}, a part of the action that does not exist: {short(space)} "
+            "has places, counted from 0"
+        )
+    size = int(space.n) if isinstance(space, Discrete) else int(np.prod(space.shape))
+    try:
+        places = places_in(acts, size, who)
+    except PolicyError:
+        raise DeclarationError(
+            f"{who}: acts is {short(acts)}, a part of the action that does not exist: "
+            f"{short(space)} has places 0 to {size - 1}"
+        ) from None
+    if isinstance(space, Discrete):
+        return _Written(Discrete(len(places)), places, columns=places)
+    if isinstance(space, MultiBinary):
+        columns = (2 * places[:, None] + np.arange(2)).reshape(-1)
+        return _Written(MultiBinary(len(places)), places, columns=columns)
+    if isinstance(space, MultiDiscrete):
+        counts = space.nvec.reshape(-1)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        columns = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in places])
+        first = np.broadcast_to(space.start, space.shape).reshape(-1)[places]
+        own = MultiDiscrete(counts[places], dtype=space.dtype, start=first)
+        return _Written(own, places, columns=columns)
+    assert isinstance(space, Box)
+    low, high = space.low.reshape(-1)[places], space.high.reshape(-1)[places]
+    return _Written(Box(low, high, dtype=space.dtype), places)
+
+
+def _named(names: tuple[str, ...], space: Space[Any], who: str) -> _Written:
+    found: dict[str, tuple[tuple[str, ...], Space[Any]]] = {}
+    for name in names:
+        path, part = tuple(name.split(".")), space
+        for key in path:
+            inner = parts_of(part) or {}
+            if key not in inner:
+                hint = meant(name, [".".join(p) for p in leaf_paths(space)], "its parts are")
+                raise DeclarationError(
+                    f"{who}: acts names {name!r}, a part of the action that does not exist{hint}"
+                )
+            part = inner[key]
+        found[name] = path, part
+    paths = [path for path, _ in found.values()]
+    if any(a != b and b[: len(a)] == a for a in paths for b in paths):
+        raise DeclarationError(f"{who}: acts names a part of the action twice: {short(names)}")
+    if len(found) == 1:
+        path, part = next(iter(found.values()))
+        return _Written(part, paths=tuple(((*path, *x), x) for x in leaf_paths(part)))
+    inside = [
+        ((*path, *x), (name, *x)) for name, (path, part) in found.items() for x in leaf_paths(part)
+    ]
+    own = Dict([(name, part) for name, (_, part) in found.items()])
+    return _Written(own, paths=tuple(inside))
+
+
+# Both
+
+
+class OwnPart:
+    """The part of observations that a skill sees, and of actions that it writes.
+
+    Args:
+        sees: the skill's; None: it sees all.
+        acts: the skill's; None: it writes all.
+        rest: the hierarchy's, for the other numbers of the action.
+        observation_space: of the environment.
+        action_space: of the environment.
+        who: begins messages: "skill 'arm'".
+
+    Raises:
+        DeclarationError: they do not fit the spaces; the message names the field.
+    """
+
+    def __init__(
+        self,
+        sees: Any,
+        acts: Any,
+        rest: Any,
+        observation_space: Space[Any],
+        action_space: Space[Any],
+        who: str,
+    ) -> None:
+        from skillweave.spaces.packing import obs_shape  # needs torch
+
+        self.who = who
+        self._declared = sees, acts, rest
+        self.whole_observation_space = observation_space
+        self.whole_action_space = action_space
+        self.observation_space = observation_space
+        """Of what its policy sees, without a goal."""
+        self.action_space = action_space
+        """Of its own actions."""
+        self._ndim = len(obs_shape(observation_space))
+        self.inputs: dict[str, Input] | None = None
+        """What it sees, by the name of the input; None: all."""
+        self.written: _Written | None = None
+        """What it writes; None: all."""
+        self._view: Callable[[Array], Array] | None = None
+        if sees is not None:
+            self._fit_sees(sees, observation_space, action_space)
+        self.rest: Rest | None = None
+        """The rest of the action; None: there is none."""
+        if acts is not None:
+            self.written = _written(declared_acts(acts, who), action_space, who)
+            self.action_space = self.written.space
+            if not isinstance(action_space, Discrete):
+                self.rest = Rest(rest, action_space)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what was declared as JSON."""
+        sees, acts, rest = self._declared
+        content = part_to_json(sees, acts, self.who)
+        return content if self.rest is None else content | {"rest": rest_to_json(rest)}
+
+    @property
+    def holds(self) -> bool:
+        """Return whether the last action of the environment counts."""
+        return self.rest is not None and self.rest.holds
+
+    def _fit_sees(self, sees: Any, space: Space[Any], action_space: Space[Any]) -> None:
+        mapping = declared_sees(sees, self.who)
+        try:
+            self._plan = Plan(mapping, space, action_space, {}, self.who)
+        except PolicyError as error:
+            raise DeclarationError(str(error)) from None
+        assert self._plan.inputs is not None
+        self.inputs = self._plan.inputs
+        spaces = {name: self._input_space(name, given) for name, given in self.inputs.items()}
+        self.observation_space = spaces[""] if set(spaces) == {""} else Dict(list(spaces.items()))
+
+    def _input_space(self, name: str, given: Input) -> Space[Any]:
+        """Return the space of one input."""
+        leaves = given.leaves
+        if len(given.sources) > 1 and any(leaf is not None and leaf.image for leaf, _ in leaves):
+            raise DeclarationError(
+                f"{self.who}: sees joins an image with other parts of the observation: give each "
+                "an input of its own, sees = {'image': 'camera', 'rest': ('joints', ...)}"
+            )
+        leaf, whole = leaves[0]
+        if leaf is not None and whole and not given.scalings:
+            space: Space[Any] = self._plan.spaces[0]
+            for field in leaf.fields:
+                space = (parts_of(space) or {})[field]
+            if isinstance(space, Box):
+                return space
+        return Box(-np.inf, np.inf, given.shape or (1,), np.float32)
+
+    def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:
+        """Return the part of larger observations, of which ``view`` returns the environment's."""
+        part = copy.copy(self)
+        part._view, part.whole_observation_space = view, observation_space
+        return part
+
+    def see(self, obs: Array) -> Array:
+        """Return what its policy sees of observations (…, *obs_shape), without a goal."""
+        if self._view is not None:
+            obs = self._view(obs)
+        if self.inputs is None:
+            return obs
+        from skillweave.spaces.packing import obs_dtype  # needs torch
+
+        lead = obs.shape[: obs.ndim - self._ndim]
+        flat = obs if len(lead) == 1 else obs.reshape(-1, *obs.shape[len(lead) :])
+        seen = self._plan.read(flat, None, None)
+        space = self.observation_space
+        if "" in seen:
+            assert isinstance(space, Box)
+            return np.ascontiguousarray(seen[""], space.dtype).reshape(*lead, *space.shape)
+        # Zeros, because the bytes between parts are written to files.
+        joint = np.zeros(len(flat), obs_dtype(space))
+        for name, value in seen.items():
+            joint[name] = value.reshape(joint[name].shape)
+        return joint.reshape(lead)
+
+    def mask(self, mask: Array | None) -> Array | None:
+        """Return which of its own choices a mask (…, A) allows; all where it allows none."""
+        if mask is None or self.written is None or self.written.columns is None:
+            return mask
+        own = mask[..., self.written.columns]
+        free = self._free(own)
+        return own if free.all() else own | ~free[..., None]
+
+    def _free(self, own: Array) -> Array:
+        """Return where each of its own parts has an allowed choice, (…) bool."""
+        counts: Any = self.action_space.n if isinstance(self.action_space, Discrete) else None
+        if isinstance(self.action_space, MultiBinary):
+            counts = np.full(self.action_space.n, 2)
+        elif isinstance(self.action_space, MultiDiscrete):
+            counts = self.action_space.nvec
+        starts = np.concatenate([[0], np.cumsum(np.ravel(counts))[:-1]]).astype(np.int64)
+        free: Array = np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1)
+        return free
+
+    def check_mask(self, mask: Array | None, action: Array) -> None:
+        """Raise a SkillError where a mask (n, A) leaves it no choice, or forbids the rest.
+
+        Args:
+            action: (n, …), the whole actions.
+        """
+        if mask is None or self.written is None or self.written.columns is None:
+            return
+        if not self._free(mask[:, self.written.columns]).all():
+            raise SkillError(
+                f"{self.who}: the environment's action mask allows none of the choices that it "
+                "owns (acts): let it start only where one is allowed, or let it own more"
+            )
+        space = self.whole_action_space
+        if isinstance(space, Discrete):
+            return
+        if isinstance(space, MultiDiscrete):
+            counts, start = space.nvec.reshape(-1), np.broadcast_to(space.start, space.shape)
+            choice = (action - start).reshape(len(action), -1)
+        else:
+            choice = action.reshape(len(action), -1)
+            counts = np.full(choice.shape[1], 2)
+        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        allowed = np.take_along_axis(mask, (first + choice).astype(np.int64), axis=1)
+        allowed[:, self.written.places] = True
+        if not allowed.all():
+            row, place = np.argwhere(~allowed)[0].tolist()
+            raise SkillError(
+                f"{self.who}: the environment's action mask forbids the value "
+                f"{int(choice[row, place])} at place {place} of the action, which rest leaves it "
+                "at: give the hierarchy another rest, or let the skill own this place (acts)"
+            )
+
+    def write(self, own: Array, last: Array | None) -> Array:
+        """Return whole actions (n, …) of its own ones (n, …).
+
+        Args:
+            last: (n, K), the last actions as ``Rest.stored``; needed only where it ``holds``.
+        """
+        written = self.written
+        if written is None:
+            return own
+        if isinstance(self.whole_action_space, Discrete):
+            assert written.places is not None
+            choice = written.places[own] + self.whole_action_space.start
+            return np.asarray(choice, self.whole_action_space.dtype)
+        assert self.rest is not None
+        action = self.rest.filled(len(own), last)
+        if written.places is not None:
+            action.reshape(len(own), -1)[:, written.places] = own.reshape(len(own), -1)
+        for path, inside in written.paths:
+            part_at(action, path)[...] = part_at(own, inside)
+        return action
