@@ -64,7 +64,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
         if doubtful and rest and not _help(log, skill, start, end, rest, doubtful):
             places.append([place for place in whole if place not in fixed])
         else:
-            places.append(seen if seen is None else whole)  # type: ignore[arg-type]
+            places.append(seen if seen is None else whole)
     return tuple(places)
 
 

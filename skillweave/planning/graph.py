@@ -46,9 +46,9 @@ CANDIDATES = 32
 MOST_APART = 64
 """Goals up to which each is an option of its own everywhere, as another skill would be."""
 FURTHER = 2.0
-"""A neighbour counts only if it is at most so many times as far as the nearest, or no further than
-usual: where the log has few calls, others are often behind a wall, and a small chance to pass it
-would grow with each call that is tried again."""
+"""A neighbour counts only if it is at most so many times as far as the nearest, or as is usual:
+where the log has few calls, others are often behind a wall, and a small chance to pass it would
+grow with each call that is tried again."""
 SAMPLED = 500
 """Starts by which it is measured what is usual."""
 MOST_SWEEPS = 2_000
@@ -435,7 +435,8 @@ def _sampled(places: Array) -> Array:
 
 def _without_far(far: Array, usual: float) -> Array:
     """Return distances (…, k), infinite where they are too far to count."""
-    return np.where(far <= np.maximum(FURTHER * far[..., :1], usual), far, np.float32(np.inf))
+    limit = FURTHER * np.maximum(far[..., :1], np.float32(usual))
+    return np.where(far <= limit, far, np.float32(np.inf))
 
 
 class Apart(Options):

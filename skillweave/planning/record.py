@@ -171,8 +171,9 @@ class WithDrawnGoals(Memoryless):
             mine = np.flatnonzero(skill == i)
             if len(mine):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
+        spaces = {goals.skill.name: goals.space for _, goals in self._goals.values()}
         for name, (rows, numbers) in again.items():
-            choice[GOAL][name][rows] = from_numbers(self._space[GOAL][name], numbers)
+            choice[GOAL][name][rows] = from_numbers(spaces[name], numbers)
         return choice, memory
 
 

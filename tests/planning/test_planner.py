@@ -714,3 +714,14 @@ def test_it_is_declared_as_a_selector(log: CallLog, tmp_path: Any) -> None:
     assert declared(task).load(tmp_path / "run").policy is not None
     with pytest.raises(RunError, match="the selector had the policy planner"):
         declared(has_key).load(tmp_path / "run")
+
+
+def test_calls_behind_a_wall_do_not_count() -> None:
+    """Before a wall "try" leads nowhere; behind it, much further than usual, to the goal."""
+    before = [*np.arange(0, 0.6, 0.02).tolist(), 1.0, 1.01, 0.99]
+    calls = [(p, [(0, [p], False, "own")]) for p in before]
+    calls += [(p, [(0, [9], True, "own")]) for p in (1.2, 1.21, 1.22, 1.23, 1.24)]
+    planner = Planner(log_of(["try"], calls), at(9), neighbours=5, gamma=GAMMA, caution=0.0)
+    q = planner.values(np.float32([[1.0], [1.2]]))[:, 0]
+    # Each call that is tried again before the wall would have a chance, and so nearly all its worth.
+    assert q.tolist() == pytest.approx([0.0, 1.0], abs=1e-3)
