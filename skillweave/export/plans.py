@@ -14,6 +14,7 @@ import numpy as np
 
 from skillweave.errors import PolicyError
 from skillweave.planning.goal import GoalTask
+from skillweave.planning.graph import FURTHER
 from skillweave.planning.neighbours import AHEAD, SOFT
 from skillweave.planning.planner import Planner
 from skillweave.planning.tried import LATEST, SLACK, TRUST
@@ -44,6 +45,7 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
         "worth": planner.plan.worth,
         "call": graph.pieces.call,
         "skill_of": graph.skill_of,
+        "usual": graph.usual,
         "lengths": np.array(graph.log.lengths, np.int64),
         **{f"machine.{k}": v for k, v in machine.arrays.items()},
         **{f"states.{k}": v for k, v in planner.states.arrays.items()},
@@ -77,5 +79,6 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
         "temperature": planner.temperature,
     }
     constants = {"ahead": AHEAD, "soft": SOFT, "latest": LATEST, "trust": TRUST, "slack": SLACK}
+    constants["further"] = FURTHER
     entry = {"kind": "Plan", "features": features, "events": events, "rewards": rewards}
     return entry | settings | constants, buffer.getvalue()

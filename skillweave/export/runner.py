@@ -596,6 +596,8 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
             found = order[np.sort(first)[:k]]
             pieces[c, : len(found)], far[c, : len(found)] = rows[found], distance[found]
         far = far.astype("f4")
+        limit = np.float32(entry["further"]) * np.maximum(far[:, :1], data["usual"][:, None])
+        far = np.where(far <= limit, far, np.float32(np.inf))
         weights = 1.0 / (np.where(np.isfinite(far), far, 1e9) + entry["soft"])
         total = weights.sum(1)
         return pieces, weights / total[:, None], far[:, 0], total

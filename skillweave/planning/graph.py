@@ -204,6 +204,12 @@ class CallGraph:
         """Of each choice, its pieces (m,) and the features of their starts (m, F)."""
         return list(zip(self._of_choice, self._starts, strict=True))
 
+    @property
+    def usual(self) -> Array:
+        """The usual distance of each option's K-th neighbour, (O,) float32, without goals."""
+        options = (each.usual(self.neighbours) for each in self._options if isinstance(each, Apart))
+        return np.concatenate([np.float32(each) for each in options])
+
     def near(self, obs: Array) -> Near:
         """Return the nearest pieces of each choice to observations (n, …)."""
         return self.near_features([each(obs) for each in self.maps])
@@ -455,15 +461,19 @@ class Apart(Options):
 
     def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
         """Return the nearest pieces of each goal; see ``Options.near``."""
-        if k not in self._usual:
-            self._usual[k] = [self._usually(mine, k) for mine in self._mine]
         found = []
-        for mine, usual in zip(self._mine, self._usual[k], strict=True):
+        for mine, usual in zip(self._mine, self.usual(k), strict=True):
             places, far = self._nearest(mine, to, k, without)
             found.append((places, _without_far(far, usual)))
         places, far = (np.stack(part, 1) for part in zip(*found, strict=True))
         pieces = self._rows[places] if len(self._rows) else places
         return pieces, far, np.repeat(self._goal[None], len(to), axis=0)
+
+    def usual(self, k: int) -> list[float]:
+        """Return the usual distance of each option's k-th neighbour."""
+        if k not in self._usual:
+            self._usual[k] = [self._usually(mine, k) for mine in self._mine]
+        return self._usual[k]
 
     def _usually(self, mine: Array, k: int) -> float:
         """Return the median distance of a start's k-th neighbour among others."""
