@@ -44,7 +44,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
     """
     space = log.observation_space
     codec = obs_codec(space)
-    if codec.images:
+    if codec.images and all(seen is None for seen in log.sees):
         return tuple(log.sees)
     before, after = (
         codec.split(to_tensor(x))[0].reshape(len(x), -1).numpy() for x in (log.before, log.next_obs)
@@ -58,6 +58,9 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
     start, end = before[log.offset[:-1]], after[log.offset[1:] - 1]
     places: list[Places] = []
     for skill, seen in enumerate(log.sees):
+        if seen is None and codec.images:
+            places.append(None)
+            continue
         whole = range(codec.size) if seen is None else sorted({*seen, *moves})
         doubtful = [place for place in whole if place in fixed]
         rest = [place for place in whole if place not in fixed and varies[place]]

@@ -208,7 +208,7 @@ class CallGraph:
     def usual(self) -> Array:
         """The usual distance of each option's K-th neighbour, (O,) float32, without goals."""
         options = (each.usual(self.neighbours) for each in self._options if isinstance(each, Apart))
-        return np.concatenate([np.float32(each) for each in options])
+        return np.concatenate([np.array(each, np.float32) for each in options])
 
     def near(self, obs: Array) -> Near:
         """Return the nearest pieces of each choice to observations (n, …)."""

@@ -723,5 +723,5 @@ def test_calls_behind_a_wall_do_not_count() -> None:
     calls += [(p, [(0, [9], True, "own")]) for p in (1.2, 1.21, 1.22, 1.23, 1.24)]
     planner = Planner(log_of(["try"], calls), at(9), neighbours=5, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[1.0], [1.2]]))[:, 0]
-    # Each call that is tried again before the wall would have a chance, and so nearly all its worth.
+    # Else each call that is tried again before the wall would have a chance.
     assert q.tolist() == pytest.approx([0.0, 1.0], abs=1e-3)
