@@ -107,6 +107,7 @@ def repair(
     entry["repair"]["before"] = matrix_to_json(found.matrix)
     reason = str(found.log.blame(name_of(skill), name_of(after), done))
     entry["repair"]["blame"] = reason
+    entry["repair"]["bonus"] = found.gain
     content |= {"stages": [entry], "seed": seed}
     rehearsal = None
     if can_rehearse(learnt.algorithm):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,16 +15,17 @@ from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.paths import level_of, name_of
-from skillweave.planning import CallLog, HandOver, join, record_calls
+from skillweave.planning import CallLog, HandOver, join
 from skillweave.planning.hand_over import before_each, calls_done
-from skillweave.planning.record import RandomChoice
+from skillweave.planning.predicates import Held, as_event
+from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
-from skillweave.types import Array, Memory
+from skillweave.types import Array, Memory, Step
 
 START_CALLS = 1
 """The most calls at random before the other episodes of a repair, if the hierarchy has any."""
@@ -35,6 +37,8 @@ LARGEST_CHUNK = 200_000
 """The most steps that are recorded at once, as they are kept in memory."""
 NEVER = 200_000
 """Steps after which a pair of skills without a call is given up."""
+LONG_CALL = 1_000
+"""Steps of a call without a limit that count for its bonus."""
 SEED = 7_000
 """Seeds of measurements start here: people use smaller ones."""
 
@@ -66,8 +70,14 @@ class Repair:
         return f"{self.blame}\nbefore\n{self.before}\nafter\n{self.later}\n{self.sentence}"
 
 
-def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
-    """Return the stage of a run's entry in which a skill is repaired."""
+def repair_stage(
+    roles: Roles, entry: Mapping[str, Any], done: Mapping[str, Any] | None = None
+) -> Stage:
+    """Return the stage of a run's entry in which a skill is repaired.
+
+    Args:
+        done: as for ``hand_over``.
+    """
     repair = entry["repair"]
     path = repair["skill"]
     level, role = roles.levels[level_of(path)], roles[path]
@@ -76,15 +86,24 @@ def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
     def learning_task(policies: Policies) -> LearningTask:
         others = {p: policy_at(roles, policies, p) for p in level.skills if p != path}
         whole = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
+        limit = whole.limit(list(level.skills).index(path))
+        assert role.skill is not None
+        holds = event_of(role.skill, done)
+        bonus = repair.get("bonus", 0.0)
+        learning = role
+        if holds is not None and bonus:
+            # As much as if a call that ends by the event went on, and the event held.
+            rest = bonus * sum(role.config.gamma**k for k in range(limit or LONG_CALL))
+            learning = replace(role, skill=eager(role.skill, holds, bonus, rest))
         return skill_task(
-            role,
+            learning,
             level.reflexes,
             level.skill_set(others),
             0 if calls is None else START_CALLS,
             level.apart.search_steps,
             start_after=(name_of(repair["after"]),),
             # Calls are what counts, and steps beyond their limit would take steps from the starts.
-            call_limit=whole.limit(list(level.skills).index(path)),
+            call_limit=limit,
         )
 
     assert role.config is not None
@@ -97,6 +116,40 @@ def repair_stage(roles: Roles, entry: Mapping[str, Any]) -> Stage:
         level=level.path,
         learner=path,
     )
+
+
+def event_of(skill: Skill, done: Mapping[str, Any] | None) -> Callable[[Step], Array] | None:
+    """Return where the event that a skill's call is for holds in a step; None: there is none.
+
+    Of ``held(...)``, where the predicate inside holds: so each of its steps counts.
+    """
+    if skill.name in (done or {}):
+        event = as_event((done or {})[skill.name], f"done of {skill.name!r}")
+        return event.predicate.holds if isinstance(event, Held) else event.holds
+    return skill.success if skill.defines("success") else None
+
+
+def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: float) -> Skill:
+    """Return a skill that is also paid for its event, so that it hurries.
+
+    Its own reward may be content with a call that comes too late.
+
+    Args:
+        holds: the event, of a step.
+        bonus: reward of each step in which it holds.
+        rest: reward of one in which it holds and the call ends by it.
+    """
+
+    def reward(self: Skill, step: Step) -> Array:
+        own = skill.reward(step) if skill.defines("reward") else step.reward
+        over = np.asarray(step.terminated, bool)
+        if skill.defines("termination"):
+            over = over | np.asarray(skill.termination(step), bool)
+        return own + np.asarray(holds(step), bool) * np.where(over, rest, bonus)
+
+    twin = copy.copy(skill)
+    twin.__class__ = type(type(skill).__name__, (type(skill),), {"reward": reward})
+    return twin
 
 
 class PairChoice(RandomChoice):
@@ -149,6 +202,9 @@ class Measured:
     """The calls of the skill, each with the call before it."""
     may_start: bool
     """The skill may start at some end of a call of the other one."""
+    gain: float
+    """The skill's own reward per step in calls that were done, less that in those that failed; 0
+    where it is not more, or one of these kinds is missing."""
 
 
 def measure(
@@ -172,25 +228,31 @@ def measure(
     names = tuple(s.name for s in skills.skills)
     number, first = names.index(skill), names.index(after)
     matrix, parts, steps, may_start = None, list[CallLog](), 0, False
+    rates: dict[bool, list[float]] = {True: [], False: []}
     size = CHUNK
     tell(f"measuring: calls of {skill} after {after}, at least {calls}")
     while True:
         choose = PairChoice(names, max(1, len(skills.lengths)), skill, after)
         seed = SEED + len(parts)
-        log = record_calls(spec, skills, size, choose=choose, num_envs=num_envs, seed=seed)
+        log, returns = with_returns(spec, skills, size, choose, num_envs, seed)
         steps += log.steps
         found = log.hand_over(done)
         matrix = found if matrix is None else _sum(matrix, found)
         may = log.may_follow[log.skill == first][:, number * (log.choices // len(names))]
         may_start |= bool(may.any())
         of_skill = log.skill == number
+        won = calls_done(log, done)
+        for was_done, each in rates.items():
+            some = of_skill & (won == was_done) & ~log.was_cut
+            each.extend((returns[some] / log.tau[some]).tolist())
         following = log.followed_by
         first_calls = np.flatnonzero(following >= 0)
         first_calls = first_calls[of_skill[following[first_calls]]]
         parts.append(log.take(np.union1d(np.flatnonzero(of_skill), first_calls)))
         seen = int(matrix.of(skill, after)[1])
         if seen >= calls or steps >= MOST_STEPS or (not seen and steps >= NEVER):
-            return Measured(matrix, join(parts), may_start)
+            gain = np.mean(rates[True]) - np.mean(rates[False]) if all(rates.values()) else 0.0
+            return Measured(matrix, join(parts), may_start, max(0.0, float(gain)))
         needed = steps * (calls / max(seen, 1) - 1) * 1.1
         size = int(np.clip(needed, CHUNK, min(MOST_STEPS - steps, LARGEST_CHUNK)))
 

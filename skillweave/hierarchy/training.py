@@ -152,7 +152,9 @@ def _repaired(
                 f"{', '.join(entry['repair']['done'])}, which is code: "
                 f"continue it by {repair_words(entry['repair'], run)}"
             )
-        after = train_stages([repair_stage(roles, entry)], run, listeners, policies, make_learner)
+        after = train_stages(
+            [repair_stage(roles, entry, done)], run, listeners, policies, make_learner
+        )
         later = assembled(roles, after)
         if judge_repair(roles, run, entry, listeners, later, done):
             policies = after

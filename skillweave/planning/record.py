@@ -100,6 +100,25 @@ def record_calls(
         EnvError: the environment cannot be made, or sets no such key of ``info``.
         SkillError: no skill may start in an observation.
     """
+    return with_returns(env, skills, steps, choose, num_envs, seed, info, own_rewards=False)[0]
+
+
+def with_returns(
+    env: Any,
+    skills: Any,
+    steps: int,
+    choose: Any,
+    num_envs: int,
+    seed: int,
+    info: Sequence[str] = (),
+    *,
+    own_rewards: bool = True,
+) -> tuple[CallLog, Array]:
+    """Return the log of ``record_calls``, and each call's ``Recorder.own_returns``, (C,).
+
+    Args:
+        own_rewards: compute them; else there are none, (0,).
+    """
     steps, num_envs = whole_number(steps, "steps", 1), whole_number(num_envs, "num_envs", 1)
     skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
     if skill_set is None:
@@ -117,7 +136,7 @@ def record_calls(
         selector = _selector(choose, skill_set, engine)
         spaces = engine.observation_space, engine.action_space
         check_size(steps, spaces)
-        recorder = Recorder(skill_set, spaces, num_envs, info=info)
+        recorder = Recorder(skill_set, spaces, num_envs, info=info, own_rewards=own_rewards)
         player = Player(skill_set, selector)
         rng = (seeds / "choices").numpy()
         sampled = isinstance(choose, RandomChoice) or (
@@ -126,7 +145,8 @@ def record_calls(
         turn = Turn(not sampled, rng)
         played = _play(recorder, engine, player, steps, turn, seeds.integer(), choose)
         log = recorder.log()
-        return replace(log, seed=played[log.episode])
+        returns = recorder.own_returns() if own_rewards else np.zeros(0)
+        return replace(log, seed=played[log.episode]), returns
 
 
 class WithDrawnGoals(Memoryless):

@@ -159,6 +159,8 @@ class RepairEntry(TypedDict):
     """Skills whose calls were judged by an event that the caller gave."""
     blame: str
     """A sentence on the reason of the failure."""
+    bonus: NotRequired[NonNegative]
+    """Additional reward of each step in which the event that a call is for holds."""
     rehearsal: NotRequired[str]
     """Checksum of the file of its rehearsal's observations."""
     before: Matrix
