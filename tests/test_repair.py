@@ -17,9 +17,12 @@ import skillweave as sw
 from skillweave.algorithms import ppo
 from skillweave.api import Run
 from skillweave.collecting import skill_collector
+from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
-from skillweave.planning import HandOver, Mission, record_calls
+from skillweave.hierarchy.roles import roles_of
+from skillweave.planning import HandOver, Mission, held, record_calls
+from skillweave.planning.record import RandomChoice
 from skillweave.runs.directory import RunDirectory
 
 
@@ -191,6 +194,63 @@ def test_observations_of_done_calls_are_rehearsed(run: Run) -> None:
     assert repair.rehearsed_obs(log, skill, "press", None) is not None
     failed = log.take(np.flatnonzero(~log.succeeded))
     assert repair.rehearsed_obs(failed, skill, "flip", None) is None
+
+
+class Stay(sw.Skill):
+    """Has neither a reward nor an end of its own."""
+
+    name = "remain"
+
+    def success(self, step: Any) -> Any:
+        return at_goal(step.next_obs)
+
+
+def steps_to(*counts: int) -> sw.Step:
+    """Steps to these counts; the last one ends the episode."""
+    n = len(counts)
+    obs = np.array([[1, 0]] * n, np.float32)
+    last = np.arange(n) == n - 1
+    return sw.Step(
+        obs=obs, action=np.zeros(n, np.int64), reward=np.full(n, 0.5, np.float32),
+        next_obs=np.array([[1, c] for c in counts], np.float32), terminated=last,
+        truncated=np.zeros(n, bool), timed_out=np.zeros(n, bool), elapsed=np.ones(n, np.int64),
+        info={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("skill", "rewards"),
+    [(Stay(), [0.5, 2.5, 2.5, 10.5]), (Press(), [2.0, 13.0, 13.0, 13.0])],
+    ids=["goes on", "ends by it"],
+)
+def test_an_eager_skill_is_paid_while_its_event_holds(skill: sw.Skill, rewards: Any) -> None:
+    holds = repair.event_of(skill, None)
+    assert holds is not None
+    twin = repair.eager(skill, holds, bonus=2.0, rest=10.0)
+    np.testing.assert_allclose(twin.reward(steps_to(2, 3, 3, 3)), rewards)
+    assert twin.defines("reward")
+    assert twin.name == skill.name
+    assert skill.defines("reward") == isinstance(skill, Press), "the skill itself stays as it is"
+
+
+def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
+    step = steps_to(1, 3)
+    for event in (held(lambda obs: obs[:, 1] == 1, 50), lambda obs: obs[:, 1] == 1):
+        holds = repair.event_of(Press(), {"press": event})
+        assert holds is not None
+        assert holds(step).tolist() == [True, False]
+    holds = repair.event_of(Press(), {"flip": at_goal})
+    assert holds is not None
+    assert holds(step).tolist() == [False, True]
+
+
+def test_calls_of_a_repair_have_the_selectors_limit() -> None:
+    roles = roles_of(declare(Press(), Flip(), call_steps=5))
+    policies = {name: RandomChoice(3) for name in roles.skills}
+    entry = {"name": "r", "budget": 100, "repair": {"skill": "press", "after": "flip"}}
+    collector = repair.repair_stage(roles, entry).learning_task(policies).collector(2, None)
+    assert isinstance(collector, SkillCollector)
+    assert collector.call_limit == 5, "of 8 by itself"
 
 
 def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:

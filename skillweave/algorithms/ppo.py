@@ -38,7 +38,7 @@ from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
-REHEARSAL_COST = 0.2
+REHEARSAL_COST = 0.3
 """Cost of a nat of KL in the rehearsal's observations, where advantages have a deviation of 1."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
@@ -177,7 +177,7 @@ class PPOAlgorithm(Algorithm):
         count = samples.count
         limited = self._kl_limit is not None
         names = REPORT if terms.reference is None else (*REPORT, "reference_kl")
-        names = names if terms.rehearsal is None else (*names, "rehearsal_kl")
+        names = names if batch.rehearsal is None else (*names, "rehearsal_kl")
         steps = torch.zeros_like(rate)
         sums = rate.new_zeros(len(names), len(rate))
         compiles = cfg.compile and not self.memory_size

@@ -81,9 +81,10 @@ class SkillCollector(Collector):
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
-        self._call_limit = call_limit
+        self.call_limit = call_limit
+        """The most steps of a call of the skill; None: any number."""
         if call_limit is None and skill is not None:
-            self._call_limit = skill.max_steps
+            self.call_limit = skill.max_steps
         n = self.num_envs
         self._never = np.zeros(n, bool)
         size = 0 if acting is None else acting.memory_size
@@ -132,7 +133,7 @@ class SkillCollector(Collector):
         starters = self._starters.skills if self._searches else None
         how = self._start_calls, self._search_steps, self._episode_calls, self._start_after
         return SkillCollector(
-            engine, acting, self.skill, self.reflexes, starters, *how, self._call_limit, self._part
+            engine, acting, self.skill, self.reflexes, starters, *how, self.call_limit, self._part
         )
 
     def _prepare(self, request: Request) -> None:
@@ -288,8 +289,8 @@ class SkillCollector(Collector):
     ) -> Array:
         """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
         end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
-        if self._call_limit is not None:
-            end[elapsed >= self._call_limit] = LIMIT
+        if self.call_limit is not None:
+            end[elapsed >= self.call_limit] = LIMIT
         if skill is not None and step is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
             if len(rows):

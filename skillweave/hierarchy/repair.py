@@ -148,7 +148,8 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
         return own + np.asarray(holds(step), bool) * np.where(over, rest, bonus)
 
     twin = copy.copy(skill)
-    twin.__class__ = type(type(skill).__name__, (type(skill),), {"reward": reward})
+    attributes = {"name": skill.name, "reward": reward}
+    twin.__class__ = type(type(skill).__name__, (type(skill),), attributes)
     return twin
 
 
