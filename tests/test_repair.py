@@ -168,6 +168,7 @@ def test_a_skill_learns_to_go_on_from_where_the_other_ends(run: Run, tmp_path: P
         repaired(new, tmp_path / "newer")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rehearses", [True, False])
 def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rehearses: bool
@@ -176,7 +177,7 @@ def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
     monkeypatch.setattr(skill_collector, "NAMED_SHARE", 1.0)
     if not rehearses:
         monkeypatch.setattr(ppo, "REHEARSAL_COST", 0.0)
-    (result,) = repaired(run, tmp_path / "new").repairs
+    (result,) = repaired(run, tmp_path / "new", steps=10_240).repairs
     assert result.later.of("press", "flip")[0] > 0.9
     assert result.before.of("press")[0] > 0.9
     kept = result.later.of("press")[0]

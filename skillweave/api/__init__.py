@@ -917,12 +917,14 @@ class Run:
     ) -> Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
-        Half of the episodes begin after a call of the other skill, the others as usual. A skill of
-        PPO without a memory also rehearses: the KL from its earlier policy has a cost in the
-        observations of its calls that were done elsewhere (kickstarting, Schmitt et al. 2018), so
-        that it does not forget. Before and after, calls are recorded, and the hand-overs counted:
-        the new weights are kept if this one is clearly better and no other one clearly worse. All
-        other weights stay as they are. What was done is in ``Run.repairs``.
+        Half of the episodes begin after a call of the other skill, the others as usual. The skill
+        is paid its own reward, and more while the event holds that its calls are for: as much per
+        step as calls that were done earned more than those that failed. A skill of PPO without a
+        memory also rehearses: the KL from its earlier policy has a cost in the observations of its
+        calls that were done after other skills (kickstarting, Schmitt et al. 2018), so that it
+        does not forget. Before and after, calls are recorded, and the hand-overs counted: the new
+        weights are kept if this one is clearly better and no other one clearly worse. All other
+        weights stay as they are. What was done is in ``Run.repairs``.
 
         Args:
             skill: the skill that fails, by its path.
@@ -930,7 +932,7 @@ class Run:
             steps: environment steps of training; measuring takes more. None: 200,000.
             run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
             done: by skill, the event that a call is for, in place of the skill's ``success``; as
-                for ``planning.hand_over``. The skill learns by its own reward in any case.
+                for ``planning.hand_over``.
             calls: calls of the pair to measure at least, before and after.
             seed: the root of every random stream.
             quiet: no progress.

@@ -9,7 +9,9 @@ import pytest
 from goals.worlds import SPACES, Rest, aim_of, declared, go_to, place_of
 
 import skillweave as sw
+from skillweave.hierarchy.repair import rehearsed_obs
 from skillweave.planning import CallLog, join
+from skillweave.skills.goals import goals_of
 
 
 def walk(self: Any, obs: Any, goal: Any) -> Any:
@@ -91,6 +93,22 @@ def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
     found = run.report(tmp_path / "report.html", episodes=2)
     assert not any("success()" in sentence for sentence in found["missing"])
     assert "go_to" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("space", ["box", "dict"])
+def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None:
+    log = ready(space).log_calls(200, num_envs=2)
+    skill = go_to(space)
+    seen = rehearsed_obs(log, skill, "rest", None)
+    assert seen is not None
+    goals = goals_of(skill)
+    assert goals is not None
+    assert seen.dtype == goals.join(log.start[:1], goals.read(goals.start(1))).dtype
+    pairs = {(*o, *g) for o, g in zip(seen["observation"], goals.flat(seen["goal"]), strict=True)}
+    first = np.flatnonzero((log.skill == 0) & log.succeeded & (log.order == 0))
+    assert len(first)
+    for call in first:
+        assert (*log.start[call], *log.goals["go_to"][call]) in pairs
 
 
 def test_logs_with_other_goals_are_not_joined() -> None:

@@ -328,6 +328,7 @@ def test_goals_are_drawn_and_joined(name):
     assert np.array_equal(joint["observation"], obs)
     assert np.array_equal(joint["goal"], drawn)
     assert goals.flat(drawn).shape == (50, goals.size)
+    assert np.array_equal(goals.from_flat(goals.flat(drawn)), drawn)
     assert np.array_equal(
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
