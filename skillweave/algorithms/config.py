@@ -187,6 +187,8 @@ class SkillCritic(OnPolicy):
     """Gradients are scaled down to this norm."""
     deciding: bool = False
     """Also learn the value of deciding again, which interruption needs."""
+    sees_goals: bool = False
+    """Skills have goals: the observation is one of ``with_goal``, with the goals of all skills."""
     min_advantage_std: NonNegative = 0.05
     """Least divisor of the task's normalised advantages, in units of reward."""
     epsilon: Fraction = 0.0

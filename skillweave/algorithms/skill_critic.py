@@ -6,6 +6,9 @@ interruption use one critic. A call is interrupted where Q of its skill is less 
 selector's policy while it learns, so V is learnt from its decisions. The best Q in place of V would
 be too high: the selector does not always call that skill, and the maximum of several estimates is
 biased upwards.
+
+A skill with another goal is another option, so where skills have goals, Q sees the goal of the
+call. V(s) must not depend on it: for V the inputs of goals are 0.
 """
 
 from __future__ import annotations
@@ -23,13 +26,14 @@ from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_n
 from skillweave.algorithms.rollouts import values_after
 from skillweave.experience import Report, Rollout
 from skillweave.networks.net import Net
-from skillweave.networks.stacked import Layout, take_rows
-from skillweave.ops.device import FLOAT
+from skillweave.networks.stacked import Inputs, Layout, take_rows
+from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.losses import value_loss
 from skillweave.ops.moments import explained_variance
 from skillweave.ops.optim import adam_, clip_grad_norm_
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
+from skillweave.spaces import obs_codec
 
 
 class SkillCriticAlgorithm(Algorithm):
@@ -53,6 +57,16 @@ class SkillCriticAlgorithm(Algorithm):
         outputs = self.skills + config.deciding  # the last one: the value of deciding again
         self.net = Net("critic", self.obs, config.network, outputs)
         self.acting = self.layout = Layout(self.net.shapes)
+        self._keeps: dict[str, Constant] = {}
+        """By the name of an input, 0 where it is of goals, else 1."""
+        if config.sees_goals:
+            assert isinstance(observation_space, gym.spaces.Dict)
+            goals = obs_codec(observation_space["goal"])
+            keeps = torch.ones(self.obs.size, **FLOAT)
+            keeps[self.obs.size - goals.size :] = 0.0
+            self._keeps["vector"] = Constant(keeps)
+            for i in range(len(self.obs.images) - len(goals.images), len(self.obs.images)):
+                self._keeps[f"image.{i}"] = Constant(torch.zeros(1, **FLOAT))
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> AgentState:
         """Create the state of fresh members, in which all skills have the same value."""
@@ -77,8 +91,21 @@ class SkillCriticAlgorithm(Algorithm):
         With ``deciding``, the last value is the one of a new decision. While the selector still
         draws skills at random, values are scaled down, so few calls are interrupted.
         """
-        q = self.net(params.views, self.inputs(params, obs)) * params.extra.get("trust", 1.0)
+        inputs = self.inputs(params, obs)
+        q = self._values(params.views, inputs) * params.extra.get("trust", 1.0)
         return q[..., : self.skills].argmax(-1), q, None
+
+    def _values(self, views: Any, inputs: Inputs) -> Tensor:
+        """Return the values of skills, and of a new decision, (P, B, S + 1)."""
+        q = self.net(views, inputs)
+        if not self._keeps or not self.config.deciding:
+            return q
+        blank = {k: self._without_goals(k, x) for k, x in inputs.items()}
+        return torch.cat([q[..., : self.skills], self.net(views, blank)[..., self.skills :]], -1)
+
+    def _without_goals(self, name: str, x: Tensor) -> Tensor:
+        keeps = self._keeps.get(name)
+        return x if keeps is None else x * keeps.on(x.device).to(x.dtype)
 
     def acting_params(
         self, state: AgentState, progress: float = 1.0, device: Device = "cpu"
@@ -132,7 +159,7 @@ class SkillCriticAlgorithm(Algorithm):
                 target.device
             )
             for rows in order.chunk(parts, dim=1):
-                q = self.net(leaves, {k: take_rows(v, rows) for k, v in inputs.items()})
+                q = self._values(leaves, {k: take_rows(v, rows) for k, v in inputs.items()})
                 goal = take_rows(target, rows)
                 chosen = q.gather(2, take_rows(action, rows)[..., None])
                 loss = value_loss(chosen.squeeze(-1), goal)

@@ -37,6 +37,7 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.skills import Skill, path_of
+from skillweave.skills.goals import CallGoals
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step, prefixed, unprefixed
 
@@ -306,12 +307,17 @@ class HierarchyCollector(Collector):
     @staticmethod
     def _of_critic(trace: Trace, level: Level, steps: Batch) -> Batch:
         """Return all steps of a level, for its critic."""
-        acts = steps["valid"]
+        acts, running = steps["valid"], trace[level.path + "skill"]
+        seen = {name: trace[name] for name in ("obs", "next_obs")}
+        if own := level.player.goals:
+            names = ((i, f"{level.path}{level.skills[i].name}/goal") for i in own)
+            goals = {i: trace[name] for i, name in names}
+            where = np.where(acts, running, -1)
+            seen = {k: CallGoals(own).join(obs, where, goals) for k, obs in seen.items()}
         return steps.replace(
-            obs=trace["obs"],
-            action=np.where(acts, trace[level.path + "skill"], 0),
+            **seen,
+            action=np.where(acts, running, 0),
             steps=np.ones(trace.lead, np.int64),
-            next_obs=trace["next_obs"],
             valid=None if acts.all() else acts,
             call_start=acts & (trace[level.path + "call_elapsed"] == 1),
         )

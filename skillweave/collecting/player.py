@@ -34,7 +34,7 @@ from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
 from skillweave.skills.goal_spaces import GOAL, SKILL
-from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.goals import CallGoals, Goals, goals_of
 from skillweave.skills.own_part import ZERO, Rest
 from skillweave.skills.outputs import blame
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
@@ -358,7 +358,7 @@ class Player:
                 if len(mine):
                     self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
         if self.skills.interruption is not None:
-            self._interrupt(self.skills.interruption, running, step.next_obs, end)
+            self._interrupt(self.skills.interruption, memory, rows, step.next_obs, end)
         end[step.terminated | step.truncated] = EPISODE
         memory["end"][rows] = end
         self._watch(memory, rows, step, running, elapsed, end)
@@ -462,16 +462,26 @@ class Player:
             stuck[waits] = ~self.skills.startable(obs[waits]).any(axis=1)
         return stuck
 
-    def _interrupt(self, how: Interruption, running: Array, obs: Array, end: Array) -> None:
-        """End calls where a new decision is worth clearly more, in place."""
-        rows = np.flatnonzero(end == RUNNING)
-        if not len(rows):
+    def _interrupt(
+        self, how: Interruption, memory: Memory, rows: Array, obs: Array, end: Array
+    ) -> None:
+        """End calls where a new decision is worth clearly more, in place.
+
+        What a call is worth is that of its skill with its goal.
+        """
+        mine = np.flatnonzero(end == RUNNING)
+        if not len(mine):
             return
-        worth, n = how.worth(obs[rows]), len(self.actors)
-        goes_on = worth[np.arange(len(rows)), running[rows]]
-        may = self.skills.startable(obs[rows])[:, :: max(1, len(self.skills.lengths))]
+        rows, obs, n = rows[mine], obs[mine], len(self.actors)
+        running, seen = memory["skill"][rows], obs
+        if self.goals:
+            goals = {i: of.read(memory[f"goal.{i}"][rows]) for i, of in self.goals.items()}
+            seen = CallGoals(self.goals).join(obs, running, goals)
+        worth = how.worth(seen)
+        goes_on = worth[np.arange(len(rows)), running]
+        may = self.skills.startable(obs)[:, :: max(1, len(self.skills.lengths))]
         again = np.where(may.any(axis=1), worth[:, n], -np.inf)  # else no skill could be called
-        end[rows[again - goes_on > how.margin]] = INTERRUPTED
+        end[mine[again - goes_on > how.margin]] = INTERRUPTED
 
     def _watch(
         self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array

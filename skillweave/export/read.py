@@ -30,7 +30,7 @@ from skillweave.settings import AtLeastOne, Check, Count, NonNegative
 from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum
-from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, checked_goal
@@ -358,7 +358,11 @@ class _Reading:
         choices = choice_space(int(plain.n), with_goals, names)
         interruption = None
         if fitted["critic"] is not None:
-            critic = self._network(dict(fitted["critic"]), f"{path}.critic", plain)
+            count, whole = gym.spaces.Discrete(len(skills)), self.spaces
+            if with_goals:
+                self.spaces = with_goal(whole[0], goals_space(with_goals)), whole[1]
+            critic = self._network(dict(fitted["critic"]), f"{path}.critic", count)
+            self.spaces = whole
             interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
         skill_set = SkillSet(

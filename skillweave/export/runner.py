@@ -119,8 +119,11 @@ class Runner:
 
 
 def blank(entry: Any) -> Any:
-    """Return a goal (1, ...) of zeros."""
-    return np.zeros((1, *entry["shape"]), np.dtype(entry["dtype"]))
+    """Return a goal (1, ...) that stands where there is none."""
+    goal = np.zeros((1, *entry["shape"]), np.dtype(entry["dtype"]))
+    for part, value in zip(leaves(goal), entry["example"], strict=True):
+        part[...] = value
+    return goal
 
 
 def leaves(goal: Any) -> list[Any]:
@@ -395,6 +398,23 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             return act()
         return self.runner.seeing(self.goal, self.skills[self.skill]["goal"], act)
 
+    def worth(self) -> Any:
+        """Return the values of skills and of a new decision; a critic sees the call's goal."""
+        runner, goals = self.runner, [(i, s["goal"]) for i, s in enumerate(self.skills)]
+        before = runner.feeds
+        if any(entry for _, entry in goals):
+            runner.feeds = {f"obs.observation{k[3:]}": x for k, x in before.items()}
+        for i, entry in goals:
+            if entry:
+                goal = self.goal if i == self.skill else blank(entry)
+                for k, fields in entry["inputs"]:
+                    name = f"obs.goal.{self.skills[i]['name']}{k[8:]}"
+                    runner.feeds[name] = reduce(getitem, fields, goal)
+        try:
+            return self.critic.act(None)
+        finally:
+            runner.feeds = before
+
     def parted(self, choice: Any) -> Any:
         """Return the number of a choice, and goals by the places of skills."""
         if isinstance(choice, tuple):
@@ -434,7 +454,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
-            worth = self.critic.act(None)
+            worth = self.worth()
             may = self.may_start()
             margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]

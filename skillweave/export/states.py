@@ -24,13 +24,14 @@ from skillweave.selectors import Automaton
 from skillweave.selectors.base import function_name
 from skillweave.selectors.function import FunctionSelector
 from skillweave.skills import Reflex
+from skillweave.skills.goal_spaces import example_of, leaf_paths, part_at
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import function_name as written_name
 from skillweave.skills.onnx_file import OnnxPolicy
 from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import obs_dtype, obs_shape, space_to_json
-from skillweave.types import Policy
+from skillweave.types import Array, Policy
 
 
 class States:
@@ -69,21 +70,24 @@ class States:
             case ExportedNetwork():
                 return self._exported(policy, name)
             case ScriptedPolicy() if policy.mapping.is_identity:
-                what = "observations (1, ...) to actions (1, ...)"
-                if policy.with_goal is not None:
-                    what = "observations (1, ...) and goals (1, ...) to actions (1, ...)"
-                code = self._asks(f"{name}.policy", policy.function, what)
-                return {"kind": "Code", "code": code, "with_goal": policy.with_goal}
+                acts: Any = policy.function
+                with_goal = policy.with_goal
             case MappedPolicy():
                 return self._model(policy, name, where, sampled)
+            case _:
+                acts, with_goal = policy, None
         if policy.start(1):
             raise PolicyError(
                 f"{where} is a {type(policy).__name__}, whose memory cannot be written as "
                 "ONNX: train the skill, or give it an ONNX file"
             )
-        what = "observations (1, ...) to actions (1, ...)"
-        code = self._asks(f"{name}.policy", policy, what)
-        return {"kind": "Code", "code": code, "with_goal": None}
+        beside = "" if with_goal is None else " and goals (1, ...)"
+        what = f"observations (1, ...){beside} to actions (1, ...)"
+        return {
+            "kind": "Code",
+            "code": self._asks(f"{name}.policy", acts, what),
+            "with_goal": with_goal,
+        }
 
     def _hierarchy(self, policy: HierarchyPolicy, prefix: str, sampled: bool) -> dict[str, Any]:
         skills = policy.skills
@@ -144,12 +148,14 @@ class States:
         space, policy = skills.skills[i].goal_space, skills.policies[i]
         if space is None:
             return None
+        example = example_of(space)
         # What takes the goal by an input of its own observes what the environment gives.
         beside = isinstance(policy, MappedPolicy) and policy.has_goals
         return {
             "space": space_to_json(space),
             "dtype": dtype_to_json(obs_dtype(space)),
             "shape": list(obs_shape(space)),
+            "example": [_short(part_at(example, path)) for path in leaf_paths(space)],
             "inputs": [[f"obs.goal{name[3:]}", fields] for name, fields, _ in inputs_of(space)],
             "clip": method("clip_goal", "observations and goals (1, ...) to goals (1, ...)"),
             "joined": not beside,
@@ -314,6 +320,12 @@ class States:
         self.functions[free] = function
         self.code[free] = what
         return free
+
+
+def _short(numbers: Array) -> Any:
+    """Return numbers as JSON; one number if all are equal."""
+    same = (numbers == numbers.flat[0]).all()
+    return numbers.flat[0].item() if same else numbers.tolist()
 
 
 def _as_json(goal: Any) -> Any:

@@ -254,22 +254,10 @@ def _check_goals(roles: Roles) -> None:
     for path, skill in roles.skills.items():
         if skill.goal_space is None:
             continue
-        level = roles.levels[roles[path].level]
         if path in roles.levels:
             raise DeclarationError(
                 f"skill {path!r} is a hierarchy with a goal_space, which is not supported yet: let "
                 "one of its own skills have the goals, and its selector choose them"
-            )
-        if level.together.interrupt:
-            raise DeclarationError(
-                f"together.interrupt is True, but skill {path!r} has goals, and the critic that "
-                "interrupts calls does not see goals yet: leave out interrupt"
-            )
-        if skill.policy is None and skill.task_weight:
-            raise DeclarationError(
-                f"skill {path!r} has goals and task_weight {skill.task_weight:g}, but the task's "
-                "advantage comes from a critic that does not see goals yet: leave out task_weight; "
-                "the skill follows its own reward alone"
             )
 
 

@@ -202,7 +202,14 @@ class Level:
             guide_kl=None if self.guide is None else self.guide.target_kl,
         )
         margin = self.together.margin if self.together.interrupt else None
-        critic = Role(self.critic_path, "critic", spec, choices=len(self.skills), margin=margin)
+        critic = Role(
+            self.critic_path,
+            "critic",
+            spec,
+            choices=len(self.skills),
+            goal_spaces=self.goal_spaces,
+            margin=margin,
+        )
         return selector, critic
 
     @property

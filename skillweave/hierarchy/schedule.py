@@ -18,6 +18,8 @@ from skillweave.hierarchy.fitting import active_guide
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
 from skillweave.paths import SELECTOR, decides, join
+from skillweave.skills.goal_spaces import goal_part
+from skillweave.spaces import obs_codec
 from skillweave.training.learning_task import (
     JointTask,
     LearningTask,
@@ -25,6 +27,7 @@ from skillweave.training.learning_task import (
     selector_task,
     skill_task,
 )
+from skillweave.training.role import Role
 from skillweave.training.stage import TOGETHER, Policies, Stage, Together, target_of
 
 DEFAULT_STEPS = 1_000_000
@@ -132,7 +135,7 @@ def _together(roles: Roles, level: Level, budget: int) -> Stage:
         if isinstance(algorithm, OnPolicy) and not decides(path)
     )
     if settings.interrupt or follows_task:
-        beside[level.critic_path] = _critic(config, settings.interrupt)
+        beside[level.critic_path] = _critic(config, roles[level.critic_path], settings.interrupt)
     return Stage(
         join(level.path, TOGETHER),
         "together",
@@ -175,7 +178,7 @@ def _beside_selector(roles: Roles, level: Level) -> dict[str, AlgorithmConfig]:
         if role.kind == "critic" and role.margin is not None:
             inner = roles.levels[role.level]
             decider = configs.get(inner.selector_path, inner.algorithm)
-            configs[role.path] = _critic(decider, deciding=True)
+            configs[role.path] = _critic(decider, role, deciding=True)
         elif role.config is not None:
             selects = role.kind == "selector"
             configs[role.path] = _with_epsilon(role.config, settings) if selects else role.config
@@ -183,17 +186,12 @@ def _beside_selector(roles: Roles, level: Level) -> dict[str, AlgorithmConfig]:
 
 
 def _task_weights(roles: Roles, level: Level) -> dict[str, float]:
-    """Return the task's weight of skills that set one, or are in a hierarchy that does, by path.
-
-    A skill with goals follows its own reward alone, as the critic of skills does not see goals.
-    """
+    """Return the task's weight of skills that set one, or are in a hierarchy that does, by path."""
     weights: dict[str, float] = {}
     for role in roles.below(level.path):
         if role.kind == "skill" and role.config is not None:
             way = reversed(roles.skills_to(role.path, level.path))
             weight = next((s.task_weight for s in way if s.task_weight is not None), None)
-            if role.skill is not None and role.skill.goal_space is not None:
-                weight = 0.0
             if weight is not None:
                 weights[role.path] = weight
     return weights
@@ -215,8 +213,11 @@ def _with_epsilon(config: Any, settings: Together) -> Any:
     return replace(config, **{name: getattr(settings, name) for name in ("epsilon", *decay)})
 
 
-def _critic(selector: Any, deciding: bool) -> SkillCritic:
-    """Return the critic of skills; it observes and discounts like ``selector``'s settings."""
+def _critic(selector: Any, role: Role, deciding: bool) -> SkillCritic:
+    """Return the critic of skills; it observes and discounts like ``selector``'s settings.
+
+    Beside what the selector sees, it sees the goals of the skills that have some.
+    """
     shared = {f: getattr(selector, f) for f in ("gamma", "learning_rate", "num_envs", "device")}
     if isinstance(selector, PPO):
         same = (
@@ -234,7 +235,13 @@ def _critic(selector: Any, deciding: bool) -> SkillCritic:
         shared["network"] = replace(shared["network"], rnn=None)
     elif isinstance(network := getattr(selector, "network", None), Network):
         shared["network"] = Network(planes=network.planes)
-    return SkillCritic(**shared, normalize_obs=selector.normalize_obs, deciding=deciding)
+    sees_goals = bool(role.goal_spaces)
+    if sees_goals and (network := shared.get("network")) is not None and network.sees is not None:
+        whole = obs_codec(role.observation_space).size
+        goals = range(whole - obs_codec(goal_part(role.observation_space)).size, whole)
+        shared["network"] = replace(network, sees=(*network.sees, *goals))
+    how: Any = {"normalize_obs": selector.normalize_obs, "deciding": deciding}
+    return SkillCritic(**shared, **how, sees_goals=sees_goals)
 
 
 def _apart(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list[Stage]:
@@ -289,7 +296,9 @@ def _selector_stage(roles: Roles, level: Level, config: AlgorithmConfig, budget:
         budget,
         learning_task,
         target_of(level.selection.target_return, None, SELECTOR),
-        beside={level.critic_path: _critic(config, deciding=True)} if interrupts else {},
+        beside={level.critic_path: _critic(config, roles[level.critic_path], deciding=True)}
+        if interrupts
+        else {},
         together=level.together if interrupts else None,
         guide_kl=role.guide_kl,
         level=level.path,

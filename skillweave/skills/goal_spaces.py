@@ -36,6 +36,11 @@ def goal_part(observation_space: gym.Space[Any]) -> gym.Space[Any]:
     return observation_space[GOAL]
 
 
+def goals_space(goal_spaces: Mapping[str, gym.Space[Any]]) -> gym.spaces.Dict:
+    """Return the space of the goals of several skills, by their names."""
+    return gym.spaces.Dict(list(goal_spaces.items()))
+
+
 def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
     """Return the end of a message about a skill that was trained for other goals; "": the same.
 

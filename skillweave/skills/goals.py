@@ -22,6 +22,7 @@ from skillweave.skills.goal_spaces import (
     GOAL,
     OBSERVATION,
     example_of,
+    goals_space,
     joint_dtype,
     leaf_paths,
     numbers_in,
@@ -176,6 +177,38 @@ class Goals:
     @property
     def _label(self) -> str:
         return f"{self._who}: goals()"
+
+
+class CallGoals:
+    """The goals of a level's skills beside observations, as its critic of skills sees them.
+
+    Only the goal of the running skill counts; the others are ``example_of`` their spaces.
+
+    Args:
+        goals: of the skills that have some, by their places in the list.
+    """
+
+    def __init__(self, goals: Mapping[int, Goals]) -> None:
+        self._goals = dict(goals)
+        space = goals_space({of.skill.name: of.space for of in goals.values()})
+        self._blank = example_of(space)
+
+    def join(self, obs: Array, running: Array, goals: Mapping[int, Array]) -> Array:
+        """Return observations and goals as one array (…).
+
+        Args:
+            obs: (…, *obs_shape).
+            running: (…) int64, the running skills.
+            goals: by place, (…, *goal_shape) of the latest calls; one that is missing has no call.
+        """
+        lead = running.shape
+        whole = self._blank.dtype, ()
+        joint = np.zeros(lead, joint_dtype(obs.dtype, obs.shape[len(lead) :], *whole))
+        joint[OBSERVATION], joint[GOAL] = obs, self._blank
+        for i, values in goals.items():
+            runs = running == i
+            joint[GOAL][self._goals[i].skill.name][runs] = values[runs]
+        return joint
 
 
 ADVICE = "give one in it, or let the skill move goals into it: clip_goal(obs, goal)"

@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
-from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
 from skillweave.skills.own_part import OwnPart
 
 
@@ -34,7 +34,8 @@ class Role:
     """The number of a selector's choices, or of a critic's values; None: it acts in the
     environment."""
     goal_spaces: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
-    """Of a selector, the spaces of goals that it chooses, by the names of their skills."""
+    """Of a selector, the spaces of goals that it chooses, by the names of their skills; a critic
+    observes them."""
     skills: tuple[str, ...] = ()
     """Of a selector, the names of the skills that it chooses from, in order."""
     row_steps: int = 1
@@ -55,8 +56,13 @@ class Role:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """The space of what it observes: the environment's, or a skill's part; perhaps and a goal."""
+        """The space of what it observes: the environment's or a skill's part, perhaps and goals.
+
+        A skill with goals observes its own, a critic those of all skills of its level.
+        """
         space = self.spec.spaces.observation if self.part is None else self.part.observation_space
+        if self.kind == "critic" and self.goal_spaces:
+            return with_goal(space, goals_space(self.goal_spaces))
         if self.skill is None or self.skill.goal_space is None:
             return space
         return with_goal(space, self.skill.goal_space)
@@ -65,7 +71,8 @@ class Role:
     def action_space(self) -> gym.Space[Any]:
         """The space of its actions, or of its choices."""
         if self.choices is not None:
-            return choice_space(self.choices, self.goal_spaces, self.skills)
+            chosen = self.goal_spaces if self.kind == "selector" else {}
+            return choice_space(self.choices, chosen, self.skills)
         return self.spec.spaces.action if self.part is None else self.part.action_space
 
     @cached_property

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from goals.worlds import SPACES, GoTo, Point, Rest, go_to, place_of
 from test_networks import agent
 
 import skillweave as sw
+from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.player import Player
 from skillweave.collecting.lengths import Lengths
@@ -20,9 +22,9 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
-from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.selectors import ready_selector
-from skillweave.skills.goal_spaces import choice_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
 from skillweave.skills.goals import goals_of
 
 pytest.importorskip("onnxscript")
@@ -144,6 +146,16 @@ def nested() -> Any:
     return env, selected(env, skills, PPO)
 
 
+def interrupted() -> Any:
+    env = Point()
+    skills = skills_of(env, go_to(), Rest(), go_to("number", name="side"), call_steps=9)
+    spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
+    seen = with_goal(env.observation_space, goals_space(spaces))
+    config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
+    critic = mild(config, seen, gym.spaces.Discrete(3), seed=1)
+    return env, selected(env, with_interruption(skills, critic, 0.02), PPO)
+
+
 CASES: dict[str, Any] = {
     "ppo": lambda: made(go_to(), Rest),
     "lengths": lambda: made(go_to(), Rest, call_steps=Lengths(2, 5)),
@@ -163,6 +175,7 @@ CASES: dict[str, Any] = {
     "dict": lambda: made(go_to("dict"), Rest, selector=parts),
     "images": lambda: made(go_to("dict"), selector=parts, env=Point(as_dict=True)),
     "nested": nested,
+    "interrupted": interrupted,
     "discrete": lambda: made(go_to(), env=Point(discrete=True)),
 }  # fmt: skip
 

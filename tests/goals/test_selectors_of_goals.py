@@ -252,10 +252,6 @@ def test_what_goals_are_not_for_yet():
         DeclarationError, match="hierarchy with a goal_space, which is not supported"
     ):
         declared([whole])
-    with pytest.raises(DeclarationError, match="interrupt is True, but skill 'go_to' has goals"):
-        declared(selector=SELECTOR, together=sw.Together(interrupt=True))
-    with pytest.raises(DeclarationError, match="goals and task_weight 2"):
-        declared([go_to(task_weight=2.0)], selector=SELECTOR, learn="together")
     guide = sw.Guide(sw.Automaton({"a": {("go_to", HERE), "rest"}}, {}))
     with pytest.raises(DeclarationError, match="guide: it gives a goal"):
         declared([go_to(), Rest()], selector=SELECTOR, guide=guide).check_spaces()

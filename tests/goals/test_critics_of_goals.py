@@ -1,0 +1,125 @@
+"""The critic of skills sees the goal of a call: it interrupts calls, and gives the task's part."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from small_runs import assert_same, stopped_run
+from worlds import SMALL, SPACES, Point, Rest, declared, go_to
+
+import skillweave as sw
+from skillweave.algorithms.config import SkillCritic
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.collecting.call_end import INTERRUPTED, RUNNING, Interruption
+from skillweave.collecting.player import Player
+from skillweave.collecting.skill_set import SkillSet
+from skillweave.seeding import Seeds
+from skillweave.skills.goal_spaces import draw_from, goals_space, with_goal
+from skillweave.skills.goals import CallGoals, goals_of
+from skillweave.types import Step
+
+SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+TOGETHER: Any = {"selector": SELECTOR, "learn": "together", "train_defaults": OFTEN}
+
+
+def random_critic(space: Any, goals: dict[str, Any], **how: Any) -> AgentPolicy:
+    seen = with_goal(space, goals_space(goals))
+    settings = SkillCritic(network=SMALL, sees_goals=True, deciding=True, normalize_obs=False)
+    algorithm = make_algorithm(settings, seen, gym.spaces.Discrete(2))
+    policy = AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))
+    noise = torch.Generator().manual_seed(0)
+    weights = {
+        k: v + 0.5 * torch.randn(v.shape, generator=noise) for k, v in policy.weights.items()
+    }
+    return AgentPolicy(algorithm, weights)
+
+
+@pytest.mark.parametrize("space", ["box", "number", "dict", "picture"])
+def test_what_a_skill_is_worth_depends_on_its_goal_and_a_decision_does_not(space):
+    critic = random_critic(Point.observation_space, {"go_to": SPACES[space]})
+    goals = goals_of(go_to(space))
+    assert goals is not None
+    values = draw_from(SPACES[space], 20, np.random.default_rng(0))
+    obs = np.tile(np.float32([0.3, -0.4]), (20, 1))
+    seen = CallGoals({0: goals}).join(obs, np.zeros(20, int), {0: values})
+    worth = critic.heads(seen)
+    assert worth.shape == (20, 3)
+    assert len(np.unique(worth[:, 0].round(4))) > 1
+    np.testing.assert_allclose(worth[:, 2], worth[0, 2], rtol=1e-5)
+
+
+def test_goals_of_skills_that_do_not_run_are_not_seen():
+    goals = {i: goals_of(go_to("box", name=f"go{i}")) for i in range(2)}
+    obs, running = np.zeros((2, 2), np.float32), np.array([0, 1])
+    mine = {i: np.full((2, 2), i + 0.5, np.float32) for i in range(2)}
+    seen = CallGoals(goals).join(obs, running, mine)["goal"]
+    assert seen["go0"].tolist() == [[0.5, 0.5], [0, 0]]
+    assert seen["go1"].tolist() == [[0, 0], [1.5, 1.5]]
+
+
+def test_a_call_is_cut_for_its_goal():
+    """Two environments run the same skill: the one whose goal is worth little decides again."""
+
+    def worth(seen):
+        far = seen["goal"]["go_to"][:, 0]
+        return np.stack([far, far * 0, far * 0], axis=1)
+
+    skill = go_to()
+    space = with_goal(Point.observation_space, skill.goal_space)
+    policy = sw.from_function(lambda obs, goal: goal - obs).bind_with_goals(
+        Point.observation_space, Point.action_space, "it", goals_of(skill)
+    )
+    assert policy.observation_space == space
+    skills = SkillSet((skill,), (policy,), interruption=Interruption(worth, 0.2))
+    player = Player(skills)
+    memory, rows = player.start(3), np.arange(3)
+    goals = np.float32([[-0.9, 0], [-0.1, 0], [0.9, 0]])  # 0 is worth 0.9, 0.1 and -0.9 more
+    player.begin(memory, rows, np.zeros(3, int), {0: goals})
+    obs = np.zeros((3, 2), np.float32)
+    no = np.zeros(3, bool)
+    step = Step(obs, obs, obs + 2, np.zeros(3), no, no, no, np.ones(3, int), {})
+    assert player.observe(memory, rows, step).tolist() == [INTERRUPTED, RUNNING, RUNNING]
+
+
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize(
+    ("learn", "space"), [("together", "box"), ("apart", "number"), ("together", "bits")]
+)
+def test_interruption_with_goals_is_trained_and_resumed(learn, space, tmp_path):
+    how = TOGETHER | {"learn": learn, "together": sw.Together(interrupt=True, margin=0.01)}
+
+    def hierarchy():
+        return declared([Rest(), go_to(space)], steps=900, **how)
+
+    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    critic = run.policy.skills.interruption.critic
+    assert critic.observation_space["goal"]["go_to"] == SPACES[space]
+    before = run.evaluate(3)
+    again = sw.load(tmp_path / "run", hierarchy()).evaluate(3)
+    assert again.returns == before.returns
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", run.path)
+
+
+def test_a_skill_with_goals_follows_the_task_too(tmp_path):
+    def trained(weight):
+        hierarchy = declared([go_to(task_weight=weight), Rest()], steps=500, **TOGETHER)
+        run = hierarchy.train(tmp_path / str(weight), seed=1, quiet=True)
+        return run.policy.skills.policies[0].weights
+
+    own, both, again = (trained(weight) for weight in (0.0, 2.0, None))
+    assert any(not torch.equal(own[k], both[k]) for k in own)
+    assert any(not torch.equal(own[k], again[k]) for k in own)  # Together.task_weight
+
+
+def test_a_network_that_sees_a_part_has_a_critic_that_sees_goals_too(tmp_path):
+    selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees=(1,)))
+    how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
+    run = declared([Rest(), go_to()], steps=300, **how).train(tmp_path / "run", quiet=True)
+    assert run.policy.skills.interruption.critic.algorithm.config.network.sees == (1, 2, 3)
