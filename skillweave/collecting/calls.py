@@ -16,6 +16,7 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
+from skillweave.skills.goal_spaces import OBSERVATION
 from skillweave.types import Array
 
 
@@ -136,11 +137,11 @@ class OpenCalls:
             "steps": ends["steps"],
             "terminated": steps["terminated"][row, env] & ~cut,
             "truncated": steps["truncated"][row, env] | cut,
-            "next_obs": trace["next_obs"][row, env],
+            "next_obs": self.level.seen(trace, "next_obs")[row, env],
             "episode_start": ends["first"],
         }
         if cut.any():
-            values["next_obs"][cut] = trace["obs"][row[cut], env[cut]]
+            values["next_obs"][cut] = self.level.seen(trace, "obs")[row[cut], env[cut]]
         selector = self.level.selector
         if selector is not None and not self.level.player.goals:
             values["action"] = np.asarray(selector.acting.to_env(values["action"]))
@@ -156,7 +157,8 @@ class OpenCalls:
 
     def _at_decisions(self, trace: Trace, ends: Mapping[str, Array]) -> dict[str, Array]:
         """Return what calls were decided on, (K, …), by the names of a row."""
-        found = {"obs": trace["next_obs"][ends["row"], ends["env"]]}  # if there is no call
+        seen = self.level.seen(trace, "next_obs")
+        found = {"obs": seen[ends["row"], ends["env"]]}  # if there is no call
         earlier = ends["decided"] < 0
         for name, column in DECIDED_ON.items():
             values, held = self._decided_on(trace, column), self._held(column)
@@ -188,7 +190,10 @@ class OpenCalls:
         mask, level = np.ones_like(values["mask"]), self.level
         on = np.flatnonzero(~values["terminated"])
         if len(on):
-            may = level.player.skills.startable(values["next_obs"][on])
+            seen = values["next_obs"][on]
+            may = level.player.skills.startable(
+                seen if level.player.own_goals is None else seen[OBSERVATION]
+            )
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
             may = may | ~may.any(axis=1, keepdims=True)

@@ -72,6 +72,8 @@ class Collector:
         """By names of these, what numbers that choose among something may be."""
         self.goals: dict[str, Goals] = {}
         """By names of these, the skills whose goals they are."""
+        self.seen_goals: dict[str, Goals] = {}
+        """By names of open calls' observations, the goals that stand in them."""
         self.open: dict[str, Array] = {}
         """The same of what has a shape that is known only when it begins."""
         self.after_request = {"sums"}
@@ -180,7 +182,8 @@ class Collector:
         self.obs, self.begun = np.array(obs), True
         space = self.engine.observation_space
         self.open.clear()
-        self.open |= opened(unprefixed("open", state), self.kept, self.obs, space)
+        saved = unprefixed("open", state)
+        self.open |= opened(saved, self.kept, self.obs, space, self.seen_goals)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         ids = np.union1d(early, other)
         self._clear(ids)

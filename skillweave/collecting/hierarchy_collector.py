@@ -7,6 +7,7 @@ calls go on. A call that is open when the rows are full goes on in the next batc
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -37,7 +38,7 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.skills import Skill, path_of
-from skillweave.skills.goals import CallGoals
+from skillweave.skills.goals import CallGoals, goals_of
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step, prefixed, unprefixed
 
@@ -100,12 +101,17 @@ class HierarchyCollector(Collector):
             self.skills = with_learners(skills, learners, margins or {})
         self.keep_rewards, self.guide, self.as_skill = keep_rewards, guide, as_skill
         self.selector = None if acting is None else LearnerActor(acting, SELECTOR, decides=True)
-        self.player = Player(self.skills, self.selector, guide)
+        self._goals = goals_of(as_skill)
+        self.player = Player(self.skills, self.selector, guide, self._goals)
         self.memory = self.player.start(n)
         """The player's, (N, …) each; changed in place."""
         self.kept |= prefixed("player", self.memory)
         self.ranges |= prefixed("player", ranges_of(self.player))
         self.goals |= prefixed("player", stored_goals(self.player))
+        if self._goals is not None:
+            self.kept["goal"] = self._goals.start(n)
+            self.goals["goal"] = self._goals
+            self.kept["needs_goal"] = np.ones(n, bool)  # an episode starts
         self.root = Level(self.player, self.learners)
         self.levels = {
             level: self.memory
@@ -123,6 +129,8 @@ class HierarchyCollector(Collector):
             if level.selector is not None or (level is self.root and not ready):
                 calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
                 self._open[level.path] = calls
+                if level.player.own_goals is not None:
+                    self.seen_goals[f"{level.path}obs"] = level.player.own_goals
                 self._keep_after_request(level.path, calls.kept)
                 if "action" in calls.kept:
                     self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
@@ -149,6 +157,8 @@ class HierarchyCollector(Collector):
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)
         self.player.restart(self.memory, ids)
+        if self._goals is not None:
+            self.kept["needs_goal"][ids] = True
 
     # Steps are made -----------------------------------------------------------------------------
 
@@ -159,6 +169,7 @@ class HierarchyCollector(Collector):
         for path, acting in self.learners.items():
             self._begin(path.removesuffix(SELECTOR), acting, request.below[path])
         self._states = {path: memory.copy() for path, memory in self._recurrent.items()}
+        self._goal_rng = (request.seeds / "goals").numpy()
         rng = (request.seeds / "skills").numpy()
         self._turn = Turn(request.greedy, rng, self.kept["age"], self.overridden)
 
@@ -182,17 +193,21 @@ class HierarchyCollector(Collector):
         obs, mask = self.obs, self.engine.mask()
         if self.overridden is not None:
             self.overridden[:] = False
-        action = self.player.act(self.memory, self._all, obs, mask, self._turn)
+        seen, goal = self._with_goals(obs)
+        action = self.player.act(self.memory, self._all, seen, mask, self._turn)
         if self._records:
+            out.write(goal=goal)
             out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
             for level, memory in self.levels.items():
                 out.write(**{level.path + "skill": memory["skill"]})
                 for i, goals in level.player.goals.items():
-                    goal = goals.read(memory[f"goal.{i}"])
-                    out.write(**{f"{level.path}{level.skills[i].name}/goal": goal})
+                    of_call = goals.read(memory[f"goal.{i}"])
+                    out.write(**{f"{level.path}{level.skills[i].name}/goal": of_call})
         raw = self.engine.step(action)
         self.kept["age"] += 1
         step = raw.seen(obs, action, self.kept["age"].copy())
+        if goal is not None:
+            step = replace(step, goal=goal)
         end = self.player.observe(self.memory, self._all, step)
         terminated, truncated = self._ends(step, end)
         ended = np.flatnonzero(terminated | truncated)
@@ -207,6 +222,20 @@ class HierarchyCollector(Collector):
             self._begin_anew(ended)
         out.next(raw.info)
 
+    def _with_goals(self, obs: Array) -> tuple[Array, Array | None]:
+        """Return what the hierarchy sees, (N, …), after the goals of new episodes; and its goals.
+
+        None: it has none.
+        """
+        if self._goals is None:
+            return obs, None
+        needs, kept = self.kept["needs_goal"], self.kept["goal"]
+        if len(ids := np.flatnonzero(needs)):
+            kept[ids] = self._goals.stored(self._goals.draw(obs[ids], self._goal_rng))
+            needs[ids] = False
+        goal = self._goals.read(kept).copy()
+        return self._goals.join(obs, goal), goal
+
     def _ends(self, step: Step, end: Array) -> tuple[Array, Array]:
         """Return where episodes are terminated, and truncated, (N,) bool each.
 
@@ -215,7 +244,8 @@ class HierarchyCollector(Collector):
         """
         if self.as_skill is None:
             return step.terminated, step.truncated & ~step.terminated
-        outcome = judge(self.as_skill, seen_by(self.as_skill, step, step.elapsed), self._all)
+        own = seen_by(self.as_skill, step, step.elapsed, goal=step.goal)
+        outcome = judge(self.as_skill, own, self._all)
         terminated, truncated = outcome.terminated, step.truncated | outcome.truncated
         if self.skills.restricts:
             waits = np.flatnonzero(end != RUNNING)
@@ -261,7 +291,8 @@ class HierarchyCollector(Collector):
         every = np.ones(trace.lead, bool)
         reward = trace["env_reward"]
         if self.as_skill is not None:
-            reward = rewards_of(trace, self.as_skill, every, trace["elapsed"])
+            elapsed, goal = trace["elapsed"], trace.get("goal")
+            reward = rewards_of(trace, self.as_skill, every, elapsed, goal)
         ends = {name: trace[name] for name in ("terminated", "truncated")}
         each = np.zeros((*trace.lead, 3))
         each[..., 0], each[..., 2] = reward, 1.0
@@ -308,7 +339,7 @@ class HierarchyCollector(Collector):
     def _of_critic(trace: Trace, level: Level, steps: Batch) -> Batch:
         """Return all steps of a level, for its critic."""
         acts, running = steps["valid"], trace[level.path + "skill"]
-        seen = {name: trace[name] for name in ("obs", "next_obs")}
+        seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
         if own := level.player.goals:
             names = ((i, f"{level.path}{level.skills[i].name}/goal") for i in own)
             goals = {i: trace[name] for i, name in names}
@@ -359,11 +390,13 @@ class HierarchyCollector(Collector):
     ) -> tuple[Level, Batch, Array, Array]:
         """Judge a skill that is a hierarchy; return the arguments of ``_of_level`` for it."""
         skill, below = level.skills[i], level.below[i]
-        elapsed = trace[level.path + "call_elapsed"]
-        steps = steps_of(trace, skill, acts, elapsed, end)
+        elapsed, goal = trace[level.path + "call_elapsed"], trace.get(f"{below.path}goal")
+        steps = steps_of(trace, skill, acts, elapsed, end, goal)
         own = trace[below.path + "call_end"]
         limited = steps["truncated"] & timed_out(trace, skill, elapsed)
         closes = (own != RUNNING) | (end == EPISODE) | limited
+        if goal is not None:  # in its next call it decides again
+            closes |= end != RUNNING
         # The hierarchy's own end cuts the calls below it, unless it is called again at once.
         cut = (own == RUNNING) & (end != RUNNING)
         inner = np.where(end == EPISODE, np.int8(EPISODE), np.int8(LIMIT))

@@ -14,8 +14,10 @@ from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.player import LearnerActor, Player
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.experience import Trace
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.skills import Skill
+from skillweave.skills.goals import goals_of
 from skillweave.types import Array, Policy
 
 
@@ -52,7 +54,7 @@ def with_learners(
         if (chooser := f"{name}/{SELECTOR}") in learners:
             selector = LearnerActor(learners[chooser], chooser, decides=True)
         below = with_learners(policy.skills, learners, margins, f"{name}/")
-        return Player(below, selector, policy.guide)
+        return Player(below, selector, policy.guide, goals_of(skill))
 
     pairs = zip(skills.skills, skills.policies, strict=True)
     critic, interruption = path + CRITIC, None
@@ -94,6 +96,11 @@ class Level:
         """The selector; None: it does not learn."""
         found = self.player.selector
         return found if isinstance(found, LearnerActor) else None
+
+    def seen(self, trace: Trace, name: str) -> Array:
+        """Return the column ``name``, "obs" or "next_obs", as selector and critic see it."""
+        own = self.player.own_goals
+        return trace[name] if own is None else own.join(trace[name], trace[self.path + "goal"])
 
     @property
     def has_critic(self) -> bool:

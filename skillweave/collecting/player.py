@@ -33,7 +33,7 @@ from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
-from skillweave.skills.goal_spaces import GOAL, SKILL
+from skillweave.skills.goal_spaces import GOAL, OBSERVATION, SKILL
 from skillweave.skills.goals import CallGoals, Goals, goals_of
 from skillweave.skills.own_part import ZERO, Rest
 from skillweave.skills.outputs import blame
@@ -166,14 +166,20 @@ class Player:
         skills: with their policies; one that is a ``Player`` or has one is a hierarchy.
         selector: chooses where a call has ended; None: the caller does, by ``begin``, or the guide.
         guide: a ready selector that restricts the choices, or makes them.
+        own_goals: of the hierarchy, as a skill that has goals: what it is given to see is then
+            observation and goal; selector and guide see both, the skills the observation.
     """
 
     watches = True
 
     def __init__(
-        self, skills: SkillSet, selector: Any = None, guide: ActiveGuide | None = None
+        self,
+        skills: SkillSet,
+        selector: Any = None,
+        guide: ActiveGuide | None = None,
+        own_goals: Goals | None = None,
     ) -> None:
-        self.skills, self.guide = skills, guide
+        self.skills, self.guide, self.own_goals = skills, guide, own_goals
         self.actors = tuple(
             _actor_of(policy, f"skill {path_of(skill)!r}: its policy's act()")
             for skill, policy in zip(skills.skills, skills.policies, strict=True)
@@ -250,6 +256,8 @@ class Player:
         if len(ended):
             every = len(ended) == len(rows)
             self._decide(memory, rows[ended], obs if every else obs[ended], turn)
+        if self.own_goals is not None:
+            obs = obs[OBSERVATION]
         return self.act_in_calls(memory, rows, obs, mask, turn)
 
     def act_in_calls(
@@ -304,7 +312,8 @@ class Player:
         """Start the calls of ``choice`` (k,) in environments ``rows`` (k,).
 
         A skill that is called again at once, in the same episode, goes on with its memory; after
-        another skill's call, or in a new episode, it starts with a fresh one.
+        another skill's call, or in a new episode, it starts with a fresh one. So does a hierarchy
+        that has goals, in each call.
 
         Args:
             goals: by the places of skills that have goals, (k, *goal_shape), checked; they count
@@ -332,7 +341,8 @@ class Player:
         memory["elapsed"][rows] = 0
         memory["end"][rows] = RUNNING
         for i, keys in enumerate(self._keys):
-            if keys and len(fresh := rows[changed & (skill == i)]):
+            anew = changed | (i in self.goals and isinstance(self.actors[i], Player))
+            if keys and len(fresh := rows[anew & (skill == i)]):
                 _put(self.of_skill(memory, i), fresh, self.actors[i].start(len(fresh)))
 
     def observe(self, memory: Memory, rows: Array, step: Step) -> Array:
@@ -358,7 +368,7 @@ class Player:
                 if len(mine):
                     self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
         if self.skills.interruption is not None:
-            self._interrupt(self.skills.interruption, memory, rows, step.next_obs, end)
+            self._interrupt(self.skills.interruption, memory, rows, step, end)
         end[step.terminated | step.truncated] = EPISODE
         memory["end"][rows] = end
         self._watch(memory, rows, step, running, elapsed, end)
@@ -385,18 +395,23 @@ class Player:
         """Return the selector's memory, the same arrays under its own names."""
         return {k: memory[f"selector.{k}"] for k in self._selector_keys}
 
-    def _decide(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> None:
-        """Choose in environments ``rows`` (k,), and start the calls."""
+    def _decide(self, memory: Memory, rows: Array, seen: Array, turn: Turn) -> None:
+        """Choose in environments ``rows`` (k,), and start the calls.
+
+        Args:
+            seen: (k, …) what the selector sees.
+        """
+        obs = seen if self.own_goals is None else seen[OBSERVATION]
         may, guide = self.skills.mask(obs, None if turn.age is None else turn.age[rows]), self.guide
         greedy = turn.deterministic and self.skills.greedy_selector
         if guide is not None and guide.decides and self.goals:
             may = self.skills.startable(obs) if may is None else may
-            choice = guide.choose(memory, rows, obs, may, turn.deterministic, turn.rng)
+            choice = guide.choose(memory, rows, seen, may, turn.deterministic, turn.rng)
             self._begin_with_goals(memory, rows, choice, obs)
             return
         if guide is not None:
             may = self.skills.startable(obs) if may is None else may
-            chances = guide.ask(memory, rows, obs, may, turn.deterministic, turn.rng)
+            chances = guide.ask(memory, rows, seen, may, turn.deterministic, turn.rng)
             memory["chances"][rows] = chances
             may = chances > 0.0 if guide.restricts else may
         if self.selector is None:
@@ -404,7 +419,7 @@ class Player:
             choice = may.argmax(axis=1)  # the guide has left one
         else:
             how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
-            choice = np.asarray(self.selector.act(self.of_selector(memory), rows, obs, may, how))
+            choice = np.asarray(self.selector.act(self.of_selector(memory), rows, seen, may, how))
         if self.goals:
             self._begin_with_goals(memory, rows, choice, obs)
         else:
@@ -463,7 +478,7 @@ class Player:
         return stuck
 
     def _interrupt(
-        self, how: Interruption, memory: Memory, rows: Array, obs: Array, end: Array
+        self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
     ) -> None:
         """End calls where a new decision is worth clearly more, in place.
 
@@ -472,11 +487,13 @@ class Player:
         mine = np.flatnonzero(end == RUNNING)
         if not len(mine):
             return
-        rows, obs, n = rows[mine], obs[mine], len(self.actors)
+        rows, obs, n = rows[mine], step.next_obs[mine], len(self.actors)
         running, seen = memory["skill"][rows], obs
+        if self.own_goals is not None:
+            seen = self.own_goals.join(obs, step.goal[mine])
         if self.goals:
             goals = {i: of.read(memory[f"goal.{i}"][rows]) for i, of in self.goals.items()}
-            seen = CallGoals(self.goals).join(obs, running, goals)
+            seen = CallGoals(self.goals).join(seen, running, goals)
         worth = how.worth(seen)
         goes_on = worth[np.arange(len(rows)), running]
         may = self.skills.startable(obs)[:, :: max(1, len(self.skills.lengths))]

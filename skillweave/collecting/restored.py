@@ -11,6 +11,7 @@ import numpy as np
 from skillweave.collecting.call_end import RUNNING, CallEnd
 from skillweave.collecting.player import Player
 from skillweave.paths import join, level_of, name_of
+from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Memory, prefixed
@@ -68,6 +69,7 @@ def opened(
     kept: Mapping[str, Array],
     obs: Array,
     observation_space: gym.Space[Any],
+    goals: Mapping[str, Goals] | None = None,
 ) -> Memory:
     """Return the open calls of a checkpoint, copied; observations as the environments have them.
 
@@ -75,14 +77,19 @@ def opened(
         open_calls: (N, …) each; observations that are structured as bytes.
         kept: of each environment, to know whether calls are open.
         obs: (N, *obs_shape), what the environments show now.
+        goals: by the names of observations, those of the hierarchies that observe them, too.
 
     Raises:
         ValueError: it is not of these environments.
     """
-    found, codec = {}, obs_codec(observation_space)
+    found, plain = {}, obs_codec(observation_space)
     for name, value in open_calls.items():
         if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
-            found[name] = value.copy().view(obs.dtype).reshape(obs.shape)
+            like, codec = obs, plain
+            if (own := (goals or {}).get(name)) is not None:
+                like = own.join(obs, own.read(own.start(len(obs))))
+                codec = obs_codec(with_goal(observation_space, own.space))
+            found[name] = value.copy().view(like.dtype).reshape(like.shape)
             # What calls that are over were decided on is not kept.
             is_open = kept[join(level_of(name), "open")]
             codec.check(to_tensor(found[name][is_open]))

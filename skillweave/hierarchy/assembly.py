@@ -10,6 +10,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.fitting import learning_guide, restricting_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.roles import Level, Roles
+from skillweave.skills.goals import goals_of
 from skillweave.types import Policy
 
 
@@ -22,7 +23,8 @@ def assembled(roles: Roles, policies: Mapping[str, Policy], path: str = "") -> H
             skills = with_interruption(skills, whole[level.critic_path], level.together.margin)
         selector = whole[level.selector_path]
         guide = restricting_guide(level, selector.observation_space)
-        whole[level.path] = HierarchyPolicy(selector, skills, guide)
+        goals = goals_of(level.as_skill)
+        whole[level.path] = HierarchyPolicy(selector, skills, guide, goals)
     policy: HierarchyPolicy = whole[path]
     return policy
 

@@ -246,19 +246,6 @@ def check_nested(roles: Roles) -> None:
                     f"skill {path!r} is a hierarchy, so it has no {field} of its own: give the "
                     f"hierarchy {where}"
                 )
-    _check_goals(roles)
-
-
-def _check_goals(roles: Roles) -> None:
-    """Raise a DeclarationError where a skill with goals is what cannot have goals yet."""
-    for path, skill in roles.skills.items():
-        if skill.goal_space is None:
-            continue
-        if path in roles.levels:
-            raise DeclarationError(
-                f"skill {path!r} is a hierarchy with a goal_space, which is not supported yet: let "
-                "one of its own skills have the goals, and its selector choose them"
-            )
 
 
 def _check_same_env(name: str, spec: EnvSpec, other: EnvSpec) -> None:

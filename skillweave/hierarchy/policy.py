@@ -17,7 +17,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
-from skillweave.skills.goals import goals_of
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.types import Array, Memory, Policy, Step, unprefixed
 
 
@@ -29,15 +29,20 @@ class HierarchyPolicy:
         selector: chooses a row of the skills.
         skills: with their policies: ``OptionsEnv.skills``.
         guide: a ready selector that restricts what the selector may choose.
+        goals: of the skill that it is in another hierarchy: it observes them, too.
     """
 
     def __init__(
-        self, selector: Policy, skills: SkillSet, guide: ActiveGuide | None = None
+        self,
+        selector: Policy,
+        skills: SkillSet,
+        guide: ActiveGuide | None = None,
+        goals: Goals | None = None,
     ) -> None:
         self.selector = selector
         self.skills = skills
         self.guide = guide
-        self.player = Player(skills, selector, guide)
+        self.player = Player(skills, selector, guide, goals)
         self.observation_space = selector.observation_space
         self.action_space = skills.action_space
         self.labels = tuple(s.name for s in skills.skills)
@@ -186,6 +191,8 @@ class SkillAlone:
             assert self.part is not None
             assert self.part.rest is not None
             beside["last_action"] = self.part.rest.stored(step.action)
+        if self.goals is not None:
+            step = replace(step, goal=self.goals.read(memory["goal"]))
         return self.policy.observe(own, step) | beside
 
     def goal_now(self, memory: Memory, row: int = 0) -> Array | None:

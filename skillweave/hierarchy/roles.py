@@ -189,6 +189,7 @@ class Level:
 
     def deciding_roles(self, spec: EnvSpec) -> tuple[Role, Role]:
         """Return the roles of its selector and of its critic, in the environment ``spec``."""
+        own = None if self.as_skill is None else self.as_skill.goal_space
         selector = Role(
             self.selector_path,
             "selector",
@@ -196,6 +197,7 @@ class Level:
             self.selector if isinstance(self.selector, AlgorithmConfig) else None,
             choices=self.choices,
             goal_spaces=self.goal_spaces,
+            own_goals=own,
             skills=self.names,
             row_steps=self._usual_steps,
             greedy=self.selection.greedy_selector is not False,
@@ -208,6 +210,7 @@ class Level:
             spec,
             choices=len(self.skills),
             goal_spaces=self.goal_spaces,
+            own_goals=own,
             margin=margin,
         )
         return selector, critic

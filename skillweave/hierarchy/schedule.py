@@ -102,7 +102,7 @@ def level_stages(roles: Roles, level: Level, budgets: Mapping[str, int]) -> list
         return apart
     together = _together(roles, level, budgets[join(level.path, TOGETHER)])
     # The episodes of a hierarchy that cannot play alone cannot be evaluated.
-    if level.as_skill is None or _plays_alone(roles, level):
+    if level.as_skill is None or (level.as_skill.goal_space is None and _plays_alone(roles, level)):
         left_open = any(open_choices(roles, level))
         together = replace(together, compared=bool(apart), greedy_judged=left_open)
     return [*apart, together]

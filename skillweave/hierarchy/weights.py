@@ -321,7 +321,7 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
         if role is None or role.kind == "critic":
             continue
         action_space = acts if role.choices is None else role.action_space
-        goal_space = None if role.skill is None else role.skill.goal_space
+        goal_space = role.own_goals if role.skill is None else role.skill.goal_space
         own = seen if goal_space is None else with_goal(seen, goal_space)
         if role.part is not None:
             own, action_space = role.observation_space, role.action_space
@@ -336,4 +336,5 @@ def check_parts(roles: Roles, policy: HierarchyPolicy, where: str) -> None:
         if goal_space is None:
             continue
         if says := other_goals(goal_part(part.observation_space), goal_space):
-            raise RunError(f"{where}: skill {path!r} {says}")
+            who = f"skill {path!r}" if role.skill is not None else repr(path)
+            raise RunError(f"{where}: {who} {says}")

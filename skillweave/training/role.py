@@ -36,6 +36,9 @@ class Role:
     goal_spaces: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
     """Of a selector, the spaces of goals that it chooses, by the names of their skills; a critic
     observes them."""
+    own_goals: gym.Space[Any] | None = None
+    """Of a selector and a critic, the space of the goals of their hierarchy, as a skill, which they
+    observe, too; None: it has none."""
     skills: tuple[str, ...] = ()
     """Of a selector, the names of the skills that it chooses from, in order."""
     row_steps: int = 1
@@ -58,9 +61,12 @@ class Role:
     def observation_space(self) -> gym.Space[Any]:
         """The space of what it observes: the environment's or a skill's part, perhaps and goals.
 
-        A skill with goals observes its own, a critic those of all skills of its level.
+        A skill with goals observes its own, a selector those of its hierarchy, and a critic these
+        and those of all skills of its level.
         """
         space = self.spec.spaces.observation if self.part is None else self.part.observation_space
+        if self.own_goals is not None:
+            space = with_goal(space, self.own_goals)
         if self.kind == "critic" and self.goal_spaces:
             return with_goal(space, goals_space(self.goal_spaces))
         if self.skill is None or self.skill.goal_space is None:

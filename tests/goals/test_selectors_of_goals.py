@@ -246,12 +246,6 @@ def test_an_environment_of_options_does_not_change_goals(tmp_path):
 
 
 def test_what_goals_are_not_for_yet():
-    inner = declared([Rest()], selector=lambda obs: np.full(len(obs), "rest"), name="inner")
-    whole = type("Whole", (sw.Skill,), {"policy": inner, "goal_space": SPACES["box"]})()
-    with pytest.raises(
-        DeclarationError, match="hierarchy with a goal_space, which is not supported"
-    ):
-        declared([whole])
     guide = sw.Guide(sw.Automaton({"a": {("go_to", HERE), "rest"}}, {}))
     with pytest.raises(DeclarationError, match="guide: it gives a goal"):
         declared([go_to(), Rest()], selector=SELECTOR, guide=guide).check_spaces()

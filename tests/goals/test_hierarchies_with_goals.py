@@ -1,0 +1,127 @@
+"""A hierarchy that is a skill with goals: its selector sees the goal, and may pass it on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from small_runs import assert_same, stopped_run
+from worlds import SMALL, SPACES, GoTo, Rest, aim_of, declared, go_to
+
+import skillweave as sw
+from skillweave.errors import RunError
+from skillweave.skills.goal_spaces import with_goal
+
+SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+
+
+class Walk(GoTo):
+    """A step towards the goal."""
+
+    name = "walk"
+    max_steps = 3
+
+    def policy(self, obs, goal):
+        return np.clip(5 * (aim_of(goal) - obs), -1, 1)
+
+
+def passes_on(obs):
+    """The inner selector: the goal of the hierarchy is that of its skill."""
+    assert obs["goal"].shape == (len(obs), 2)
+    return np.full(len(obs), "walk"), np.clip(obs["goal"], -1, 1)
+
+
+def outer_goals(obs):
+    return np.full(len(obs), "far"), np.where(obs[:, :1] > 0, 0.7, 0.1) * np.ones((1, 2))
+
+
+def far(inner: Any, space: str = "box", **attributes: Any) -> sw.Skill:
+    """A hierarchy as a skill with goals."""
+    methods = {"name": "far", "policy": inner, "goal_space": SPACES[space], "max_steps": 9}
+    return type("Far", (GoTo,), methods | attributes)()
+
+
+def test_a_rule_passes_the_goal_on(tmp_path):
+    inner = declared([Walk(), Rest()], selector=passes_on, name="inner", call_steps=3)
+    hierarchy = declared([far(inner), Rest()], selector=outer_goals, call_steps=9)
+    run = hierarchy.train(tmp_path / "run", quiet=True)
+    report = run.evaluate(4)
+    assert report.skills["far"].success_rate == 1.0
+    assert report.skills["far/walk"].calls >= report.skills["far"].calls
+    alone = run.evaluate(6, skill="far")
+    assert alone.skills["far"].success_rate > 0.3  # drawn goals, some of them far
+    player = run.player(skill="far", goal=(0.5, 0.7))
+    obs = np.zeros(2, np.float32)
+    for _ in range(9):
+        obs = obs + 0.2 * player.act(obs)
+    np.testing.assert_allclose(obs, [0.5, 0.7], atol=0.15)
+
+
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize(
+    ("learn", "space"),
+    [("together", "box"), ("apart", "number"), ("apart, then together", "dict"), ("apart", "box")],
+)
+def test_it_learns_and_goes_on_bit_for_bit(learn, space, tmp_path):
+    def hierarchy():
+        how = {"selector": SELECTOR, "learn": learn, "train_defaults": OFTEN, "call_steps": 3}
+        inner = declared([go_to(), Rest()], name="inner", **how)
+        outer = how | {"call_steps": 9, "steps": 2000}
+        if space == "dict":  # no network chooses such goals
+            outer["selector"] = lambda obs: (
+                np.where(obs[:, 0] > 0, "rest", "far"),
+                {"at": np.tanh(obs), "side": (obs[:, 1] > 0).astype(int)},
+            )
+        return declared([far(inner, space), Rest()], **outer)
+
+    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    selector = run.policy.skills.policies[0].selector
+    assert selector.observation_space == with_goal(run.policy.observation_space, SPACES[space])
+    before = run.evaluate(3)
+    assert {"far", "far/go_to"} <= set(before.skills)
+    assert sw.load(tmp_path / "run", hierarchy()).evaluate(3).returns == before.returns
+    stopped_run(hierarchy(), tmp_path / "cut", 4)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", run.path)
+
+
+def test_its_selector_learns_to_use_the_goal(tmp_path):
+    """The inner selector alone can reach a goal; what it was never told, it could not."""
+    from skillweave.collecting.hierarchy_collector import HierarchyCollector
+
+    rows = []
+    original = HierarchyCollector._views
+
+    def views(self, trace, steps):
+        found = original(self, trace, steps)
+        if self.as_skill is not None:
+            batch = found[""]
+            rows.append((batch["obs"], batch["next_obs"], batch["terminated"], batch.valid_rows))
+        return found
+
+    inner = declared([Walk(), Rest()], selector=SELECTOR, name="inner", call_steps=3, steps=400)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HierarchyCollector, "_views", views)
+        declared([far(inner), Rest()], selector=outer_goals, steps=None, call_steps=9).train(
+            tmp_path / "run", quiet=True
+        )
+    goals = set()
+    for obs, after, terminated, mine in rows:
+        assert (obs["goal"] == after["goal"])[mine].all()  # a call has one goal
+        reached = np.abs(after["observation"] - after["goal"] % 2).max(-1) < 0.15
+        assert (reached == terminated)[mine].all()  # judged by this goal
+        goals |= {str(x) for x in obs["goal"][mine]}
+    assert len(goals) > 5
+
+
+def test_other_goals_are_refused(tmp_path):
+    inner = declared([Walk(), Rest()], selector=SELECTOR, name="inner", call_steps=3, steps=200)
+
+    def hierarchy(space):
+        return declared([far(inner, space), Rest()], selector=outer_goals, call_steps=9)
+
+    hierarchy("box").train(tmp_path / "run", quiet=True)
+    with pytest.raises(RunError, match=r"'far'.*was trained for goals of Box"):
+        sw.load(tmp_path / "run", hierarchy("unbounded"))
