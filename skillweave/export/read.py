@@ -248,7 +248,7 @@ class _Reading:
             case "Model":
                 return self._model(entry, path, goals)
             case "Hierarchy":
-                return self._hierarchy(entry, path)
+                return self._hierarchy(entry, path, goals)
         raise RunError(
             f"{self.file}: {path}.kind is {short(entry.get('kind'))}; it must be one of Code, "
             "Network, Model, Hierarchy"
@@ -342,27 +342,32 @@ class _Reading:
         _check_data_inside(content, file)
         return file, content
 
-    def _hierarchy(self, entry: dict[str, Any], path: str) -> HierarchyPolicy:
+    def _hierarchy(
+        self, entry: dict[str, Any], path: str, own: Goals | None = None
+    ) -> HierarchyPolicy:
         fitted: HierarchyEntry = self._fit(HierarchyEntry, entry, path)
         skills = []
         policies = []
         for i, one in enumerate(fitted["skills"]):
             skills.append(self._skill(one, f"{path}.skills[{i}]"))
             goal = one.get("goal") or {"joined": True}
-            own = goals_of(skills[-1]), goal["joined"]
-            policies.append(self._policy(one["policy"], f"{path}.skills[{i}].policy", *own))
+            seen = goals_of(skills[-1]), goal["joined"]
+            policies.append(self._policy(one["policy"], f"{path}.skills[{i}].policy", *seen))
         names = tuple(skill.name for skill in skills)
+        whole = self.spaces
+        if own is not None:  # the selector, the guide and the critic see its goal
+            self.spaces = with_goal(whole[0], own.space), whole[1]
         plain = gym.spaces.Discrete(len(skills) * max(1, len(fitted["lengths"])))
         spaces = {skill.name: skill.goal_space for skill in skills}
         with_goals = {name: space for name, space in spaces.items() if space is not None}
         choices = choice_space(int(plain.n), with_goals, names)
         interruption = None
         if fitted["critic"] is not None:
-            count, whole = gym.spaces.Discrete(len(skills)), self.spaces
+            count, seen = gym.spaces.Discrete(len(skills)), self.spaces
             if with_goals:
-                self.spaces = with_goal(whole[0], goals_space(with_goals)), whole[1]
+                self.spaces = with_goal(seen[0], goals_space(with_goals)), seen[1]
             critic = self._network(dict(fitted["critic"]), f"{path}.critic", count)
-            self.spaces = whole
+            self.spaces = seen
             interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
         skill_set = SkillSet(
@@ -379,7 +384,8 @@ class _Reading:
             ready: Any = self._selector(fitted["guide"], f"{path}.guide", names, plain)
             guide = ActiveGuide(ready)
         selector = self._selector(fitted["selector"], f"{path}.selector", names, choices)
-        return HierarchyPolicy(selector, skill_set, guide)
+        self.spaces = whole
+        return HierarchyPolicy(selector, skill_set, guide, own)
 
     def _skill(self, entry: SkillEntry, path: str) -> RecordedSkill:
         methods: dict[str, Any] = {}

@@ -360,6 +360,11 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         self.guide = runner.made(entry["guide"] or {"kind": "Code"})  # or nothing: all is allowed
         self.policies = [runner.made(skill["policy"]) for skill in self.skills]
         self.critic = entry["critic"] and runner.made(entry["critic"])
+        self.own: Any = None  # the entry of its goals, as a skill that has some
+        self.given: Any = None  # the goal of its call
+        for skill, policy in zip(self.skills, self.policies, strict=True):
+            if skill["goal"] and isinstance(policy, _Hierarchy):
+                policy.own = skill["goal"] | {"joined": True}
 
     def reset(self) -> None:
         self.skill, self.why, self.succeeded, self.goal = -1, EPISODE, False, None
@@ -376,14 +381,13 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
     def act(self, mask: Any, last: Any = None) -> Any:
         lengths, runner = self.entry["lengths"] or [np.inf], self.runner
         if self.why != RUNNING:
-            may = self.guide.allowed(self.may_start()[None], self).repeat(len(lengths))
-            if not may.any():
-                raise ValueError(f"no skill may start in observation {runner.obs[0]}")
-            choice, goals = self.parted(self.selector.act(may[None], self))
+            self.given, may = runner.goal, self.may_start()
+            choice, goals = self.as_selector(lambda: self.decided(may, len(lengths)))
             skill, length = divmod(int(choice), len(lengths))
             self.goal = self.fitted(self.skills[skill], goals.get(skill))
-            if skill != self.skill:
-                self.policies[skill].reset()
+            part = self.policies[skill]
+            if skill != self.skill or (self.goal is not None and isinstance(part, _Hierarchy)):
+                part.reset()
             self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
             self.skill, self.elapsed, self.why = skill, 0, RUNNING
         action = self.with_goal(lambda: self.policies[self.skill].act(mask))
@@ -394,9 +398,21 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
 
     def with_goal(self, act: Any) -> Any:
         """Return what the running skill does, where it sees its goal."""
-        if self.goal is None:
+        if self.goal is None and self.own is None:
             return act()
-        return self.runner.seeing(self.goal, self.skills[self.skill]["goal"], act)
+        entry = self.skills[self.skill]["goal"] or {"joined": False}
+        return self.runner.seeing(self.goal, entry, act)
+
+    def as_selector(self, act: Any) -> Any:
+        """Return what the selector, the guide or the critic does, which see the own goal."""
+        return self.runner.seeing(self.given, self.own, act) if self.own else act()
+
+    def decided(self, may: Any, lengths: int) -> Any:
+        """Return the number of the next choice, and goals by the places of skills."""
+        may = self.guide.allowed(may[None], self).repeat(lengths)
+        if not may.any():
+            raise ValueError(f"no skill may start in observation {self.runner.obs[0]}")
+        return self.parted(self.selector.act(may[None], self))
 
     def worth(self) -> Any:
         """Return the values of skills and of a new decision; a critic sees the call's goal."""
@@ -454,7 +470,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         if entry["termination"] and runner.asks(entry["termination"], runner.step(*when)):
             self.why = OWN
         if self.critic and self.why == RUNNING:
-            worth = self.worth()
+            worth = self.as_selector(self.worth)
             may = self.may_start()
             margin = self.entry["margin"]
             gain = worth[len(may) :] - worth[self.skill]
@@ -462,8 +478,8 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         judge, self.succeeded = entry["success"], self.why == OWN
         if judge and self.why != RUNNING:
             self.succeeded = runner.asks(judge, runner.step(*when))
-        self.selector.watch(self, elapsed, timed_out)
-        self.guide.watch(self, elapsed, timed_out)
+        self.selector.watch(self, elapsed, timed_out, self.given)
+        self.guide.watch(self, elapsed, timed_out, self.given)
 
 
 class _Function(_Code):  # a selector: observations, perhaps how the last call ended, to a skill

@@ -149,8 +149,10 @@ class States:
         if space is None:
             return None
         example = example_of(space)
-        # What takes the goal by an input of its own observes what the environment gives.
-        beside = isinstance(policy, MappedPolicy) and policy.has_goals
+        # What takes the goal by an input of its own observes what the environment gives; of a
+        # hierarchy only the selector observes both.
+        mapped = isinstance(policy, MappedPolicy) and policy.has_goals
+        beside = mapped or isinstance(policy, HierarchyPolicy)
         return {
             "space": space_to_json(space),
             "dtype": dtype_to_json(obs_dtype(space)),

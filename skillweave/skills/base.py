@@ -52,8 +52,8 @@ class Skill:
         call_steps: the most steps of a call, wherever it is trained; None: the hierarchy's.
         steps: training steps where it learns apart; None: its share of ``Hierarchy.steps``.
         task_weight: weight of the task's advantage beside its own reward where skills learn
-            together; None: ``Together.task_weight`` (1), or 0 for a skill with goals. 0: only its
-            own reward counts, as it should in a skill for other hierarchies.
+            together; None: ``Together.task_weight`` (1). 0: only its own reward counts, as it
+            should in a skill for other hierarchies.
         algorithm: settings of the algorithm that trains it, its network included; None: the
             hierarchy's.
         target_return: mean return of the periodic evaluation (the hierarchy's ``eval_every``) at

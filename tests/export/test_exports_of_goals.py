@@ -60,14 +60,15 @@ def skills_of(env: Point, *skills: sw.Skill, config: Any = PPO, **how: Any) -> S
     return SkillSet(skills, tuple(policies), **{"call_steps": 4, **how})
 
 
-def selected(env: Point, skills: SkillSet, selector: Any) -> HierarchyPolicy:
+def selected(env: Point, skills: SkillSet, selector: Any, space: Any = None) -> HierarchyPolicy:
+    seen = env.observation_space if space is None else space
     names = tuple(skill.name for skill in skills.skills)
     spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
     choices = choice_space(skills.choices, spaces, names)
     ready = None if hasattr(selector, "learning_rate") else ready_selector(selector, names)
     if ready is None:
-        return HierarchyPolicy(mild(selector, env.observation_space, choices, seed=2), skills)
-    return HierarchyPolicy(ready.bind(env.observation_space, choices, "selector"), skills)
+        return HierarchyPolicy(mild(selector, seen, choices, seed=2), skills)
+    return HierarchyPolicy(ready.bind(seen, choices, "selector"), skills)
 
 
 class Walk(GoTo):
@@ -146,6 +147,44 @@ def nested() -> Any:
     return env, selected(env, skills, PPO)
 
 
+def within(**how: Any) -> Any:
+    """A hierarchy with goals of its own, whose selector a network, a rule or an automaton is."""
+    env = Point()
+    skills = skills_of(env, go_to(), go_to(name="other"), Rest(), call_steps=2)
+    whole = type("Far", (GoTo,), {"max_steps": 7})()
+    own = goals_of(whole)
+    assert own is not None
+    seen = with_goal(env.observation_space, own.space)
+    spaces = {"go_to": GoTo.goal_space, "other": GoTo.goal_space}
+    if how.get("cut"):
+        config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
+        with_goals = with_goal(seen, goals_space(spaces))
+        critic = mild(config, with_goals, gym.spaces.Discrete(3), seed=1)
+        skills = with_interruption(skills, critic, 0.02)
+    inner = selected(env, skills, how.get("inner", PPO), seen)
+    inner = HierarchyPolicy(inner.selector, skills, None, own)
+    outer = SkillSet((whole, Rest()), (inner, skills.policies[2]), call_steps=5)
+    return env, selected(env, outer, chooses_far)
+
+
+def chooses_far(obs: Any) -> Any:
+    return np.where(obs[:, 0] > -0.9, "far", "rest"), np.tanh(obs)
+
+
+def passes_on(obs: Any) -> Any:
+    goals = (obs["goal"] + np.tanh(obs["observation"])) / 2
+    return np.full(len(obs), "go_to"), {"go_to": goals}
+
+
+NEAR = sw.Automaton(
+    states={"go": ("go_to", lambda obs: obs["goal"]), "stay": "rest"},
+    transitions={
+        ("go", "stay"): lambda step: step.goal[:, 0] < 0,
+        ("stay", "go"): "failure",
+    },
+)
+
+
 def interrupted() -> Any:
     env = Point()
     skills = skills_of(env, go_to(), Rest(), go_to("number", name="side"), call_steps=9)
@@ -176,6 +215,10 @@ CASES: dict[str, Any] = {
     "images": lambda: made(go_to("dict"), selector=parts, env=Point(as_dict=True)),
     "nested": nested,
     "interrupted": interrupted,
+    "within": within,
+    "within, by a rule": lambda: within(inner=passes_on),
+    "within, by an automaton": lambda: within(inner=NEAR),
+    "within, interrupted": lambda: within(cut=True),
     "discrete": lambda: made(go_to(), env=Point(discrete=True)),
 }  # fmt: skip
 
