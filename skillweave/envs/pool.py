@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import warnings
 from collections.abc import Callable, Iterator
@@ -132,25 +133,24 @@ class _OneOfPool(gym.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # Gymnasium has it so, too
 
-    def __init__(self, make: MakePool, render_mode: str | None) -> None:
+    def __init__(self, make: MakePool, spaces: tuple[Any, Any], render_mode: str | None) -> None:
         self.render_mode = render_mode
+        self.observation_space, self.action_space = spaces
         self._make = make
-        self._pool = make(num_envs=1, threads=1, seed=0)
-        self._seeded = False
+        self._pool: Any = None  # until the first reset
         self._ids = np.zeros(1, np.int32)
-        self.observation_space = self._pool.observation_space
-        self.action_space = self._pool.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
-        if seed is not None or not self._seeded:
+        if seed is not None or self._pool is None:
             new = int(self.np_random.integers(POOL_SEEDS)) if seed is None else seed % POOL_SEEDS
             self._pool = self._make(num_envs=1, threads=1, seed=new)
-            self._seeded = True
         obs, info = self._pool.reset(self._ids)
         return self._seen(obs), _first(info)
 
     def step(self, action: Any) -> Any:
+        if self._pool is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
         many = np.asarray(action, self.action_space.dtype)[None]
         if isinstance(self.action_space, gym.spaces.Discrete):
             many = many.astype(np.int32)  # EnvPool's
@@ -159,7 +159,14 @@ class _OneOfPool(gym.Env[Any, Any]):
         return self._seen(obs), float(reward[0]), *ends, _first(info)
 
     def render(self) -> Any:
-        return None if self.render_mode is None else self._pool.render(self._ids)[0]
+        if self.render_mode is None or self._pool is None:
+            return None
+        if not hasattr(self._pool, "render"):
+            raise EnvError(
+                f"{short(self._pool)} cannot be rendered: give it a method render(ids), which "
+                "returns pictures (k, H, W, 3) uint8; PoolWrapper has one to override"
+            )
+        return self._pool.render(self._ids)[0]
 
     def _seen(self, obs: Any) -> Any:
         return unpack(self.observation_space, pack(self.observation_space, obs)[0])
@@ -194,8 +201,13 @@ def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
         The function, for ``EnvSpec``. It has the name of ``pool``.
     """
 
+    @functools.cache  # a simulator may take half a second to load
+    def spaces() -> tuple[Any, Any]:
+        first = pool(num_envs=1, threads=1, seed=0)
+        return first.observation_space, first.action_space
+
     def one(render_mode: str | None = None) -> gym.Env[Any, Any]:
-        return _OneOfPool(pool, render_mode)
+        return _OneOfPool(pool, spaces(), render_mode)
 
     one.__name__ = str(getattr(pool, "__name__", type(pool).__name__))
     return one

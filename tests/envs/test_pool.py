@@ -216,6 +216,12 @@ def test_one_environment_of_a_pool_is_one_of_gymnasium():
     assert terminated
     assert env.reset()[0]["root"] == 5  # the same pool goes on
     assert sw.one_of(later)().render() is None
+    clock = sw.one_of(Clock)("rgb_array")
+    with pytest.raises(gym.error.ResetNeeded):
+        clock.step(1)
+    clock.reset()
+    with pytest.raises(EnvError, match=r"cannot be rendered: give it a method render\(ids\)"):
+        clock.render()
 
 
 def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_without_a_seed():

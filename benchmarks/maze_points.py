@@ -1,0 +1,150 @@
+"""The large maze with one skill with a goal: roll to a point that is near; a selector chooses it.
+
+    python -m benchmarks.maze_points [--seeds 0 1] [--out runs/maze-points]
+
+The recipe ``mazes`` with one skill in place of its five, in as many steps: a million for the skill
+and the selector together. Neither sees walls; the selector chooses any point of the maze, and the
+skill rolls towards it, two metres at most. A score is the share of 60 episodes of
+Gymnasium-Robotics' maze that reach the goal, where the selector samples.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from skillweave import Apart, Array, Hierarchy, Network, Skill, Step, register_encoder
+from skillweave.recipes import _mazes, mazes
+from skillweave.recipes._mazes import PLACE, SPEED
+
+SKILL_STEPS, SELECTOR_STEPS = 150_000, 838_000
+"""Together they are the recipe's, a million."""
+EPISODES = 60
+RANGE = 2.0
+"""Metres to the furthest point of a call."""
+THERE = 0.3
+"""Metres from the point at which a call ends."""
+CORNER = np.array([6.0, 4.5], np.float32)
+"""Metres from the middle of the maze to its north-eastern corner."""
+POINT = slice(6, 8)
+"""The place of the goal in what the skill's networks see."""
+
+
+class GoTo(Skill):
+    """Roll to a point, until it is there, or a wall is in the way."""
+
+    goal_space = gym.spaces.Box(-CORNER, CORNER)
+    max_steps = 100
+    steps = SKILL_STEPS
+
+    def goals(self, obs: Array, rng: np.random.Generator) -> Array:
+        """Return points in range, in all directions alike."""
+        angle, far = rng.uniform((0.0, THERE), (2.0 * np.pi, RANGE), (len(obs), 2)).T
+        way = far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return self.inside(obs[:, PLACE] + way)
+
+    def clip_goal(self, obs: Array, goal: Array) -> Array:
+        """Return the points in range that lie in the direction of the chosen ones."""
+        way = goal - obs[:, PLACE]
+        far = np.hypot(*way.T)[:, None]
+        return self.inside(obs[:, PLACE] + way * np.minimum(1.0, RANGE / np.maximum(far, 1e-6)))
+
+    def inside(self, points: Array) -> Array:
+        """Return points within the maze."""
+        inner: Array = np.clip(points, self.goal_space.low, self.goal_space.high)
+        return inner.astype(np.float32)
+
+    def reward(self, step: Step) -> Array:
+        """Return metres a second by which the point comes nearer."""
+        nearer: Array = 100.0 * (self.far(step.obs, step.goal) - self.far(step.next_obs, step.goal))
+        return nearer
+
+    def far(self, obs: Array, goal: Any) -> Array:
+        """Return metres to the point, (n,)."""
+        metres: Array = np.hypot(*(goal - obs[:, PLACE]).T)
+        return metres
+
+    def termination(self, step: Step) -> Array:
+        """Return whether it is there, or stuck as the recipe's skills are."""
+        way = step.goal - step.next_obs[:, PLACE]
+        way = way / np.maximum(np.hypot(*way.T), 1e-6)[:, None]
+        before, after = ((o[:, SPEED] * way).sum(axis=1) for o in (step.obs, step.next_obs))
+        stuck = (after < mazes.SLOW) & (after - before < mazes.GAIN) & (step.elapsed >= mazes.TRY)
+        ends: Array = stuck | self.success(step)
+        return ends
+
+    def success(self, step: Step) -> Array:
+        """Return whether it is there."""
+        there: Array = self.far(step.next_obs, step.goal) < THERE
+        return there
+
+
+class Motion:
+    """An encoder without parameters: the speed, and where the point is from here."""
+
+    size = 4
+
+    def __init__(self, obs: Any) -> None:
+        self.shapes: dict[str, tuple[int, ...]] = {}
+
+    def init_(self, views: Any, generators: Any) -> None:
+        """Fill no weights: it has none."""
+
+    def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
+        """Map (P, B, 8) to (P, B, 4)."""
+        import torch
+
+        seen = inputs["vector"]
+        return torch.cat([seen[..., SPEED], seen[..., POINT] - seen[..., PLACE]], -1)
+
+
+register_encoder("motion to a point in a maze", Motion)
+
+
+def declare(**how: Any) -> Hierarchy:
+    """Return the hierarchy; ``how`` changes any of its settings."""
+    network = Network(hidden=(32, 32), activation="relu", encoder="motion to a point in a maze")
+    settings: dict[str, Any] = {
+        "call_steps": 25,
+        "algorithm": replace(mazes.BALL, network=network),
+        "selector": replace(mazes.SELECTOR, ent_coef=0.01, ent_coef_final=0.0),
+        "learn": "apart",
+        "apart": Apart(selector_steps=SELECTOR_STEPS),
+        "selection": mazes.SAMPLING,
+    } | how
+    return Hierarchy(_mazes.spec("large"), [GoTo()], **settings)
+
+
+def score(seed: int, out: Path) -> float:
+    """Return the share of episodes that reach the goal; train what is not in the folder."""
+    hierarchy, path = declare(), out / str(seed)
+    run = hierarchy.resume(path) if path.exists() else hierarchy.train(path, seed=seed)
+    return float(run.evaluate(EPISODES, deterministic=False).mean)
+
+
+def main() -> None:
+    """Train each seed, and print its score."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--out", type=Path, default=Path("runs/maze-points"))
+    asked = parser.parse_args()
+    scores = []
+    for seed in asked.seeds:
+        start = time.perf_counter()
+        scores.append(score(seed, asked.out))
+        print(f"seed {seed}: {scores[-1]:.0%}, {time.perf_counter() - start:.0f} s", flush=True)
+    print(f"median {statistics.median(scores):.0%}")
+
+
+if __name__ == "__main__":
+    main()
