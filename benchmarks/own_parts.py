@@ -39,6 +39,21 @@ def move(way: Array) -> Array:
     return moved
 
 
+def rise(offset: Array) -> Array:
+    """Return the arm's action that leads above the block, for its way to the block (n, 3)."""
+    return move(offset + np.array([0.0, 0.0, 0.1]))
+
+
+def widen(fingers: Array) -> Array:
+    """Return the fingers' action (n, 1) that opens them."""
+    return np.ones((len(fingers), 1), np.float32)
+
+
+def narrow(fingers: Array) -> Array:
+    """Return the fingers' action (n, 1) that closes them."""
+    return -widen(fingers)
+
+
 def to_goal(obs: Array) -> Array:
     """Return the way of the block to the goal, (n, 3)."""
     way: Array = obs[:, whole.GOAL] - obs[:, whole.BLOCK]
@@ -50,9 +65,7 @@ class Above(whole.Above):
 
     sees, acts = whole.OFFSET, ARM
 
-    def policy(self, obs: Array) -> Array:
-        """Return the way of the arm."""
-        return move(obs + (0.0, 0.0, 0.1))
+    policy = rise
 
     def initiation(self, obs: Array) -> Array:
         """Return whether the fingers are open."""
@@ -92,9 +105,7 @@ class Open(Skill):
 
     sees, acts = whole.FINGERS, FINGERS
 
-    def policy(self, obs: Array) -> Array:
-        """Return the fingers' action."""
-        return np.ones((len(obs), 1), np.float32)
+    policy = widen
 
     def initiation(self, obs: Array) -> Array:
         """Return whether they are not open, and hold nothing."""
@@ -110,9 +121,7 @@ class Close(whole.Close):
 
     sees, acts = whole.FINGERS, FINGERS
 
-    def policy(self, obs: Array) -> Array:
-        """Return the fingers' action."""
-        return -np.ones((len(obs), 1), np.float32)
+    policy = narrow
 
 
 def declare() -> Hierarchy:

@@ -35,8 +35,8 @@ from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, SKILL
 from skillweave.skills.goals import CallGoals, Goals, goals_of
-from skillweave.skills.own_part import ZERO, Rest
 from skillweave.skills.outputs import blame
+from skillweave.skills.own_part import ZERO, Rest
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
 
 
@@ -267,7 +267,7 @@ class Player:
         running, actions = memory["skill"][rows], None
         last = memory.get("last_action") if turn.last_action is None else turn.last_action
         own = Turn(self.skills.greedy, turn.rng, turn.age, turn.overridden, last, turn.trace)
-        for i, actor in enumerate(self.actors):
+        for i in range(len(self.actors)):
             mine = np.flatnonzero(running == i)
             if not len(mine):
                 continue

@@ -21,9 +21,8 @@ from skillweave.selectors.base import (
 )
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.goals import as_goals
-from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.outputs import as_array, called, checked_actions, required_arguments
 from skillweave.skills.probing import probe
-from skillweave.skills.outputs import required_arguments
 from skillweave.types import Array, Memory, Step, read_only
 
 

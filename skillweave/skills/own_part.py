@@ -68,7 +68,7 @@ def computed(sees: Any, who: str) -> bool:
     return bool(declared_sees(sees, who).functions())
 
 
-def declared_acts(acts: Any, who: str) -> tuple[str, ...] | slice | tuple[int, ...]:
+def declared_acts(acts: Any, who: str) -> Any:
     """Return a skill's ``acts``: names of parts of a Dict action, or places of another one.
 
     Raises:
@@ -97,8 +97,7 @@ def declared_acts(acts: Any, who: str) -> tuple[str, ...] | slice | tuple[int, .
                 f"{who}: acts has a scale, an offset or a clip, which only the acts of a policy "
                 "from elsewhere has: give the places alone, acts = (0, 1, 2)"
             )
-        to: slice | tuple[int, ...] = acts.to
-        return to
+        return acts.to
     raise DeclarationError(
         f"{who}: acts is {short(acts)}; it must be the places of its numbers in the action, "
         "acts = (0, 1, 2) or slice(0, 3), or the names of parts of a Dict action: acts = 'arm'"
@@ -112,8 +111,8 @@ def part_to_json(sees: Any, acts: Any, who: str) -> dict[str, Any]:
         content["sees"] = declared_sees(sees, who).to_json()["sees"]
     if acts is not None:
         written = declared_acts(acts, who)
-        is_slice = isinstance(written, slice)
-        content["acts"] = places_to_json(written) if is_slice else list(written)
+        named = isinstance(written, tuple) and isinstance(written[0], str)
+        content["acts"] = list(written) if named else places_to_json(written)
     return content
 
 
@@ -251,7 +250,8 @@ def _leaf(rest: Any, space: Space[Any], where: str, path: tuple[str, ...]) -> _L
     if isinstance(rest, str):
         return _Leaf(path, zero, np.full(shape, rest == HOLD))
     wrong = DeclarationError(
-        f"{where} is {short(rest)}, but the action has {zero.size} numbers ({short(space)}); {_REST}"
+        f"{where} is {short(rest)}, but the action has {zero.size} numbers ({short(space)}); "
+        f"{_REST}"
     )
     entries = np.empty(1, object)
     if isinstance(rest, Sequence | np.ndarray) and np.ndim(np.asarray(rest, object)) > 0:
@@ -306,10 +306,10 @@ def _written(acts: Any, space: Space[Any], who: str) -> _Written:
         return _named(acts, space, who)
     if named:
         raise DeclarationError(
-            f"{who}: acts names {acts[0]!r}, a part of the action that does not exist: {short(space)} "
-            "has places, counted from 0"
+            f"{who}: acts names {acts[0]!r}, a part of the action that does not exist: "
+            f"{short(space)} has places, counted from 0"
         )
-    size = int(space.n) if isinstance(space, Discrete) else int(np.prod(space.shape))
+    size = int(space.n) if isinstance(space, Discrete) else int(np.prod(space.shape or ()))
     try:
         places = places_in(acts, size, who)
     except PolicyError:
@@ -444,7 +444,7 @@ class OwnPart:
                 "an input of its own, sees = {'image': 'camera', 'rest': ('joints', ...)}"
             )
         leaf, whole = leaves[0]
-        if leaf is not None and whole and not given.scalings:
+        if leaf is not None and whole and len(leaves) == 1 and not given.scalings:
             space: Space[Any] = self._plan.spaces[0]
             for field in leaf.fields:
                 space = (parts_of(space) or {})[field]
@@ -495,8 +495,8 @@ class OwnPart:
         elif isinstance(self.action_space, MultiDiscrete):
             counts = self.action_space.nvec
         starts = np.concatenate([[0], np.cumsum(np.ravel(counts))[:-1]]).astype(np.int64)
-        free: Array = np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1)
-        return free
+        free = np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1)
+        return np.asarray(free)
 
     def check_mask(self, mask: Array | None, action: Array) -> None:
         """Raise a SkillError where a mask (n, A) leaves it no choice, or forbids the rest.
