@@ -50,7 +50,15 @@ if TYPE_CHECKING:
     from skillweave.reporting.curves_figure import plot_curves
     from skillweave.seeding import Seeds
     from skillweave.selectors import Automaton, LastCall, tree
-    from skillweave.skills import Reflex, Skill, from_function, from_onnx, from_sb3, from_torch
+    from skillweave.skills import (
+        Reflex,
+        Residual,
+        Skill,
+        from_function,
+        from_onnx,
+        from_sb3,
+        from_torch,
+    )
     from skillweave.skills.mapping import Acts, Goal, LastAction, Part
     from skillweave.training.callback import TrainEvent
     from skillweave.training.defaults import TrainDefaults
@@ -108,6 +116,7 @@ _HOME = {
     "Range": "evolution.config",
     "Ray": "collecting.cluster",
     "Reflex": "skills",
+    "Residual": "skills",
     "Report": "experience",
     "Rollout": "experience",
     "Run": "api",
@@ -204,6 +213,7 @@ __all__ = [
     "Ray",
     "Reflex",
     "Report",
+    "Residual",
     "Rollout",
     "Run",
     "RunError",

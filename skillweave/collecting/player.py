@@ -10,7 +10,8 @@ are named as follows; a hierarchy that is skill ``i`` has the same names under `
 - ``last_action``: the last action of the environment, as bytes, where it counts for a skill's own
   part (``Rest``);
 - ``goal.i``: the goal of the latest call of skill ``i``, where it has goals;
-- ``i.<key>``: what the policy of skill ``i`` remembers;
+- ``i.<key>``: what the policy of skill ``i`` remembers; ``base.i.<key>``: the policy that it
+  corrects (``Residual``);
 - ``selector.<key>``, ``guide.<key>``: the same of the selector and its guide; ``chances``: how
   likely the guide's latest choices were.
 """
@@ -90,6 +91,7 @@ class PolicyActor:
 
     def __init__(self, policy: Policy, blamed: str) -> None:
         self._policy, self._blamed = policy, blamed
+        self.action_space: gym.Space[Any] = policy.action_space
         self.watches = getattr(type(policy), "observe", None) is not Memoryless.observe
 
     def start(self, n: int) -> Memory:
@@ -181,14 +183,14 @@ class Player:
     ) -> None:
         self.skills, self.guide, self.own_goals = skills, guide, own_goals
         self.actors = tuple(
-            _actor_of(policy, f"skill {path_of(skill)!r}: its policy's act()")
+            actor_of(policy, f"skill {path_of(skill)!r}: its policy's act()")
             for skill, policy in zip(skills.skills, skills.policies, strict=True)
         )
         self.selector: Any = None
         if selector is not None:
-            self.selector = _actor_of(selector, "the selector's act()")
+            self.selector = actor_of(selector, "the selector's act()")
         self._ready = selector if hasattr(selector, "watch") else None
-        self._keys = tuple(self._named(i) for i in range(len(self.actors)))
+        self._keys = tuple(self._named(i, actor) for i, actor in enumerate(self.actors))
         self._selector_keys = () if self.selector is None else tuple(self.selector.start(1))
         self._limits = tuple(skills.limit(i) for i in range(len(self.actors)))
         self._stops = tuple(skill.defines("termination") for skill in skills.skills)
@@ -197,6 +199,12 @@ class Player:
         self.goals: dict[int, Goals] = {i: goals for i, goals in every if goals is not None}
         """The goals of skills that have some, by their place in the list."""
         self._rest = Rest(ZERO, self.action_space) if skills.holds else None
+        self._bases = {
+            i: actor_of(part.base, f"{part.who}: the act() of the policy that it corrects")
+            for i, part in enumerate(skills.parts)
+            if part is not None and part.base is not None
+        }
+        self._base_keys = {i: self._named(i, base) for i, base in self._bases.items()}
         if isinstance(selector, LearnerActor) and self.goals:
             selector.widen = selector.acting.widened
 
@@ -224,6 +232,8 @@ class Player:
         memory |= {f"goal.{i}": goals.start(n) for i, goals in self.goals.items()}
         for i, actor in enumerate(self.actors):
             memory |= {f"{i}.{k}": v for k, v in actor.start(n).items()}
+        for i, base in self._bases.items():
+            memory |= {f"base.{i}.{k}": v for k, v in base.start(n).items()}
         if self.selector is not None:
             memory |= {f"selector.{k}": v for k, v in self.selector.start(n).items()}
         if self.guide is not None:
@@ -291,14 +301,18 @@ class Player:
         self, memory: Memory, i: int, rows: Array, obs: Array, mask: Array | None, turn: Turn
     ) -> Array:
         """Return the actions (k, …) of skill ``i`` in ``rows`` (k,), of which it may own a part."""
-        part, seen, below = self.skills.part(i), self._seen(memory, i, rows, obs), mask
+        part, seen, allowed = self.skills.part(i), self._seen(memory, i, rows, obs), mask
         if part is not None:
-            below = part.mask(mask)
-        actions: Array = self.actors[i].act(self.of_skill(memory, i), rows, seen, below, turn)
+            allowed = part.mask(mask)
+        actions: Array = self.actors[i].act(self.of_skill(memory, i), rows, seen, allowed, turn)
         if part is None:
             return actions
         last = None if turn.last_action is None else turn.last_action[rows]
-        actions = part.write(actions, last)
+        corrected = None
+        if i in self._bases:
+            how = Turn(True, turn.rng)
+            corrected = self._bases[i].act(self.of_base(memory, i), rows, seen, None, how)
+        actions = part.write(actions, last, corrected)
         part.check_mask(mask, actions)
         return actions
 
@@ -344,6 +358,9 @@ class Player:
             anew = changed | (i in self.goals and isinstance(self.actors[i], Player))
             if keys and len(fresh := rows[anew & (skill == i)]):
                 _put(self.of_skill(memory, i), fresh, self.actors[i].start(len(fresh)))
+        for i, base in self._bases.items():
+            if self._base_keys[i] and len(fresh := rows[changed & (skill == i)]):
+                _put(self.of_base(memory, i), fresh, base.start(len(fresh)))
 
     def observe(self, memory: Memory, rows: Array, step: Step) -> Array:
         """Notice a step of environments ``rows`` (k,); return why calls ended, (k,) int8.
@@ -363,7 +380,7 @@ class Player:
             if limit is not None:
                 end[(running == i) & (elapsed >= limit)] = LIMIT
         for i, actor in enumerate(self.actors):
-            if actor.watches or self._stops[i]:
+            if actor.watches or self._stops[i] or self._base_watches(i):
                 mine = np.flatnonzero(running == i)
                 if len(mine):
                     self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
@@ -390,6 +407,14 @@ class Player:
     def of_skill(self, memory: Memory, i: int) -> Memory:
         """Return the memory of skill ``i``'s policy, the same arrays under its own names."""
         return {k: memory[f"{i}.{k}"] for k in self._keys[i]}
+
+    def of_base(self, memory: Memory, i: int) -> Memory:
+        """Return the memory of the policy that skill ``i`` corrects, under its own names."""
+        return {k: memory[f"base.{i}.{k}"] for k in self._base_keys[i]}
+
+    def _base_watches(self, i: int) -> bool:
+        """Return whether the policy that skill ``i`` corrects notices steps."""
+        return i in self._bases and bool(self._bases[i].watches)
 
     def of_selector(self, memory: Memory) -> Memory:
         """Return the selector's memory, the same arrays under its own names."""
@@ -461,10 +486,15 @@ class Player:
         skill, actor = self.skills.skills[i], self.actors[i]
         part = seen_by(skill, step, elapsed, mine, self.goal_of(memory, i, rows[mine]))
         if actor.watches:
-            below = self.of_skill(memory, i)
-            actor.observe(below, rows[mine], part)
+            below, own = self.of_skill(memory, i), self.skills.part(i)
+            actor.observe(below, rows[mine], part if own is None else own.own_step(part))
             if isinstance(actor, Player) and actor.restricts:
                 end[mine[actor.is_stuck(below, rows[mine], part.next_obs)]] = LIMIT
+        if self._base_watches(i):
+            own = self.skills.part(i)
+            assert own is not None
+            seen = own.own_step(part)
+            self._bases[i].observe(self.of_base(memory, i), rows[mine], seen)
         if self._stops[i]:
             end[mine[judge(skill, part, rows[mine]).stops]] = OWN
 
@@ -565,9 +595,9 @@ class Player:
             return obs
         return goals.join(obs, goals.read(memory[f"goal.{i}"][rows]))
 
-    def _named(self, i: int) -> tuple[str, ...]:
-        """The names of what skill ``i``'s policy remembers, checked."""
-        fresh = self.actors[i].start(1)
+    def _named(self, i: int, actor: Actor) -> tuple[str, ...]:
+        """The names of what a policy of skill ``i`` remembers, checked."""
+        fresh = actor.start(1)
         for k, v in fresh.items():
             if v.dtype.kind not in "biuf":  # a checkpoint could not hold it
                 raise PolicyError(
@@ -584,7 +614,8 @@ def player_of(policy: Any) -> Player | None:
     return found if isinstance(found, Player) else None
 
 
-def _actor_of(policy: Any, blamed: str) -> Any:
+def actor_of(policy: Any, blamed: str) -> Any:
+    """Return an ``Actor`` that acts by a policy; ``blamed`` as of ``PolicyActor``."""
     if isinstance(policy, LearnerActor):
         return policy
     return player_of(policy) or PolicyActor(policy, blamed)

@@ -18,7 +18,7 @@ from skillweave.types import Array, Memory, prefixed
 
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""
-OF_OTHERS = ("player.", "starters.")
+OF_OTHERS = ("player.", "starters.", "base.")
 """How names begin of what others remember, who may be a user's: that may be anything."""
 PLAYERS = ("player", "starters")
 """What players are called whose memory is kept."""

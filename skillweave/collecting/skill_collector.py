@@ -5,12 +5,15 @@ Stands alone because it is one of two collectors, beside ``hierarchy_collector``
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.call_end import EPISODE, LIMIT, OWN, RUNNING
 from skillweave.collecting.collector import SUCCESS, Collector
 from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.player import Turn, actor_of
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.start_policy import StartPolicy
 from skillweave.collecting.views import rows_of, steps_of, successes_of
@@ -23,7 +26,7 @@ from skillweave.messages import observed
 from skillweave.skills import Reflex, Skill, apply_reflexes, asked
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import ZERO, OwnPart, Rest
-from skillweave.types import Array, Step
+from skillweave.types import Array, Memory, Step, prefixed
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
@@ -103,12 +106,19 @@ class SkillCollector(Collector):
         self._rest = Rest(ZERO, engine.action_space) if holds else None
         if self._rest is not None:
             self.kept["last_action"] = self._rest.start(n)
+        self._base: Any = None
+        if part is not None and part.base is not None:
+            blamed = f"{part.who}: act() of the policy that it corrects"
+            self._base = actor_of(part.base, blamed)
+            self._base_memory: Memory = self._base.start(n)
+            self.kept |= prefixed("base", self._base_memory)
         self._goals = goals_of(skill)
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
             self.goals["goal"] = self._goals
             self.kept["needs_goal"] = np.zeros(n, bool)  # a call of the skill starts
         self._asks = self._searches or (skill is not None and skill.defines("termination"))
+        self._asks |= self._base is not None and self._base.watches
         """Something is asked about each step while it is made."""
         if self._searches:
             self.kept["searching"] = np.zeros(n, bool)  # the skill may not start yet
@@ -159,7 +169,7 @@ class SkillCollector(Collector):
             goal = self._choose_goals(playing)
             seen = self._goals.join(seen, goal)
         acted = self.acting.all(seen, mask if part is None else part.mask(mask), memory)
-        action, overridden = self._actions(obs, acted.action, mask, playing)
+        action, overridden = self._actions(obs, seen, acted.action, mask, playing)
         out.write(
             obs=obs,
             action=acted.action,
@@ -176,6 +186,10 @@ class SkillCollector(Collector):
         self.kept["age"] += 1
         self.kept["elapsed"] += 1 if playing is None else playing
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
+        if part is not None and step is not None and self._base is not None and self._base.watches:
+            rows = self._all if playing is None else np.flatnonzero(playing)
+            own = part.own_step(seen_by(None, step, self.kept["elapsed"][rows], rows))
+            self._base.observe(self._base_memory, rows, own)
         end = self._ends(raw, step, playing, goal)
         out.write(
             next_obs=raw.next_obs,
@@ -208,11 +222,12 @@ class SkillCollector(Collector):
         return ~self.kept["searching"]
 
     def _actions(
-        self, obs: Array, chosen: Array, mask: Array | None, playing: Array | None
+        self, obs: Array, seen: Array, chosen: Array, mask: Array | None, playing: Array | None
     ) -> tuple[Array, Array | None]:
         """Return the actions (N, …) of the skill, of reflexes, and of the search for its start.
 
         Args:
+            seen: what the learner sees of ``obs``.
             chosen: what the learner chose, in policy units.
 
         Returns:
@@ -221,8 +236,8 @@ class SkillCollector(Collector):
         action, overridden = self.acting.to_env(chosen), None
         last = self.kept.get("last_action")
         if self._part is not None:
-            action = self._part.write(action, last)
-            rows = slice(None) if playing is None else playing
+            rows = self._all if playing is None else np.flatnonzero(playing)
+            action = self._part.write(action, last, self._corrected(seen, rows))
             self._part.check_mask(None if mask is None else mask[rows], action[rows])
         if self.reflexes:
             space = self.engine.action_space
@@ -233,6 +248,21 @@ class SkillCollector(Collector):
                 searching, obs, mask, self._rng, self._last(), last
             )
         return action, overridden
+
+    def _corrected(self, seen: Array, rows: Array) -> Array | None:
+        """Return the actions (N, …) of the policy that the skill corrects; None: it has none.
+
+        Args:
+            seen: (N, …), what the skill sees.
+            rows: (k,) where it acts; elsewhere they are 0.
+        """
+        if self._base is None:
+            return None
+        action = np.zeros((self.num_envs, *self._base.action_space.shape), np.float64)
+        if len(rows):
+            turn = Turn(True, self._rng)
+            action[rows] = self._base.act(self._base_memory, rows, seen[rows], None, turn)
+        return action
 
     def _search(self, step: Step, searching: Array) -> None:
         """Let environments ``searching`` (k,) go on until the skill may start in them."""
@@ -362,6 +392,9 @@ class SkillCollector(Collector):
         super()._forget(ids)
         if self._rest is not None:
             self.kept["last_action"][ids] = self._rest.start(len(ids))
+        if self._base is not None:
+            for name, value in self._base.start(len(ids)).items():
+                self._base_memory[name][ids] = value
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
         if self._searches:

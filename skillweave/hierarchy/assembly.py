@@ -11,6 +11,7 @@ from skillweave.hierarchy.fitting import learning_guide, restricting_guide
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.skills.goals import goals_of
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Policy
 
 
@@ -59,6 +60,18 @@ def parts_of(roles: Roles, policy: HierarchyPolicy) -> dict[str, Policy]:
         by_name = dict(zip(whole.labels, whole.skills.policies, strict=True))
         parts |= {path: by_name[skill.name] for path, skill in level.skills.items()}
     return parts
+
+
+def own_parts_of(roles: Roles, policy: HierarchyPolicy) -> dict[str, OwnPart]:
+    """Return the own parts of skills in a hierarchy's policy, by path."""
+    found: dict[str, OwnPart] = {}
+    whole = parts_of(roles, policy)
+    for level in roles.levels.values():
+        acting = whole[level.path]
+        assert isinstance(acting, HierarchyPolicy)
+        pairs = zip(level.skills, acting.skills.parts, strict=False)  # none, or one for each skill
+        found |= {path: part for path, part in pairs if part is not None}
+    return found
 
 
 def learning_set(roles: Roles, level: Level, policies: Mapping[str, Policy]) -> SkillSet:

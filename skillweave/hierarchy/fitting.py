@@ -13,17 +13,18 @@ import gymnasium as gym
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
 from skillweave.collecting.guide import ActiveGuide
+from skillweave.collecting.skill_set import skills_below
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
-from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
-from skillweave.skills.goal_spaces import goal_part, other_goals, without_goal
+from skillweave.skills.foreign_policy import fitted
+from skillweave.skills.goal_spaces import goal_part
 from skillweave.skills.goals import goals_of
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.mapped import MappedPolicy
-from skillweave.spaces import obs_codec, same_space
+from skillweave.skills.ready import PART, fitted_to_skill
+from skillweave.spaces import obs_codec
 from skillweave.training.checks import check_rollout
 from skillweave.training.role import Role
 from skillweave.types import Policy
@@ -103,30 +104,16 @@ def ready_selectors(roles: Roles) -> dict[str, Policy]:
 
 
 def _fitted(policy: Policy, role: Role, who: str) -> Policy:
-    spaces = role.observation_space, role.action_space
     env = role.spec.name
     if role.part is not None:
-        env += ", of which the skill has a part (sees, acts),"
-    goals, seen = goals_of(role.skill), policy.observation_space
-    sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
-    if goals is None:
-        return fitted(policy, *spaces, who, env)
-    if seen is not None and sees_goal:
-        if says := other_goals(goal_part(seen), goals.space):
-            raise PolicyError(f"{who}: its policy {says}")
-        return fitted(policy, *spaces, who, env)
-    if not isinstance(policy, Foreign):
-        raise PolicyError(
-            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
-            f"as {spaces[0]}"
-        )
-    if not isinstance(policy, MappedPolicy):
-        raise PolicyError(
-            f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
-            "goal), or a policy from elsewhere with Goal() at its place in sees"
-        )
-    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
-    return checked_fit(bound, *spaces, who, env)
+        env += PART
+        if skills_below(policy) is not None:
+            raise PolicyError(
+                f"{who}: its policy is a hierarchy, which sees and writes all of its environment: "
+                "leave out sees and acts"
+            )
+    spaces = role.observation_space, role.action_space
+    return fitted_to_skill(policy, role.skill, *spaces, who, env)
 
 
 def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide | None:

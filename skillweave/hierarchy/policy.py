@@ -18,7 +18,7 @@ from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.types import Array, Memory, Policy, Step, unprefixed
+from skillweave.types import Array, Memory, Policy, Step, prefixed, unprefixed
 
 
 @checked_names
@@ -173,10 +173,12 @@ class SkillAlone:
 
     def _fresh(self, n: int) -> Memory:
         """Return what is remembered beside the skill's own policy, where episodes start."""
-        goal = {} if self.goals is None else {"goal": self.goals.start(n)}
-        if self.part is None or self.part.rest is None or not self.part.holds:
-            return goal
-        return goal | {"last_action": self.part.rest.start(n)}
+        fresh = {} if self.goals is None else {"goal": self.goals.start(n)}
+        if self.part is not None and self.part.rest is not None and self.part.holds:
+            fresh["last_action"] = self.part.rest.start(n)
+        if self.part is not None and self.part.base is not None:
+            fresh |= prefixed("base", self.part.base.start(n))
+        return fresh
 
     def _divided(self, memory: Memory) -> tuple[Memory, Memory]:
         """Return the memory of the skill's own policy, and what is remembered beside it."""
@@ -191,6 +193,11 @@ class SkillAlone:
             assert self.part is not None
             assert self.part.rest is not None
             beside["last_action"] = self.part.rest.stored(step.action)
+        if self.part is not None:
+            step = self.part.own_step(step)
+            if self.part.base is not None:
+                after = self.part.base.observe(unprefixed("base", beside), step)
+                beside |= prefixed("base", after)
         if self.goals is not None:
             step = replace(step, goal=self.goals.read(memory["goal"]))
         return self.policy.observe(own, step) | beside
@@ -235,7 +242,12 @@ class SkillAlone:
             seen = self.goals.join(seen, self.goals.read(beside["goal"]))
         action, own = self.policy.act(own, seen, allowed, **how)
         if part is not None:
-            action = part.write(action, beside.get("last_action"))
+            corrected = None
+            if part.base is not None:
+                base = unprefixed("base", beside)
+                corrected, base = part.base.act(base, seen, None, deterministic=True, rng=rng)
+                beside |= prefixed("base", base)
+            action = part.write(action, beside.get("last_action"), corrected)
             part.check_mask(mask, action)
         memory = own | beside
         action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)

@@ -7,8 +7,9 @@ table, with choices as a run records them for example, is another table.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar, cast
 
@@ -27,6 +28,7 @@ from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.own_part import OwnPart, computed
+from skillweave.skills.residual import Residual
 from skillweave.training.role import Role
 from skillweave.training.stage import Together
 from skillweave.types import Policy
@@ -299,9 +301,8 @@ class Roles:
     @property
     def is_data(self) -> bool:
         """True if acting needs none of the user's Python code, so a saved run is complete."""
-        ready = any(
-            not is_trained(skill) and path not in self.levels for path, skill in self.skills.items()
-        )
+        leaves = [skill for path, skill in self.skills.items() if path not in self.levels]
+        ready = any(not is_trained(s) or isinstance(s.policy, Residual) for s in leaves)
         return not ready and all(x.is_data for x in self.levels.values()) and self.spec.is_data
 
     @property
@@ -309,6 +310,34 @@ class Roles:
         """True if training, too, needs none of the user's Python code."""
         code = any(skill.defines(m) for skill in self.skills.values() for m in skill.methods)
         return self.is_data and self.spec.engine == "auto" and not code
+
+    def with_bases(self, restored: Callable[[str, Policy], Policy]) -> Roles:
+        """Return the table with other ready policies in place of those that skills correct.
+
+        Args:
+            restored: the path of a skill and its policy to the other policy.
+        """
+
+        def change(level: Level) -> Level:
+            skills = dict(level.skills)
+            for path, skill in level.skills.items():
+                part = self[path].part if isinstance(skill.policy, Residual) else None
+                if part is not None and part.base is not None:
+                    skills[path] = copy.copy(skill)
+                    base = restored(path, part.base)
+                    skills[path].policy = replace(skill.policy, policy=base)
+            return replace(level, skills=skills)
+
+        return self.changed(change)
+
+    def bases(self) -> dict[str, Policy]:
+        """Return the ready policies that skills correct, by the paths of these."""
+        parts = {path: self[path].part for path in self.skills if path not in self.levels}
+        return {
+            path: part.base
+            for path, part in parts.items()
+            if part is not None and part.base is not None
+        }
 
     def changed(self, change: Callable[[Level], Level]) -> Roles:
         """Return the table with each level replaced by ``change`` of it."""

@@ -25,6 +25,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.skills.own_part import part_to_json, rest_to_json
+from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.joint import agents_of
@@ -115,9 +116,9 @@ def train(
         (stage,) = agent.stages()
         return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
     assert isinstance(declaration, Declaration)
-    roles = roles_of(declaration)
+    roles = _with_recorded_bases(roles_of(declaration), run)
     policies: Policies = _ready(roles, run)
-    for path, policy in policies.items():
+    for path, policy in {**policies, **roles.bases()}.items():
         copy_ready_policy(run, path, policy)
     budgets = budgets_of(roles)
     for level in roles.trained:
@@ -163,6 +164,7 @@ def _repaired(
 
 def load(roles: Roles, run: RunDirectory) -> Policy:
     """Return the policy of a finished run of a hierarchy."""
+    roles = _with_recorded_bases(roles, run)
     policies = _ready(roles, run) | _learnt(run)
     if run.lacks_comparison:
         raise RunError(
@@ -188,6 +190,11 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
         if entry.get("kept", {}).get("kept") != "before":
             policies |= run.load_policies(entry["name"])
     return policies
+
+
+def _with_recorded_bases(roles: Roles, run: RunDirectory) -> Roles:
+    """Return the roles with the policies that skills correct as they were when the run started."""
+    return roles.with_bases(lambda path, policy: policy_at_start(run, path, policy))
 
 
 def _ready(roles: Roles, run: RunDirectory) -> dict[str, Policy]:
@@ -228,6 +235,10 @@ def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
     entry |= part_to_json(skill.sees, skill.acts, f"skill {path!r}")
     if skill.acts is not None:
         entry["rest"] = rest_to_json(roles[path].rest)
+    if isinstance(skill.policy, Residual) and (part := roles[path].part) is not None:
+        assert part.base is not None
+        entry["residual"] = skill.policy.scale
+        entry["policy"] = source_of(part.base)
     if inner is not None:
         entry["hierarchy"] = _level_entry(roles, inner)
     return entry if policy is None else entry | {"policy": source_of(policy)}

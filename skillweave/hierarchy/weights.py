@@ -16,7 +16,7 @@ from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
-from skillweave.hierarchy.assembly import assembled, parts_of
+from skillweave.hierarchy.assembly import assembled, own_parts_of, parts_of
 from skillweave.hierarchy.fitting import ready_policies, ready_selectors
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Level, Roles
@@ -28,6 +28,7 @@ from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.own_part import part_to_json, rest_to_json
+from skillweave.skills.residual import Residual
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 
@@ -65,10 +66,11 @@ def write_weights(
             tensors |= {join(name, k): v for k, v in weights.items()}
             continue
         ready[name] = source_of(part)
-        if isinstance(part, Foreign) and (content := part.content()) is not None:
-            tensors[join(name, "content")] = torch.tensor(
-                np.frombuffer(content, np.uint8), device="cpu"
-            )
+        tensors |= _content_of(part, name)
+    own = own_parts_of(roles, policy)
+    for name, own_part in own.items():
+        if own_part.base is not None:
+            tensors |= _content_of(own_part.base, f"{name}.base")
     header = {
         "kind": "hierarchy",
         "recipe": recipe,
@@ -76,18 +78,19 @@ def write_weights(
         "skills": list(roles.skills),
         **levels.pop(""),
         "hierarchies": levels,
-        **_own_parts(roles),
+        **({"own_parts": {k: part.to_json() for k, part in own.items()}} if own else {}),
         "parts": trained,
         "ready": ready,
     }
     write_tensors(path, tensors, header)
 
 
-def _own_parts(roles: Roles) -> dict[str, Any]:
-    """Return the header entry of skills with a part of observations or actions, by path."""
-    parts = {path: roles[path].part for path in roles.skills}
-    content = {path: part.to_json() for path, part in parts.items() if part is not None}
-    return {"own_parts": content} if content else {}
+def _content_of(policy: Policy, name: str) -> dict[str, Tensor]:
+    """Return the content of a ready policy, under its name; {}: it has none."""
+    if not isinstance(policy, Foreign) or (content := policy.content()) is None:
+        return {}
+    numbers = np.frombuffer(content, np.uint8)
+    return {join(name, "content"): torch.tensor(numbers, device="cpu")}
 
 
 def _place(spec: EnvSpec) -> dict[str, Any]:
@@ -132,7 +135,8 @@ class HierarchyHeader(InnerHeader):
     skills: list[str]
     parts: dict[str, dict[str, Any]]
     own_parts: NotRequired[dict[str, dict[str, Any]]]
-    """``sees``, ``acts`` and ``rest`` of skills that have a part of their own, by path."""
+    """``sees``, ``acts`` and ``rest`` of skills that have a part of their own, by path; of those
+    that correct a ready policy its source, ``policy``, and ``residual``, the scale."""
     ready: dict[str, Source]
     """Sources of ready skills and selectors, by path."""
     hierarchies: dict[str, InnerHeader]
@@ -204,6 +208,14 @@ def read_weights(
     for name in roles.skills:
         check_same_part(roles, name, recorded_parts.get(name, {}), f"{path}: skill {name!r}")
     roles = roles.changed(lambda level: with_calls(level, levels[level.path]))
+    roles = roles.with_bases(
+        lambda name, base: as_recorded(
+            base,
+            recorded_parts[name].get("policy"),
+            partial(_content, tensors, f"{name}.base"),
+            f"{path}: skill {name!r}",
+        )
+    )
     policies = _ready_parts(roles, tensors, header, path)
     for level in roles.levels.values():
         where = f"{path}: {level.path}" if level.path else str(path)
@@ -228,15 +240,12 @@ def _ready_parts(
 ) -> dict[str, Policy]:
     """Return the ready policies and selectors as they were when the file was written, by path."""
 
-    def content(name: str) -> bytes | None:
-        copied = tensors.get(join(name, "content"))
-        return None if copied is None else copied.contiguous().numpy().tobytes()
-
     recorded = header["ready"]
     policies: dict[str, Policy] = {}
     for name, policy in ready_policies(roles).items():
         where = f"{path}: skill {name!r}"
-        policies[name] = as_recorded(policy, recorded.get(name), partial(content, name), where)
+        content = partial(_content, tensors, name)
+        policies[name] = as_recorded(policy, recorded.get(name), content, where)
     for name, policy in ready_selectors(roles).items():
         where = f"{path}: the {name}"
         policies[name] = as_recorded(policy, recorded.get(name), lambda: None, where)
@@ -253,13 +262,21 @@ def check_same_part(roles: Roles, path: str, recorded: Mapping[str, Any], who: s
     declared = part_to_json(skill.sees, skill.acts, f"skill {path!r}")
     if skill.acts is not None and "rest" in recorded:
         declared["rest"] = rest_to_json(rest)
-    for field in ("sees", "acts", "rest"):
+    if isinstance(skill.policy, Residual):
+        declared["residual"] = skill.policy.scale
+    for field in ("sees", "acts", "rest", "residual"):
         then, now = recorded.get(field), declared.get(field)
         if then != now:
             raise RunError(
                 f"{who} was trained with {field} {shown(then)}, but now it is {shown(now)}: "
                 "declare it as it was, or train again"
             )
+
+
+def _content(tensors: Mapping[str, Tensor], name: str) -> bytes | None:
+    """Return the content of a ready policy under a name; None: the file has none."""
+    copied = tensors.get(join(name, "content"))
+    return None if copied is None else copied.contiguous().numpy().tobytes()
 
 
 def with_calls(level: Level, entry: Mapping[str, Any]) -> Level:

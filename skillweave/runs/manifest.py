@@ -76,6 +76,8 @@ class SkillEntry(TypedDict):
     acts: NotRequired[Any]
     rest: NotRequired[Any]
     """The other numbers of the action."""
+    residual: NotRequired[Any]
+    """The scale of a correction of ``policy``, which is ready, where the skill learns one."""
     hierarchy: NotRequired[NestedEntry]
     """Its parts, if the skill is a hierarchy."""
 

@@ -4,12 +4,14 @@ from skillweave.skills.answers import checked
 from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
+from skillweave.skills.residual import Residual
 from skillweave.skills.sb3 import from_sb3
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 
 __all__ = [
     "Reflex",
+    "Residual",
     "Skill",
     "apply_reflexes",
     "asked",

@@ -22,6 +22,7 @@ from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
+from skillweave.skills.residual import Residual
 from skillweave.skills.spelling import misspelt
 from skillweave.types import Array, Step
 
@@ -71,7 +72,8 @@ class Skill:
         policy: acts without training: a function of observations (n, *obs_shape), which needs no
             ``staticmethod``, or a method ``policy(self, obs)``, with a goal ``policy(self, obs,
             goal)``; a torch module;
-            ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained. Where an
+            ``from_sb3(...)``, ``from_onnx(...)``; any ``Policy``. None: it is trained; so is a
+            ``Residual`` of such a policy, and one with ``learn=True``. Where an
             environment has an action mask, networks that return logits respect it; actions of
             others go to the environment unchanged.
         needs_info: keys of ``info`` that its methods read; None: found by calling them once. Needed
@@ -280,8 +282,8 @@ def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
 
 
 def is_trained(skill: Skill) -> bool:
-    """Return whether a skill is trained: it has no policy, or one that it learns on with."""
-    return skill.policy is None or isinstance(skill.policy, Learnable)
+    """Return whether a skill is trained: it has no policy, or one with which it learns."""
+    return skill.policy is None or isinstance(skill.policy, Learnable | Residual)
 
 
 def path_of(skill: Skill) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MethodType
 from typing import Any
 
@@ -20,6 +20,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError, SkillError
 from skillweave.messages import short
+from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import example_of, leaf_paths, outside, part_at, parts_of
 from skillweave.skills.mapping import (
     Acts,
@@ -31,7 +32,8 @@ from skillweave.skills.mapping import (
 )
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.plan import Input, Plan, places_in
-from skillweave.types import Array
+from skillweave.skills.residual import Correction
+from skillweave.types import Array, Policy, Step
 
 HOLD, ZERO = "hold", "zero"
 """Words for ``Hierarchy.rest``: the value of the last action, and zero."""
@@ -360,6 +362,18 @@ def _named(names: tuple[str, ...], space: Space[Any], who: str) -> _Written:
     return _Written(own, paths=tuple(inside))
 
 
+def _joined(space: Space[Any], paths: Any, action: Array) -> Array:
+    """Return the part of whole actions (n,) of a Dict that lies at ``paths``."""
+    from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
+
+    if paths == ((paths[0][0], ()),):
+        return part_at(action, paths[0][0])
+    own = np.zeros((len(action), *obs_shape(space)), obs_dtype(space))
+    for path, inside in paths:
+        part_at(own, inside)[...] = part_at(action, path)
+    return own
+
+
 # Both
 
 
@@ -403,6 +417,8 @@ class OwnPart:
         self.written: _Written | None = None
         """What it writes; None: all."""
         self._view: Callable[[Array], Array] | None = None
+        self.correction: Correction | None = None
+        """The ready policy to whose actions its own are added; None: there is none."""
         if sees is not None:
             self._fit_sees(sees, observation_space, action_space)
         self.rest: Rest | None = None
@@ -417,7 +433,12 @@ class OwnPart:
         """Return what was declared as JSON."""
         sees, acts, rest = self._declared
         content = part_to_json(sees, acts, self.who)
-        return content if self.rest is None else content | {"rest": rest_to_json(rest)}
+        if self.rest is not None:
+            content["rest"] = rest_to_json(rest)
+        if self.correction is not None:
+            content["residual"] = self.correction.scale
+            content["policy"] = source_of(self.correction.base)
+        return content
 
     @property
     def holds(self) -> bool:
@@ -451,6 +472,17 @@ class OwnPart:
             if isinstance(space, Box):
                 return space
         return Box(-np.inf, np.inf, given.shape or (1,), np.float32)
+
+    def corrected(self, correction: Correction) -> OwnPart:
+        """Return the part of a skill whose actions correct those of a ready policy."""
+        part = copy.copy(self)
+        part.correction, part.action_space = correction, correction.space
+        return part
+
+    @property
+    def base(self) -> Policy | None:
+        """The ready policy that it corrects; None: there is none."""
+        return None if self.correction is None else self.correction.base
 
     def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:
         """Return the part of larger observations, of which ``view`` returns the environment's."""
@@ -531,13 +563,37 @@ class OwnPart:
                 "at: give the hierarchy another rest, or let the skill own this place (acts)"
             )
 
-    def write(self, own: Array, last: Array | None) -> Array:
+    def own_step(self, step: Step) -> Step:
+        """Return a step as its policy sees it: its part of observations and of the action."""
+        obs, next_obs = self.see(step.obs), self.see(step.next_obs)
+        return replace(step, obs=obs, next_obs=next_obs, action=self._read(step.action))
+
+    def _read(self, action: Array) -> Array:
+        """Return its part of whole actions (n, …)."""
+        written = self.written
+        if written is None:
+            return action
+        space = written.space
+        if isinstance(self.whole_action_space, Discrete):
+            assert written.places is not None
+            chosen = (action - self.whole_action_space.start)[:, None] == written.places
+            return np.asarray(chosen.argmax(axis=1), space.dtype)  # 0 where a reflex chose another
+        if written.places is not None:
+            own = action.reshape(len(action), -1)[:, written.places]
+            return own.reshape(len(action), *(space.shape or ()))
+        return _joined(space, written.paths, action)
+
+    def write(self, own: Array, last: Array | None, base: Array | None = None) -> Array:
         """Return whole actions (n, …) of its own ones (n, …).
 
         Args:
             last: (n, K), the last actions as ``Rest.stored``; needed only where it ``holds``.
+            base: (n, …), the actions that it corrects, of the policy ``base``.
         """
         written = self.written
+        if self.correction is not None:
+            assert base is not None
+            own = self.correction.apply(base, own)
         if written is None:
             return own
         if isinstance(self.whole_action_space, Discrete):

@@ -1,4 +1,4 @@
-"""Values of the attribute ``policy`` of a skill, converted to policies."""
+"""Values of the attribute ``policy`` of a skill, converted to policies and fitted to spaces."""
 
 from __future__ import annotations
 
@@ -7,11 +7,18 @@ import sys
 from types import MethodType
 from typing import Any
 
-from skillweave.errors import DeclarationError
+from gymnasium import Space
+
+from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.skills.base import Skill, is_trained
-from skillweave.skills.goal_spaces import GOAL
+from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
+from skillweave.skills.goal_spaces import GOAL, goal_part, other_goals, with_goal, without_goal
+from skillweave.skills.goals import goals_of
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.outputs import required_arguments
+from skillweave.skills.own_part import OwnPart
+from skillweave.skills.residual import Correction, Residual, check_corrected
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -23,9 +30,20 @@ def ready_policy(skill: Skill) -> Policy | None:
     Raises:
         DeclarationError: the attribute ``policy`` cannot act.
     """
-    value: Any = skill.policy
-    if is_trained(skill):
-        return None
+    return None if is_trained(skill) else _as_policy(skill.policy, skill)
+
+
+def base_policy(skill: Skill) -> Policy | None:
+    """Return the ready policy that a skill learns to correct (``Residual``); None: it has none.
+
+    Raises:
+        DeclarationError: it cannot act.
+    """
+    residual = skill.policy
+    return _as_policy(residual.policy, skill) if isinstance(residual, Residual) else None
+
+
+def _as_policy(value: Any, skill: Skill) -> Policy:
     where = f"skill {skill.name!r}: policy is"
     if isinstance(value, type):
         raise DeclarationError(f"{where} the class {value.__name__}, not a policy")
@@ -46,6 +64,90 @@ def ready_policy(skill: Skill) -> Policy | None:
         f"{where} {short(value)}, which cannot act; give a function of observations, a torch "
         "module, from_sb3(...), from_onnx(...), or a policy"
     )
+
+
+PART = ", of which the skill has a part (sees, acts),"
+"""Follows the name of an environment in messages."""
+
+
+def fitted_to_skill(
+    policy: Policy,
+    skill: Skill | None,
+    observation_space: Space[Any],
+    action_space: Space[Any],
+    who: str,
+    env: str,
+) -> Policy:
+    """Return the ready policy of a skill, fitted to the skill's spaces.
+
+    Args:
+        skill: None: it is a selector's.
+        observation_space: with the goal, where the skill has goals.
+        action_space: of its actions.
+        who: begins messages.
+        env: the name of the environment.
+
+    Raises:
+        PolicyError: it does not fit.
+    """
+    from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
+
+    spaces = observation_space, action_space
+    goals, seen = goals_of(skill), policy.observation_space
+    sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
+    if goals is None:
+        return fitted(policy, *spaces, who, env)
+    if seen is not None and sees_goal:
+        if says := other_goals(goal_part(seen), goals.space):
+            raise PolicyError(f"{who}: its policy {says}")
+        return fitted(policy, *spaces, who, env)
+    if not isinstance(policy, Foreign):
+        raise PolicyError(
+            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
+            f"as {spaces[0]}"
+        )
+    if not isinstance(policy, MappedPolicy):
+        raise PolicyError(
+            f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
+            "goal), or a policy from elsewhere with Goal() at its place in sees"
+        )
+    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
+    return checked_fit(bound, *spaces, who, env)
+
+
+def has_part(skill: Skill) -> bool:
+    """Return whether a skill's learner or policy has a part of observations or actions alone."""
+    corrects = isinstance(skill.policy, Residual)
+    return skill.sees is not None or skill.acts is not None or corrects
+
+
+def own_part(
+    skill: Skill, rest: Any, spaces: tuple[Space[Any], Space[Any]], who: str, env: str
+) -> OwnPart:
+    """Return a skill's own part of observations and actions.
+
+    Args:
+        rest: of its hierarchy.
+        spaces: the environment's, of observations and actions.
+        who: begins messages.
+        env: the name of the environment.
+
+    Raises:
+        DeclarationError: the part does not fit the environment's spaces.
+        PolicyError: the ready policy that it corrects does not.
+    """
+    residual = skill.policy if isinstance(skill.policy, Residual) else None
+    part = OwnPart(skill.sees, skill.acts, rest, *spaces, who)
+    if residual is None:
+        return part
+    check_corrected(part.action_space, who)
+    seen, base = part.observation_space, base_policy(skill)
+    assert base is not None
+    if skill.goal_space is not None:
+        seen = with_goal(seen, skill.goal_space)
+    env += "" if skill.sees is None and skill.acts is None else PART
+    fit = fitted_to_skill(base, skill, seen, part.action_space, who, env)
+    return part.corrected(Correction(residual, fit, part.action_space, who))
 
 
 def _is_method(function: Any, skill: Skill) -> bool:

@@ -15,6 +15,7 @@ from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.ready import has_part, own_part
 
 
 @dataclass(frozen=True)
@@ -87,13 +88,12 @@ class Role:
 
         Raises:
             DeclarationError: it does not fit the environment's spaces.
+            PolicyError: the ready policy that it corrects does not.
         """
-        skill = self.skill
-        if skill is None or (skill.sees is None and skill.acts is None):
+        if self.skill is None or not has_part(self.skill):
             return None
-        spaces = self.spec.spaces
-        who = f"skill {self.path!r}"
-        return OwnPart(skill.sees, skill.acts, self.rest, spaces.observation, spaces.action, who)
+        spaces = self.spec.spaces.observation, self.spec.spaces.action
+        return own_part(self.skill, self.rest, spaces, f"skill {self.path!r}", self.spec.name)
 
 
 def agent_role(spec: EnvSpec) -> Role:

@@ -1,0 +1,131 @@
+"""A learnt correction on a ready policy, as the ``policy`` of a skill.
+
+Residual policy learning: Silver et al. 2018, arXiv:1812.06298; Johannink et al. 2019,
+arXiv:1812.03201.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import Space
+from gymnasium.spaces import Box
+
+from skillweave.arguments import checked_names
+from skillweave.errors import DeclarationError
+from skillweave.messages import short
+from skillweave.skills.learnable import Learnable
+from skillweave.types import Array, Policy
+
+TAKES = "a function of observations, from_sb3(...), from_onnx(...), or another ready policy"
+
+
+@checked_names
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """A ready policy with a learnt correction: ``clip(ready + scale * learnt)``.
+
+    A skill with this ``policy`` learns the correction, from about zero on, by its algorithm. The
+    ready policy does not change; it acts greedily, and keeps its recurrent state, chunks and rate.
+    The network sees what the skill sees, and not the ready policy's action.
+
+    ```python
+    import skillweave as sw
+
+
+    def swing(obs):  # a first guess by hand
+        return 2 * obs[:, 2:]
+
+
+    class Up(sw.Skill):
+        policy = sw.Residual(swing, scale=0.5)
+        algorithm = sw.SAC()
+
+
+    hierarchy = sw.Hierarchy("Pendulum-v1", [Up()], learn="apart")
+    ```
+
+    Source: residual policy learning (Silver et al. 2018; Johannink et al. 2019).
+
+    Raises:
+        DeclarationError: a setting is wrong; the message names it.
+    """
+
+    policy: Any
+    """The ready policy: a function of observations, ``from_sb3(...)``, ``from_onnx(...)``,
+    ``from_torch(...)``, ``load_policy(...)``, or any ``Policy``; its actions are of a Box."""
+    scale: Any = 0.2
+    """The largest correction, as a share of half of an action's range: 1 may undo any action. One
+    number, or one for each number of the action. Where an action has no bounds, it is in the
+    action's own unit."""
+
+    def __post_init__(self) -> None:
+        if self.policy is None or isinstance(self.policy, type | Residual):
+            raise DeclarationError(f"Residual.policy is {short(self.policy)}; it must be {TAKES}")
+        if isinstance(self.policy, Learnable):
+            raise DeclarationError(
+                f"Residual.policy is {self.policy.name} with learn=True, but a correction leaves "
+                "the policy as it is: leave out learn, or let the skill learn on with the policy "
+                "itself, without Residual"
+            )
+        scale = self.scale
+        try:
+            array = np.asarray(scale, np.float64)
+        except (TypeError, ValueError):
+            array = np.zeros(0)
+        right = array.ndim <= 1 and array.size and np.isfinite(array).all() and (array > 0).all()
+        if isinstance(scale, str | bool) or not right:
+            raise DeclarationError(
+                f"Residual.scale is {short(scale)}; it must be a number over 0, or one for each "
+                "number of the action"
+            )
+        object.__setattr__(self, "scale", array.tolist())
+
+    def __repr__(self) -> str:
+        return f"Residual({short(self.policy, 60)}, scale={self.scale})"
+
+
+class Correction:
+    """A correction of a ready policy's actions in a space.
+
+    Args:
+        residual: as declared.
+        base: its policy, fitted to the skill's spaces.
+        space: of the skill's actions.
+        who: begins messages.
+
+    Raises:
+        DeclarationError: actions are no real numbers, or ``scale`` does not fit them.
+    """
+
+    def __init__(self, residual: Residual, base: Policy, space: Space[Any], who: str) -> None:
+        check_corrected(space, who)
+        assert isinstance(space, Box)
+        self.base, self.scale, self._box = base, residual.scale, space
+        size = int(np.prod(space.shape))
+        if isinstance(self.scale, list) and len(self.scale) != size:
+            raise DeclarationError(
+                f"{who}: Residual.scale has {len(self.scale)} numbers, but the action has {size}"
+            )
+        bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        low, high = (np.where(bounded, x, 0.0).astype(np.float64) for x in (space.low, space.high))
+        half = np.where(bounded, 0.5 * (high - low), 1.0)
+        self._step: Array = half * np.broadcast_to(self.scale, size).reshape(space.shape)
+        self.space = Box(-1.0, 1.0, space.shape, np.float32)
+        """Of what is learnt."""
+
+    def apply(self, base: Array, learnt: Array) -> Array:
+        """Return the skill's actions (n, …) of the base policy's and what was learnt, (n, …)."""
+        both = np.clip(base + self._step * learnt, self._box.low, self._box.high)
+        return np.asarray(both, self._box.dtype)
+
+
+def check_corrected(space: Space[Any], who: str) -> None:
+    """Raise a DeclarationError where actions of a space cannot be corrected."""
+    if not isinstance(space, Box) or space.dtype is None or space.dtype.kind != "f":
+        raise DeclarationError(
+            f"{who}: Residual adds to actions, which needs a Box of real numbers, but actions are "
+            f"of {short(space)}: let the skill learn without it, policy = None"
+        )

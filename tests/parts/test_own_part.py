@@ -1,0 +1,231 @@
+"""The part of observations that a skill sees, and of actions that it writes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from crane import Crane
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+
+import skillweave as sw
+from skillweave.skills.own_part import OwnPart, Rest, part_from_json, part_to_json
+from skillweave.spaces import pack
+
+OBS = Crane.observation_space
+HIGH = np.array([1.0, 2.0, 3.0], np.float32)
+BOX = Box(-HIGH, HIGH)
+
+
+def part(sees: Any = None, acts: Any = None, rest: Any = "zero", space: Any = BOX) -> OwnPart:
+    return OwnPart(sees, acts, rest, OBS, space, "skill 'x'")
+
+
+def observations(n: int = 4) -> Any:
+    batch = gym.vector.utils.batch_space(OBS, n)
+    batch.seed(1)
+    return pack(OBS, batch.sample())
+
+
+@pytest.mark.parametrize(
+    ("sees", "space"),
+    [
+        ("arm", OBS["arm"]),
+        ("camera", OBS["camera"]),
+        (("hook", "arm"), Box(-np.inf, np.inf, (3,), np.float32)),
+        ("mode", Box(-np.inf, np.inf, (3,), np.float32)),
+        ((0, 1), Box(-np.inf, np.inf, (2,), np.float32)),
+        (slice(0, 2), Box(-np.inf, np.inf, (2,), np.float32)),
+        (sw.Part("arm", scale=0.5), Box(-np.inf, np.inf, (2,), np.float32)),
+        (
+            {"picture": "camera", "rest": ("hook", "mode")},
+            Dict(picture=OBS["camera"], rest=Box(-np.inf, np.inf, (4,), np.float32)),
+        ),
+    ],
+)
+def test_what_it_sees_is_in_its_space(sees, space):
+    own, obs = part(sees), observations()
+    assert own.observation_space == space
+    seen = own.see(obs)
+    again = own.see(obs.reshape(2, 2))
+    assert again.reshape(seen.shape).tobytes() == seen.tobytes()
+    for row in range(4):
+        one: Any = seen[row]
+        if isinstance(space, Dict):
+            one = {name: seen[name][row] for name in space}
+        assert space.contains(one)
+
+
+def test_parts_are_joined_in_their_order():
+    obs = observations()
+    seen = part(("hook", "arm", "mode", lambda o: 2 * o["hook"])).see(obs)
+    assert (seen[:, :1] == obs["hook"]).all()
+    assert (seen[:, 1:3] == obs["arm"]).all()
+    assert (seen[:, 3:6].argmax(1) == obs["mode"]).all()
+    assert (seen[:, 6:] == 2 * obs["hook"]).all()
+    scaled = part(sw.Part("arm", offset=1.0, scale=2.0)).see(obs)
+    assert np.allclose(scaled, 2 * (obs["arm"] - 1))
+
+
+@pytest.mark.parametrize("acts", [(2, 0), [2, 0], np.array([2, 0]), sw.Acts(to=(2, 0))])
+def test_its_numbers_of_a_box(acts):
+    own = part(acts=acts, rest=(0.0, 1.5, 0.0))
+    assert own.action_space == Box(BOX.low[[2, 0]], BOX.high[[2, 0]], dtype=np.float32)
+    action = own.write(np.array([[0.5, -0.5]], np.float32), None)
+    assert action.dtype == np.float32
+    assert action.tolist() == [[-0.5, 1.5, 0.5]]
+
+
+def test_its_numbers_of_a_matrix():
+    space = Box(-1, 1, (2, 2), np.float64)
+    own = part(acts=slice(1, 3), space=space, rest=0.25)
+    action = own.write(np.array([[0.5, -0.5]]), None)
+    assert action.tolist() == [[[0.25, 0.5], [-0.5, 0.25]]]
+    assert space.contains(action[0])
+
+
+def test_its_choices_of_several():
+    space = MultiDiscrete([3, 4, 2], start=[1, 0, 5])
+    own = part(acts=(2, 0), space=space, rest=(1, 3, 5))
+    assert own.action_space == MultiDiscrete([2, 3], start=[5, 1])
+    action = own.write(np.array([[6, 3]]), None)
+    assert action.tolist() == [[3, 3, 6]]
+    assert action.dtype == space.dtype
+    mask = np.ones((1, 9), bool)
+    mask[0, [1, 7]] = False  # the second choice of place 0, the first of place 2
+    assert own.mask(mask).tolist() == [[False, True, True, False, True]]
+
+
+def test_its_bits():
+    own = part(acts=(1,), space=MultiBinary(3), rest="hold")
+    assert own.action_space == MultiBinary(1)
+    last = own.rest.stored(np.array([[1, 1, 0]], np.int8))
+    assert own.write(np.array([[0]], np.int8), last).tolist() == [[1, 0, 0]]
+    mask = np.array([[1, 1, 0, 1, 1, 0]], bool)
+    assert own.mask(mask).tolist() == [[False, True]]
+
+
+def test_its_choices_of_one():
+    space = Discrete(5, start=10)
+    own = part(acts=(4, 1), space=space)
+    assert own.action_space == Discrete(2)
+    assert own.write(np.array([0, 1, 0]), None).tolist() == [14, 11, 14]
+    mask = np.array([[1, 1, 1, 1, 0], [0, 0, 0, 0, 0]], bool)
+    assert own.mask(mask).tolist() == [[False, True], [True, True]]  # all where none is left
+
+
+ROBOT = Dict(
+    arm=Dict(joints=Box(-1, 1, (2,), np.float32), brake=Discrete(2)),
+    hand=Box(0, 1, (1,), np.float32),
+)
+
+
+def test_its_names_of_a_dict():
+    own = part(acts="arm", space=ROBOT, rest={"hand": "hold"})
+    assert own.action_space == ROBOT["arm"]
+    last = pack(ROBOT, {"arm": {"joints": np.ones((1, 2)), "brake": [1]}, "hand": [[0.5]]})
+    mine = pack(ROBOT["arm"], {"joints": np.full((1, 2), 0.25), "brake": [0]})
+    action = own.write(mine, own.rest.stored(last))
+    assert action["arm"]["joints"].tolist() == [[0.25, 0.25]]
+    assert action["arm"]["brake"].tolist() == [0]
+    assert action["hand"].tolist() == [[0.5]]
+    two = part(acts=("arm.brake", "hand"), space=ROBOT)
+    assert two.action_space == Dict({"arm.brake": Discrete(2), "hand": ROBOT["hand"]})
+    alone = part(acts="arm.joints", space=ROBOT)
+    action = alone.write(np.full((1, 2), 0.5, np.float32), None)
+    assert action["arm"]["joints"].tolist() == [[0.5, 0.5]]
+    assert action["hand"].tolist() == [[0.0]]
+
+
+@pytest.mark.parametrize("space", [BOX, MultiDiscrete([3, 4, 2]), MultiBinary(3), ROBOT])
+def test_the_last_action_is_held_as_it_was(space):
+    rest = Rest("hold", space)
+    batch = gym.vector.utils.batch_space(space, 3)
+    batch.seed(0)
+    actions = pack(space, batch.sample())
+    assert rest.filled(3, rest.stored(actions)).tobytes() == actions.tobytes()
+    assert rest.start(0).shape == (0, rest.start(2).shape[1])
+
+
+def test_zero_is_the_nearest_to_zero():
+    low, high = np.array([1.0, -3.0], np.float32), np.array([2.0, -1.0], np.float32)
+    space = Box(low, high)
+    assert Rest("zero", space).filled(1, None).tolist() == [[1.0, -1.0]]
+    assert Rest("zero", MultiDiscrete([3], start=[4])).filled(1, None).tolist() == [[4]]
+
+
+def mine(**attributes: Any) -> sw.Skill:
+    return type("Mine", (sw.Skill,), attributes)()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"acts": 1.5}, r"skill 'mine'.*acts is 1.5; it must be the places"),
+        ({"acts": True}, r"acts is True; it must be the places"),
+        ({"acts": ()}, r"acts: Acts.to is \(\); it must be"),
+        ({"acts": (0, 0)}, "each place of an action can be written once"),
+        ({"acts": (-1,)}, "it must be a slice, or a list of places"),
+        ({"acts": ("arm", "arm")}, "acts names a part of the action twice"),
+        ({"acts": sw.Acts(to=(0,), scale=2.0)}, "acts has a scale.*give the places alone"),
+        ({"acts": sw.Acts(to=(0,), rest=0.0)}, r"acts has rest.*Hierarchy\(..., rest=...\)"),
+        ({"acts": sw.Acts()}, "it must be the places"),
+        ({"sees": 1.5}, r"sees is 1.5; it must be the key"),
+        ({"sees": ()}, "sees is empty"),
+        ({"sees": sw.Goal()}, r"sees has Goal\(\).*already: leave it out"),
+        ({"sees": ("arm", sw.LastAction())}, r"sees has LastAction\(\).*leave it out"),
+    ],
+)
+def test_what_a_skill_cannot_declare(attributes, says):
+    with pytest.raises(sw.DeclarationError, match=says):
+        mine(**attributes).validate()
+
+
+@pytest.mark.parametrize(
+    ("sees", "acts", "rest", "space", "says"),
+    [
+        (None, 3, "zero", BOX, "acts is .3,., a part of the action that does not exist.* 0 to 2"),
+        (None, slice(1, 9), "zero", BOX, "a part of the action that does not exist"),
+        (None, "arm", "zero", BOX, "acts names 'arm', a part of the action that does not exist"),
+        (None, 4, "zero", Discrete(4), "does not exist: .* has places 0 to 3"),
+        (None, "leg", "zero", ROBOT, "acts names 'leg'.*does not exist.*arm"),
+        (None, ("arm", "arm.brake"), "zero", ROBOT, "a part of the action twice"),
+        (None, 0, "zero", ROBOT, "the action has parts with names .'arm', 'hand'."),
+        (None, 0, 5.0, BOX, "rest is 5.0, which is out of"),
+        (None, 0, (0.0, 1.0), BOX, "rest is .* but the action has 3 numbers"),
+        (None, 0, (0.0, 1.0, "stop"), BOX, "rest is .* but the action has 3 numbers"),
+        (None, 0, 0.5, MultiDiscrete([2, 2]), "has whole numbers"),
+        (None, "arm", {"leg": 0.0}, ROBOT, "rest has 'leg', which the action does not have"),
+        (None, "arm", 0.0, ROBOT, "give a dict by its keys"),
+        (None, "arm", None, ROBOT, "rest is None; it must be 'zero', 'hold'"),
+        (None, 0, "keep", BOX, "rest is 'keep'; it must be"),
+        ("legs", None, "zero", BOX, "skill 'x': sees reads 'legs'.*its parts are"),
+        ((9,), None, "zero", BOX, "sees.places is .* but there are 6 numbers"),
+        (("arm", "camera"), None, "zero", BOX, "sees joins an image with other parts.*its own"),
+    ],
+)
+def test_what_does_not_fit_the_spaces(sees, acts, rest, space, says):
+    with pytest.raises(sw.DeclarationError, match=says):
+        part(sees, acts, rest, space)
+
+
+def test_tuples_of_actions_have_names():
+    space = Tuple((Box(-1, 1, (1,), np.float32), Discrete(2)))
+    assert part(acts="1", space=space).action_space == Discrete(2)
+
+
+@pytest.mark.parametrize(
+    ("sees", "acts"),
+    [
+        ("arm", (0, 2)),
+        (("arm", slice(0, 2)), slice(0, 2)),
+        ({"a": "arm", "b": sw.Part("hook", scale=2.0)}, "hand"),
+        (None, ("hand", "arm.brake")),
+    ],
+)
+def test_parts_as_json_are_the_same_parts(sees, acts):
+    content = part_to_json(sees, acts, "x")
+    found = part_from_json(content)
+    assert part_to_json(found.get("sees"), found.get("acts"), "x") == content

@@ -1,0 +1,275 @@
+"""Corrections that are learnt on ready policies: ``Residual``."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from crane import SMALL, Arm, Crane, Hook, crane
+from small_runs import assert_same, reports_every, stopped_run
+from torch import nn
+
+import skillweave as sw
+from skillweave.algorithms.policy import AgentPolicy
+
+often = reports_every(40)
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+GREEDY = sw.Selection(greedy_skills=True)
+SAC = sw.SAC(num_envs=4, batch_size=16, learning_starts=20, buffer_size=500, network=SMALL)
+
+
+def middle(obs: Any) -> Any:
+    """Return the push of arm and hook to the middle."""
+    return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
+
+
+class Better(sw.Skill):
+    """Does better than ``middle``."""
+
+    policy = sw.Residual(middle, scale=0.5)
+
+    def reward(self, step: sw.Step) -> Any:
+        return -np.abs(step.next_obs["arm"]).sum(axis=1)
+
+
+class Linear(nn.Module):
+    """A recurrent module: it adds up what it sees."""
+
+    def forward(self, x: Any, state: Any) -> Any:
+        after = 0.5 * state + x
+        return -after, after
+
+
+def counted(obs: Any) -> Any:
+    """Return another action in each step: it is held where ``every`` says so."""
+    return 0.1 * obs["camera"][:, 0, 0, :1].astype(np.float32) * np.ones((1, 3), np.float32)
+
+
+def declared(policy: Any, scale: Any = 0.5, **attributes: Any) -> sw.Skill:
+    return type("Better", (Better,), {"policy": sw.Residual(policy, scale)} | attributes)()
+
+
+def bases() -> dict[str, Any]:
+    recurrent = sw.from_torch(Linear(), sees={"": None} and ("arm", "hook"), state=(None, 3))
+    return {
+        "function": middle,
+        "scaled function": sw.from_function(middle, acts=sw.Acts(scale=0.5)),
+        "every third step": sw.from_function(counted, every=3),
+        "recurrent": recurrent,
+        "module": sw.from_torch(nn.Linear(3, 3), sees=("arm", "hook")),
+    }
+
+
+@pytest.mark.parametrize("name", bases())
+@pytest.mark.parametrize("how", ["together", "apart", "SAC"])
+def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
+    base = bases()[name]
+    settings = {"learn": "together"} if how == "together" else {"learn": "apart"}
+    settings |= {"algorithm": SAC} if how == "SAC" else {}
+
+    def hierarchy() -> sw.Hierarchy:
+        skills = [declared(copy.deepcopy(base)), type("Other", (sw.Skill,), {})()]
+        return crane(skills, train_defaults=OFTEN, **settings)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    returns = whole.evaluate(3).returns
+    assert hierarchy().load(whole.path).evaluate(3).returns == returns
+    file = whole.save_weights(tmp_path / "weights.safetensors")
+    assert hierarchy().load_weights(file).evaluate(3).returns == returns
+
+
+def episode(policy: Any, steps: int = 20, seed: int = 0) -> Any:
+    env, player = Crane(), sw.Player(policy)
+    obs, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        obs, *_ = env.step(player.act(obs))
+    return np.array(env.actions)
+
+
+@pytest.mark.parametrize("name", bases())
+def test_the_correction_is_added_to_the_ready_policy(name):
+    ready = bases()[name]
+    skill = declared(copy.deepcopy(ready), scale=(0.5, 0.25, 0.1))
+    run = crane([skill], steps=130, selection=GREEDY).train(quiet=True)
+    learnt = run.policy.skills.policies[0]
+    assert isinstance(learnt, AgentPolicy)
+    base = ready if hasattr(ready, "bind") else sw.from_function(ready)
+    base = base.bind(Crane.observation_space, Crane().action_space, "base")
+    env, player = Crane(), run.player()
+    obs, _ = env.reset(seed=0)
+    memory = base.start(1)
+    for step in range(12):
+        seen = player._seen(obs)
+        ready_action, memory = base.act(memory, seen)
+        more, _ = learnt.act({}, seen)
+        wanted = np.clip(ready_action + [0.5, 0.25, 0.1] * more, -1, 1)
+        action = player.act(obs)
+        assert np.allclose(action, wanted[0], atol=1e-6), step
+        obs, *_ = env.step(action)
+
+
+def test_training_starts_at_the_ready_policy():
+    skill = declared(middle, scale=0.2)
+    one = sw.PPO(num_envs=4, n_steps=16, batch_size=32, learning_rate=1e-12, network=SMALL)
+    run = crane([skill], steps=64, algorithm=one, selector=one, selection=GREEDY).train(quiet=True)
+    ready = sw.from_function(middle).bind(Crane.observation_space, Crane().action_space, "base")
+    assert np.abs(episode(run.policy) - episode(ready)).max() < 0.02
+
+
+def test_the_skill_alone_acts_as_in_the_hierarchy():
+    skill = declared(sw.from_function(counted, every=3))
+    run = crane([skill], selection=GREEDY).train(quiet=True)
+    alone = run._policy("better")
+    assert (episode(alone) == episode(run.policy)).all()
+    held = episode(alone)
+    assert len(held) == 20
+    assert run.evaluate(2, skill="better").skills["better"].calls == 2
+
+
+def test_a_call_after_another_skill_starts_the_ready_policy_afresh():
+    def turns(obs: Any) -> Any:
+        return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, "better", "still")
+
+    class Still(sw.Skill):
+        """Does nothing."""
+
+        def policy(self, obs):
+            return np.zeros((len(obs), 3), np.float32)
+
+    better = declared(sw.from_function(counted, every=3), scale=1e-9)
+    run = crane([better, Still()], selector=turns, selection=GREEDY).train(quiet=True)
+    actions = episode(run.policy, 12)[:, 0]
+    assert np.allclose(actions[:4], [0, 0, 0, 0.3], atol=1e-6)
+    assert np.allclose(actions[8:12], [0.8, 0.8, 0.8, 1.0], atol=1e-6)
+
+
+def test_the_ready_policy_of_a_run_is_kept(tmp_path):
+    class Module(nn.Linear):
+        pass
+
+    skill = declared(sw.from_torch(Module(3, 3), sees=("arm", "hook")))
+    run = crane([skill]).train(tmp_path / "run", quiet=True)
+    returns = run.evaluate(3).returns
+    other = declared(sw.from_torch(Module(3, 3), sees=("arm", "hook")))  # other weights
+    file = run.save_weights(tmp_path / "weights.safetensors")
+    assert crane([copy.copy(other)]).load(run.path).evaluate(3).returns == returns
+    assert crane([copy.copy(other)]).load_weights(file).evaluate(3).returns == returns
+
+
+@pytest.mark.parametrize(
+    ("policy", "says"),
+    [
+        (sw.Residual(middle, 0.25), "was trained with residual 0.5, but now it is 0.25"),
+        (None, "was trained with residual 0.5, but now it is None"),
+    ],
+)
+def test_another_correction_is_not_loaded(policy, says, tmp_path):
+    run = crane([declared(middle)]).train(tmp_path / "run", quiet=True)
+    with pytest.raises(sw.SkillweaveError, match=says):
+        crane([type("Better", (Better,), {"policy": policy})()]).load(run.path)
+
+
+def test_a_correction_of_a_part():
+    def hold(arm: Any) -> Any:
+        return -0.5 * arm
+
+    skill = type("Arm", (Arm,), {"policy": sw.Residual(hold, 0.2)})()
+    run = crane([skill, Hook()], selector=lambda obs: np.full(len(obs), "arm")).train(quiet=True)
+    actions = episode(run.policy)
+    assert (actions[:, 2] == 0).all()
+    env = Crane()
+    obs, _ = env.reset(seed=0)
+    assert np.abs(actions[0, :2] - np.clip(-0.5 * obs["arm"], -1, 1)).max() <= 0.2
+
+
+def test_a_hierarchy_is_corrected():
+    def turns(obs: Any) -> Any:
+        return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, "swing", "lift")
+
+    swing = type("Swing", (sw.Skill,), {"acts": (0, 1), "policy": staticmethod(two)})()
+    lift = type("Lift", (sw.Skill,), {"acts": 2, "policy": staticmethod(one)})()
+    ready = crane([swing, lift], selector=turns, rest="hold").train(quiet=True).policy
+    skill = declared(ready, scale=1e-6)
+    for learn in ("together", "apart"):
+        run = crane([skill], learn=learn).train(quiet=True)
+        actions = episode(run.policy)
+        assert np.allclose(actions, episode(ready), atol=1e-5)
+        assert np.allclose(actions[5], [0.25, 0.25, -0.5], atol=1e-5)
+
+
+def two(obs: Any) -> Any:
+    return np.full((len(obs), 2), 0.25, np.float32)
+
+
+def one(obs: Any) -> Any:
+    return np.full((len(obs), 1), -0.5, np.float32)
+
+
+def test_a_population_learns_corrections():
+    evolve = {"better": sw.Evolution(population=2, generations=2)}
+    run = crane([Better()], learn="apart", steps=1200).train(evolve=evolve, quiet=True)
+    assert run.evaluate(2).returns
+
+
+@pytest.mark.parametrize(
+    ("policy", "scale", "says"),
+    [
+        (None, 0.2, "Residual.policy is None; it must be a function of observations"),
+        (nn.Linear, 0.2, "Residual.policy is .*Linear"),
+        (middle, 0.0, "Residual.scale is 0.0; it must be a number over 0"),
+        (middle, float("nan"), "Residual.scale is nan"),
+        (middle, "big", "Residual.scale is 'big'"),
+        (middle, (0.1, -0.2), "Residual.scale is"),
+        (sw.Residual(middle), 0.2, "Residual.policy is Residual"),
+    ],
+)
+def test_what_is_no_correction(policy, scale, says):
+    with pytest.raises(sw.DeclarationError, match=says):
+        sw.Residual(policy, scale)
+
+
+def test_what_learns_on_is_not_corrected():
+    module = sw.from_torch(nn.Sequential(nn.Linear(3, 3)), learn=True)
+    with pytest.raises(sw.DeclarationError, match=r"with learn=True.*leave out learn"):
+        sw.Residual(module)
+
+
+@pytest.mark.parametrize(
+    ("skill", "env", "says"),
+    [
+        (declared(lambda obs: np.zeros(len(obs), int)), "one", "needs a Box.*Discrete"),
+        (declared(middle, (0.1, 0.2)), "box", "scale has 2 numbers, but the action has 3"),
+        (declared(5), "box", "skill 'better': policy is 5, which cannot act"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_training(skill, env, says):
+    world = sw.EnvSpec(lambda: Crane(env), engine="sync", workers=1)
+    with pytest.raises(sw.DeclarationError, match=says):
+        crane([skill], env=world).train(quiet=True)
+
+
+def test_a_ready_policy_of_another_shape_is_refused():
+    with pytest.raises(sw.PolicyError, match=r"skill 'better'.*\(2, 3\) was expected"):
+        crane([declared(lambda obs: obs["arm"])]).train(quiet=True)
+
+
+def test_an_action_without_bounds_is_corrected_in_its_own_unit():
+    class Free(Crane):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+    world = sw.EnvSpec(Free, engine="sync", workers=1)
+    skill = declared(middle, 0.5)
+    run = crane([skill], env=world, steps=130, selection=GREEDY).train(quiet=True)
+    env, player = Free(), run.player()
+    obs, _ = env.reset(seed=0)
+    seen = player._seen(obs)
+    more, _ = run.policy.skills.policies[0].act({}, seen)
+    assert np.allclose(player.act(obs), (middle(seen) + 0.5 * more)[0], atol=1e-6)

@@ -1,0 +1,391 @@
+"""Skills that own a part of observations and actions: trained, resumed, nested, called, logged."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from crane import ON, SMALL, Arm, Crane, Hook, crane
+from small_runs import assert_same, reports_every, stopped_run
+
+import skillweave as sw
+from skillweave.hierarchy.roles import roles_of
+from skillweave.runs.directory import RunDirectory
+
+often = reports_every(40)
+OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+RECURRENT = sw.PPO(
+    num_envs=4, n_steps=16, batch_size=32, network=sw.Network((8,), rnn=sw.RNN("gru", 6))
+)
+SAC = sw.SAC(**OFF, network=SMALL)
+DQN = sw.DQN(**OFF, train_freq=2, network=SMALL)
+
+
+def on(kind: str = "box", masked: bool = False) -> Any:
+    return sw.EnvSpec(functools.partial(Crane, kind, masked), engine="sync", workers=1)
+
+
+def actions_of(policy: Any, steps: int = 20) -> tuple[Any, list[str]]:
+    """Return the actions of an episode (steps, 3), and the skills that acted."""
+    env, player = Crane(), sw.Player(policy)
+    obs, _ = env.reset(seed=0)
+    acted = []
+    for _ in range(steps):
+        obs, *_ = env.step(player.act(obs))
+        acts = getattr(policy, "acts", None)
+        acted.append("" if acts is None else acts(player.memory))
+    return np.array(env.actions), acted
+
+
+def in_turn(obs: Any) -> Any:
+    """Call arm, then hook, and so on: the camera shows the time."""
+    return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, "arm", "hook")
+
+
+@pytest.mark.parametrize("learn", ["together", "apart"])
+def test_each_skill_learns_on_its_own_numbers(learn):
+    hierarchy = crane(learn=learn, selector=in_turn)
+    roles = roles_of(hierarchy)
+    assert roles["arm"].action_space.shape == (2,)
+    assert roles["arm"].observation_space == Crane.observation_space["arm"]
+    run = hierarchy.train(quiet=True)
+    arm, hook = run.policy.skills.policies
+    assert arm.algorithm.action_space.shape == (2,)
+    assert hook.algorithm.observation_space.shape == (4,)
+    actions, acted = actions_of(run.policy)
+    assert acted == (["arm"] * 4 + ["hook"] * 4) * 2 + ["arm"] * 4
+    is_arm = np.array(acted) == "arm"
+    assert (actions[is_arm, 2] == 0).all()
+    assert (actions[~is_arm, :2] == 0).all()
+    assert actions[is_arm, :2].any()
+    assert actions[~is_arm, 2].any()
+    alone = run.evaluate(2, skill="arm")
+    assert alone.skills["arm"].calls == 2
+
+
+def test_the_rest_is_held():
+    run = crane(selector=in_turn, rest=("hold", 0.25, "hold")).train(quiet=True)
+    actions, _ = actions_of(run.policy)
+    assert (actions[:4, 2] == 0).all()  # nothing was done before
+    assert (actions[4:8, 0] == actions[3, 0]).all()
+    assert (actions[4:8, 1] == 0.25).all()
+    assert (actions[8:12, 2] == actions[7, 2]).all()
+    assert actions[3, 0] != 0
+    assert actions[7, 2] != 0
+    again, _ = actions_of(run.policy)
+    assert (again == actions).all()  # nothing is left of the episode before
+
+
+@pytest.mark.parametrize("skill", ["arm", "hook"])
+def test_a_skill_alone_acts_as_in_the_hierarchy(skill):
+    run = crane(selector=in_turn, rest="hold").train(quiet=True)
+    player = run.player(skill=skill)
+    env = Crane()
+    obs, _ = env.reset(seed=0)
+    for _ in range(5):
+        obs, *_ = env.step(player.act(obs))
+    actions = np.array(env.actions)
+    assert (actions[:, 2 if skill == "arm" else 0] == 0).all()
+    assert actions.any()
+
+
+ALGORITHMS: dict[str, tuple[str, dict[str, Any]]] = {
+    "PPO, together": ("box", {"learn": "together"}),
+    "PPO, apart": ("box", {"learn": "apart"}),
+    "PPO, recurrent": ("box", {"algorithm": RECURRENT}),
+    "PPO, several": ("several", {}),
+    "PPO, bits": ("bits", {}),
+    "SAC": ("box", {"algorithm": SAC, "learn": "apart"}),
+    "TD3": ("box", {"algorithm": sw.TD3(**OFF, network=SMALL), "learn": "apart"}),
+    "DQN": ("one", {"algorithm": DQN, "learn": "apart"}),
+    "SAC, discrete": ("one", {"algorithm": SAC, "learn": "apart"}),
+}
+
+
+def skills_for(kind: str) -> Any:
+    if kind != "one":
+        return [Arm(), Hook()]
+    left, right = type("Left", (Arm,), {"acts": (0, 2)})(), type("Right", (Hook,), {"acts": 3})()
+    return [left, right, type("All", (sw.Skill,), {})()]
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
+    kind, how = ALGORITHMS[name]
+
+    def hierarchy() -> sw.Hierarchy:
+        rest = {} if kind == "one" else {"rest": "hold"}
+        defaults = {"env": on(kind), "train_defaults": OFTEN}
+        return crane(skills_for(kind), **(defaults | rest | how))
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    returns = whole.evaluate(3).returns
+    assert hierarchy().load(whole.path).evaluate(3).returns == returns
+    file = whole.save_weights(tmp_path / "weights.safetensors")
+    assert hierarchy().load_weights(file).evaluate(3).returns == returns
+
+
+def test_a_run_without_its_code_has_the_parts(tmp_path):
+    class Arm(sw.Skill):
+        sees, acts = "arm", (0, 1)
+
+    class Hook(sw.Skill):
+        sees, acts = {"a": "hook", "b": "camera"}, slice(2, 3)
+
+    gym.register("Crane-v0", Crane)
+    try:
+        hierarchy = crane([Arm(), Hook()], env="Crane-v0", rest="hold")
+        run = hierarchy.train(tmp_path / "run", quiet=True)
+        loaded = sw.Hierarchy.from_manifest(RunDirectory.open(tmp_path / "run").manifest)
+        assert loaded.rest == "hold"
+        again = loaded.load(tmp_path / "run")
+        assert again.evaluate(3).returns == run.evaluate(3).returns
+    finally:
+        gym.registry.pop("Crane-v0")
+
+
+@pytest.mark.parametrize(
+    ("skills", "rest", "says"),
+    [
+        ([type("Arm", (Arm,), {"acts": (0, 2)})(), Hook()], "hold", "skill 'arm'.*with acts"),
+        ([type("Arm", (Arm,), {"sees": "hook"})(), Hook()], "hold", "skill 'arm'.*with sees"),
+        ([Arm(), Hook()], "zero", "skill 'arm'.*with rest 'hold', but now it is 'zero'"),
+    ],
+)
+def test_other_parts_are_not_loaded(skills, rest, says, tmp_path):
+    run = crane(rest="hold").train(tmp_path / "run", quiet=True)
+    other = crane(skills, rest=rest)
+    with pytest.raises(sw.RunError, match=says):
+        other.load(run.path)
+    file = run.save_weights(tmp_path / "weights.safetensors")
+    with pytest.raises(sw.RunError, match=says):
+        other.load_weights(file)
+
+
+def test_several_skills_own_the_same_part():
+    other = type("Other", (Arm,), {})()
+    run = crane([Arm(), other, Hook()]).train(quiet=True)
+    assert run.evaluate(2).returns
+
+
+def test_the_last_action_passes_into_a_hierarchy_below():
+    class Lower(sw.Skill):
+        """Lowers the hook."""
+
+        acts = 2
+
+        def policy(self, obs):
+            return np.full((len(obs), 1), -0.5, np.float32)
+
+    class Swing(sw.Skill):
+        """Swings the arm."""
+
+        acts = (0, 1)
+
+        def policy(self, obs):
+            return np.full((len(obs), 2), 0.25, np.float32)
+
+    inner = crane([Lower()], selector=lambda obs: np.full(len(obs), "lower"), rest="hold")
+    inner.name = "inner"
+    turns = functools.partial(named_turns, names=("swing", "inner"))
+    run = crane([Swing(), inner], selector=turns, rest="hold").train(quiet=True)
+    actions, acted = actions_of(run.policy)
+    assert acted[4] == "inner/lower"
+    assert (actions[:4] == [0.25, 0.25, 0.0]).all()
+    assert (actions[4:8] == [0.25, 0.25, -0.5]).all()
+    assert (actions[8:12] == [0.25, 0.25, -0.5]).all()
+
+
+def named_turns(obs: Any, names: tuple[str, str]) -> Any:
+    return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, *names)
+
+
+@pytest.mark.parametrize("learn", ["together", "apart"])
+def test_a_nested_hierarchy_learns(learn, tmp_path):
+    def hierarchy() -> sw.Hierarchy:
+        inner = crane([Arm(), Hook()], rest="hold", learn=learn, name="inner")
+        all_of_it = type("Whole", (sw.Skill,), {})()
+        return crane([inner, all_of_it], learn=learn, train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+
+
+def test_a_hierarchy_has_no_part_of_its_own():
+    inner = crane([Arm(), Hook()], name="inner")
+    part = type("Part", (sw.Skill,), {"policy": inner, "acts": (0, 1)})()
+    with pytest.raises(sw.DeclarationError, match="a hierarchy, so it has no acts of its own"):
+        crane([part])
+
+
+def test_a_rest_that_means_nothing_is_refused():
+    every = type("Every", (sw.Skill,), {})()
+    with pytest.raises(sw.DeclarationError, match="rest is 'hold', but no skill writes a part"):
+        crane([every], rest="hold")
+    with pytest.raises(sw.DeclarationError, match="rest is 'keep'; it must be"):
+        crane(rest="keep")
+
+
+def test_what_does_not_exist_is_refused_before_training():
+    wrong = type("Arm", (Arm,), {"acts": (0, 3)})()
+    with pytest.raises(sw.DeclarationError, match=r"skill 'arm': acts.*does not exist"):
+        crane([wrong, Hook()]).train(quiet=True)
+
+
+def test_ready_skills_have_parts(tmp_path):
+    class Push(sw.Skill):
+        """Pushes the arm back to the middle."""
+
+        sees, acts = "arm", (0, 1)
+
+        def policy(self, obs):
+            assert obs.shape[1:] == (2,)
+            return -0.5 * obs
+
+    class Lift(sw.Skill):
+        """A policy from elsewhere, with a mapping of its own of the part."""
+
+        sees, acts = ("hook", "arm"), 2
+        policy = sw.from_function(
+            lambda x: x, sees=sw.Part(places=(0,)), acts=sw.Acts(scale=0.25, offset=0.5)
+        )
+
+    run = crane([Push(), Lift(), Arm()], selector=ON).train(tmp_path / "run", quiet=True)
+    env = Crane()
+    for skill, numbers in (("push", slice(0, 2)), ("lift", slice(2, 3))):
+        player = run.player(skill=skill)
+        obs, _ = env.reset(seed=2)
+        action = player.act(obs)
+        wanted = -0.5 * obs["arm"] if skill == "push" else 0.25 * obs["hook"] + 0.5
+        assert np.allclose(action[numbers], np.clip(wanted, -1, 1))
+        assert np.count_nonzero(action) == np.count_nonzero(wanted)
+
+
+def test_a_ready_policy_of_another_shape_is_refused():
+    wrong = type("Arm", (Arm,), {"policy": staticmethod(lambda obs: np.zeros((len(obs), 3)))})()
+    with pytest.raises(sw.PolicyError, match=r"skill 'arm'.*\(2, 2\) was expected"):
+        crane([wrong]).train(quiet=True)
+
+
+class Sideways(sw.Skill):
+    """A skill with goals and a part."""
+
+    sees, acts = "arm", (0, 1)
+    goal_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    max_steps = 8
+
+    def reward(self, step):
+        return -np.abs(step.next_obs["arm"] - step.goal).sum(axis=1)
+
+
+@pytest.mark.parametrize("learn", ["together", "apart"])
+def test_a_skill_has_goals_and_a_part(learn, tmp_path):
+    def hierarchy() -> sw.Hierarchy:
+        return crane([Sideways(), Hook()], learn=learn, rest="hold", train_defaults=OFTEN)
+
+    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    space = whole.policy.skills.policies[0].observation_space
+    assert space["observation"] == Crane.observation_space["arm"]
+    stopped_run(hierarchy(), tmp_path / "cut", 3)
+    hierarchy().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    assert whole.evaluate(2, skill="sideways").returns
+
+
+def test_calls_come_first_and_the_rest_is_held_on(tmp_path):
+    class Late(Arm):
+        """Starts after calls of others."""
+
+        def initiation(self, obs):
+            return obs["camera"][:, 0, 0, 0] >= 4
+
+    class Down(Hook):
+        """Lowers the hook."""
+
+        def policy(self, obs):
+            return np.full((len(obs), 1), -0.5, np.float32)
+
+    late = type("Spy", (Late,), {"name": "late"})()
+    seen = []
+    late.reward = lambda step: seen.append(step.action.copy()) or -np.abs(step.action).sum(axis=1)
+    hierarchy = crane(
+        [Down(), late],
+        selector=lambda obs: np.full(len(obs), "down"),
+        learn="apart",
+        rest="hold",
+        apart=sw.Apart(start_calls=1, skill_steps=300),
+    )
+    hierarchy.train(tmp_path / "run", quiet=True)
+    held = np.concatenate(seen)[:, 2]
+    assert set(np.unique(held)) <= {-0.5, *np.unique(held[np.abs(held) != 0.5])}
+    assert (held == -0.5).mean() > 0.5
+
+
+def test_masks_are_cut_to_the_part():
+    run = crane([Arm(), type("Free", (sw.Skill,), {})()], env=on("several", True)).train(quiet=True)
+    env = Crane("several", True)
+    player = run.player(skill="free")
+    obs, info = env.reset(seed=0)
+    for _ in range(10):
+        action = player.act(obs, info=info)
+        assert info["action_mask"][action[0]]
+        obs, *_, info = env.step(action)
+
+
+def test_a_mask_that_forbids_the_rest_is_an_error():
+    with pytest.raises(sw.SkillError, match=r"skill 'hook'.*forbids the value 0 at place 0.*rest"):
+        crane([Hook()], env=on("several", True)).train(quiet=True)
+    # Zero of place 0 is forbidden in some steps, one in others, two never.
+    run = crane([Hook()], env=on("several", True), rest=(2, 0, 0)).train(quiet=True)
+    assert run.evaluate(1).returns
+
+
+def test_a_mask_that_leaves_no_choice_is_an_error():
+    low = type("Low", (Arm,), {"acts": (0,)})()
+    free = type("Free", (sw.Skill,), {})()
+    with pytest.raises(sw.SkillError, match=r"skill 'low'.*allows none of the choices"):
+        crane([low, free], env=on("one", True)).train(quiet=True)
+
+
+def test_a_population_learns_parts(tmp_path):
+    how = {"learn": "apart", "rest": "hold", "steps": 1200}
+    evolve = {"arm": sw.Evolution(population=2, generations=2)}
+    run = crane(**how).train(tmp_path / "run", evolve=evolve, quiet=True)
+    assert run.policy.skills.policies[0].action_space.shape == (2,)
+
+
+def test_options_env_calls_skills_with_parts():
+    run = crane(selector=in_turn, rest="hold").train(quiet=True)
+    env = sw.make_options_env(run, 2, 0.99)
+    env.reset(seed=0)
+    before = env.engine.steps_made
+    *_, info = env.step(np.array([0, 1]))
+    assert info["steps"].tolist() == [4, 4]
+    assert env.engine.steps_made == before + 8
+    env.close()
+
+
+def test_calls_are_logged(tmp_path):
+    run = crane(selector=in_turn, rest="hold").train(tmp_path / "run", quiet=True)
+    log = run.log_calls(200)
+    assert log.action.shape[1:] == (3,)
+    log.check_skills(run.policy.skills)
+    other = crane(selector=in_turn).train(quiet=True)
+    with pytest.raises(sw.RunError, match="has changed since the log was recorded"):
+        log.check_skills(other.policy.skills)
+
+
+def test_rows_of_a_part_cannot_be_judged_again():
+    from skillweave.collecting.judge import judged_by
+
+    with pytest.raises(sw.DeclarationError, match=r"skill 'arm'.*leave out sees"):
+        judged_by(Arm(), on())
