@@ -20,6 +20,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError, SkillweaveError
 from skillweave.export.network import ExportedNetwork, FileName, NetworkEntry, leaf_inputs
+from skillweave.export.parts import PartEntry, part_of, with_base
 from skillweave.export.write import FORMAT, MANIFEST
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
@@ -35,6 +36,7 @@ from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, checked_goal
 from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.own_part import OwnPart
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import space_from_json
 from skillweave.types import Policy
@@ -195,6 +197,8 @@ class _Reading:
                 + "; ".join(f"{k!r}: {what}" for k, what in missing.items())
             )
         self.spaces = self._space("observation_space"), self._space("action_space")
+        self.parts: dict[str, OwnPart] = {}
+        """The own parts of skills, by the paths of their policies in the file."""
 
     def policy(self, goal: Any) -> Policy:
         """Return the whole policy, a single one with this ``goal``."""
@@ -247,11 +251,13 @@ class _Reading:
                 return self._network(entry, path, self.spaces[1])
             case "Model":
                 return self._model(entry, path, goals)
+            case "Part":
+                return self._part(entry, path)
             case "Hierarchy":
                 return self._hierarchy(entry, path, goals)
         raise RunError(
             f"{self.file}: {path}.kind is {short(entry.get('kind'))}; it must be one of Code, "
-            "Network, Model, Hierarchy"
+            "Network, Model, Part, Hierarchy"
         )
 
     def _fit(self, kind: Any, entry: Any, path: str) -> Any:
@@ -315,6 +321,23 @@ class _Reading:
                 )
         return bound
 
+    def _part(self, entry: dict[str, Any], path: str) -> Policy:
+        """Return the policy of a skill with a part of its own, which is kept by its path."""
+        fitted: PartEntry = self._fit(PartEntry, entry, path)
+        spaces = self.spaces
+        try:
+            part = part_of(fitted, spaces, f"{self.file}: {path}", self.code)
+            if fitted["base"] is not None:
+                self.spaces = part.observation_space, part.action_space
+                base = self._policy(fitted["base"], f"{path}.base")
+                part = with_base(part, base, fitted.get("residual"))
+        except DeclarationError as error:
+            raise RunError(str(error)) from error
+        self.spaces = part.observation_space, part.action_space
+        policy = self._policy(fitted["policy"], f"{path}.policy")
+        self.spaces, self.parts[path] = spaces, part
+        return policy
+
     def _network(
         self, entry: dict[str, Any], path: str, action_space: gym.Space[Any]
     ) -> ExportedNetwork:
@@ -370,6 +393,7 @@ class _Reading:
             self.spaces = seen
             interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
+        kept = tuple(self.parts.get(f"{path}.skills[{i}].policy") for i in range(len(skills)))
         skill_set = SkillSet(
             tuple(skills),
             tuple(policies),
@@ -378,6 +402,7 @@ class _Reading:
             greedy=not any(sampled),
             interruption=interruption,
             greedy_selector=not _samples(fitted["selector"]),
+            parts=kept if any(kept) else (),
         )
         guide = None
         if fitted["guide"] is not None:
@@ -477,6 +502,8 @@ def _method(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _samples(entry: dict[str, Any]) -> bool:
     """Return whether an entry, or one below it, draws its actions."""
+    if entry.get("kind") == "Part":
+        return _samples(entry["policy"])
     skills = entry["skills"] if entry.get("kind") == "Hierarchy" else ()
     below = any(_samples(skill["policy"]) for skill in skills)
     return bool(entry.get("noise")) or entry.get("sampled") is True or below

@@ -96,7 +96,7 @@ class Runner:
 
     def made(self, entry: Any) -> Any:
         """Return the part of the policy that an entry of ``policy.json`` describes."""
-        kinds = (_Code, _Network, _Model, _Hierarchy, _Function, _Automaton, _Plan)
+        kinds = (_Code, _Network, _Model, _Part, _Hierarchy, _Function, _Automaton, _Plan)
         return next(k for k in kinds if k.__name__[1:] == entry["kind"])(self, entry)
 
     def asks(self, name: str, about: Any) -> bool:
@@ -344,6 +344,63 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
         return (
             np.reshape([part.argmax() for part in parts], np.shape(space["start"])) + space["start"]
         )
+
+
+class _Part(_Model):  # a policy that sees and writes a part, perhaps as a correction of another
+    def __init__(self, runner: Runner, entry: Any) -> None:
+        self.runner, self.entry = runner, entry
+        self.policy = runner.made(entry["policy"])
+        self.base = entry["base"] and runner.made(entry["base"])
+
+    def reset(self) -> None:
+        self.policy.reset()
+        if self.base:
+            self.base.reset()
+
+    def act(self, mask: Any, last: Any = None) -> Any:
+        entry, runner = self.entry, self.runner
+        columns = entry["columns"]
+        allowed = None if mask is None or columns is None else mask[:, columns]
+        if allowed is not None and not allowed.any():
+            raise ValueError("the mask allows none of the choices that the skill owns")
+        before = runner.obs, runner.feeds, runner.space
+        if entry["sees"] is not None:
+            runner.obs, runner.feeds = self.own_view()
+        try:
+            runner.space = entry["action_space"]
+            own = self.policy.act(mask if columns is None else allowed)
+            if self.base:
+                runner.space = entry["part_space"]
+                step = np.reshape(entry["step"], np.shape(own))
+                own = runner.action(self.base.act(None) + step * np.asarray(own, "f8"))
+        finally:
+            runner.obs, runner.feeds, runner.space = before
+        return self.whole(own)
+
+    def own_view(self) -> Any:
+        """Return the part of the observation as one array (1, ...), and as inputs of files."""
+        obs = np.zeros((1, *self.entry["shape"]), np.dtype(self.entry["dtype"]))
+        seen = {name: self.seen(name, parts) for name, parts in self.entry["sees"].items()}
+        if "" in seen:
+            obs[...] = seen[""]
+            return obs, {"obs": obs}
+        for name, value in seen.items():
+            obs[name] = value
+        return obs, {f"obs.{name}": obs[name] for name in seen}
+
+    def whole(self, own: Any) -> Any:
+        """Return the environment's action for the skill's own one."""
+        entry, space = self.entry, self.runner.space
+        if entry["to"] is None:
+            return self.runner.action(own)
+        if entry["fixed"] is None:
+            return self.runner.action(np.array(entry["to"])[own] + space["start"])
+        full = np.array(entry["fixed"], "f8")
+        if latest := self.runner.before:
+            held = np.array(entry["held"], bool)
+            full[held] = np.ravel(latest["action"][0])[held]
+        full[entry["to"]] = np.ravel(own)
+        return self.runner.action(full)
 
 
 def scaled(x: Any, by: Any) -> Any:

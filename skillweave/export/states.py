@@ -17,6 +17,7 @@ from skillweave.errors import PolicyError
 from skillweave.export.foreign import mapping_entry, model_of
 from skillweave.export.graphs import Graph, agent_graph, dtype_to_json, inputs_of, worth_graph
 from skillweave.export.network import ExportedNetwork
+from skillweave.export.parts import part_entry
 from skillweave.export.plans import plan_entry
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning.planner import Planner
@@ -134,7 +135,7 @@ class States:
 
         return {
             "name": skill.name,
-            "policy": self.policy(skills.policies[i], name, sampled=not skills.greedy),
+            "policy": self._own(skills, i, name),
             "limit": skills.limit(i),
             "max_steps": skill.max_steps,
             "initiation": method("initiation", "observations (1, ...) to (1,) bool"),
@@ -162,6 +163,32 @@ class States:
             "clip": method("clip_goal", "observations and goals (1, ...) to goals (1, ...)"),
             "joined": not beside,
         }
+
+    def _own(self, skills: SkillSet, i: int, name: str) -> dict[str, Any]:
+        """Return the entry of a skill's policy, with its own part of observations and actions."""
+        entry = self.policy(skills.policies[i], name, sampled=not skills.greedy)
+        if (part := skills.part(i)) is None:
+            return entry
+        base = None
+        if part.base is not None:
+            if isinstance(part.base, HierarchyPolicy):
+                raise PolicyError(
+                    f"skill {name!r} corrects a hierarchy (Residual), which no runner follows: "
+                    "correct one of its skills instead"
+                )
+            base = self.policy(part.base, f"{name}.base")
+        if skills.skills[i].goal_space is not None:
+            raise PolicyError(
+                f"skill {name!r} has goals and a part of its own (sees, acts, Residual), which no "
+                "runner follows yet: leave out one of them"
+            )
+
+        def name_of(function: Any) -> str:
+            plain = written_name(function).rpartition(":")[2]
+            what = "observations (1, ...) to numbers (1, ...)"
+            return self._asks(f"{name}.{plain}", function, what)
+
+        return part_entry(part, entry, base, name_of)
 
     def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
         name = f"{prefix}{reflex.name}"

@@ -199,6 +199,11 @@ class Rest:
         self._first = np.array(example_of(space))[None]
         self._bytes = self._one.nbytes
 
+    @property
+    def held(self) -> Array:
+        """The numbers that keep the value of the last action, (*shape) bool; not of a Dict."""
+        return self._leaves[0].held
+
     def start(self, n: int) -> Array:
         """Return what is stored before the first action of n episodes: zeros."""
         return self.stored(self._first.repeat(n, axis=0))
@@ -562,6 +567,11 @@ class OwnPart:
                 f"{int(choice[row, place])} at place {place} of the action, which rest leaves it "
                 "at: give the hierarchy another rest, or let the skill own this place (acts)"
             )
+
+    @property
+    def is_within(self) -> bool:
+        """Return whether it is a part of larger observations than the environment's."""
+        return self._view is not None
 
     def own_step(self, step: Step) -> Step:
         """Return a step as its policy sees it: its part of observations and of the action."""

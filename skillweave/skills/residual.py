@@ -112,13 +112,14 @@ class Correction:
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
         low, high = (np.where(bounded, x, 0.0).astype(np.float64) for x in (space.low, space.high))
         half = np.where(bounded, 0.5 * (high - low), 1.0)
-        self._step: Array = half * np.broadcast_to(self.scale, size).reshape(space.shape)
+        self.step: Array = half * np.broadcast_to(self.scale, size).reshape(space.shape)
+        """The largest correction of each number."""
         self.space = Box(-1.0, 1.0, space.shape, np.float32)
         """Of what is learnt."""
 
     def apply(self, base: Array, learnt: Array) -> Array:
         """Return the skill's actions (n, …) of the base policy's and what was learnt, (n, …)."""
-        both = np.clip(base + self._step * learnt, self._box.low, self._box.high)
+        both = np.clip(base + self.step * learnt, self._box.low, self._box.high)
         return np.asarray(both, self._box.dtype)
 
 
