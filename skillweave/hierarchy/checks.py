@@ -15,7 +15,7 @@ from skillweave.messages import close_matches, short
 from skillweave.paths import name_of
 from skillweave.selectors import Automaton
 from skillweave.settings import fitted
-from skillweave.skills import Reflex, Skill, is_trained, ready_policy
+from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import Target, target_of
 
