@@ -91,8 +91,12 @@ class PolicyActor:
 
     def __init__(self, policy: Policy, blamed: str) -> None:
         self._policy, self._blamed = policy, blamed
-        self.action_space: gym.Space[Any] = policy.action_space
         self.watches = getattr(type(policy), "observe", None) is not Memoryless.observe
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The space of the policy's actions; a selector may have none."""
+        return self._policy.action_space
 
     def start(self, n: int) -> Memory:
         """Return the policy's fresh memory."""
