@@ -341,7 +341,9 @@ class CallGraph:
         value = np.zeros((len(self.end), count), np.float32)
         trust = trust_in(near.distance, caution)
         options = np.flatnonzero(self.known | (novel is not None)).tolist()
-        may = may[:, self.choice_of]
+        allowed = may[:, self.choice_of]
+        if novel is None:
+            allowed &= np.isfinite(near.distance)
         for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
             worth = self._worth(judged, value)
             best = np.full_like(value, -np.inf)
@@ -352,7 +354,7 @@ class CallGraph:
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
                     q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(bonus), q)
-                np.maximum(best, q, out=best, where=may[:, c, None])
+                np.maximum(best, q, out=best, where=allowed[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
             change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)
             value = best
@@ -507,7 +509,7 @@ class ByGoal(Options):
         return pieces, _without_far(far, self._usual[k]), goal
 
     def _near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
-        """Return what ``near`` does, with those that are too far to count."""
+        """Return the nearest pieces as ``near`` does, however far they are."""
         shape = (len(to), CANDIDATES, k)
         pieces, far = np.zeros(shape, np.int64), np.full(shape, np.inf, np.float32)
         goal = np.full(shape[:2], -1)

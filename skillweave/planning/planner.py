@@ -251,7 +251,7 @@ class Planner(ReadySelector):
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
         q = np.where(q > 0, q * trust_in(near.distance, self.caution), q)
-        return np.where(self.graph.known, q, -np.inf).astype(np.float32)
+        return np.where(np.isfinite(near.distance), q, -np.inf).astype(np.float32)
 
     def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Draw logged observations, and states of the task that is not over in them.

@@ -92,6 +92,22 @@ def test_calls_count_for_one_another_by_start_and_goal() -> None:
     assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbour differs
 
 
+def test_fewer_calls_than_options() -> None:
+    """Options without a call are worth nothing, and are never chosen."""
+    log = log_of(["go"], [(p, [(0, [p + 1], True, "end")]) for p in range(5)])
+    log.goals["go"] = np.arange(1.0, 6.0)[:, None]
+    planner = bound(Planner(log, at(1), neighbours=2, caution=0.0), LINE)
+    obs = np.float32([[4], [0]])
+    assert (
+        np.isfinite(planner._values(planner.graph.near(obs), obs, planner.machine.start(2))).sum()
+        == 10
+    )
+    q = planner.values(obs)[:, 0]
+    assert q[1] > q[0]
+    choice, _ = planner.act(planner.start(2), obs)
+    assert choice["goal"]["go"][1, 0] == 1
+
+
 def test_a_goal_that_failed_is_not_repeated_forever() -> None:
     """The log says that goals above lead to 3; now there is a wall."""
     log = jumps((0, 10), np.repeat(np.arange(11), 3))
