@@ -9,6 +9,7 @@ result was kept. ``--run`` repairs the skills of another run, of other seeds for
 from __future__ import annotations
 
 import argparse
+import json
 import tempfile
 import time
 from pathlib import Path
@@ -16,9 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import skillweave as sw
-from skillweave import recipes
 from skillweave.planning import held
-from skillweave.recipes.lander_missions import GoLeft, GoRight, Hover
+from skillweave.recipes.lander_missions import GoLeft, GoRight, Hover, by_leg, declare
 
 HOVER_STEPS = 100
 DONE = {
@@ -29,6 +29,13 @@ DONE = {
 """The legs of a mission: a place, and a place that is held."""
 LEAST = 20
 """The fewest calls of a pair that count for the worst change."""
+
+
+def declared(run: Path) -> sw.Hierarchy:
+    """Return the recipe's hierarchy, with the rule as selector if the run has not learnt one."""
+    stages = json.loads((run / "run.json").read_text())["stages"]
+    learnt = any("selector" in stage["learns"] for stage in stages)
+    return declare() if learnt else declare(selector=by_leg)
 
 
 def main() -> None:
@@ -43,7 +50,7 @@ def main() -> None:
     if given.run is None:
         run = sw.Hierarchy.pretrained("lander-missions")
     else:
-        run = sw.load(given.run, recipes.load("lander-missions"))
+        run = sw.load(given.run, declared(Path(given.run)))
     rates = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(given.to or temporary)

@@ -32,7 +32,7 @@ from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rollout, Sample
+from skillweave.experience import Reference, Rehearsal, Rollout, Sample
 from skillweave.seeding import Seeds
 
 P, B = 2, 16
@@ -92,6 +92,13 @@ def test_compiled_steps_equal_plain_ones(
         torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-6, msg=field.name)
 
 
+def rehearsed(width: int, log_std: torch.Tensor | None = None) -> Rehearsal:
+    """Observations in which a policy with ``width`` dist_params keeps what it did."""
+    g = torch.Generator().manual_seed(7)
+    obs, did = (torch.randn(P, 9, n, generator=g) for n in (3, width))
+    return Rehearsal(obs, did, log_std)
+
+
 def rollout(space: gym.Space[Any], seed: int) -> Rollout:
     """Steps of 8 rows in 4 environments; with gaps, more of them in the second member."""
     g = torch.Generator().manual_seed(seed)
@@ -126,8 +133,10 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
         (PPO, {"learning_rate_schedule": "kl", "target_kl": 0.01}, FORCE, "aot_eager"),
         (PPO, {"target_kl": 0.002}, gym.spaces.Discrete(3), "aot_eager"),
         (SelfImitationPPO, {"clip_value": 0.2, "imitation_rows": 64}, FORCE, "aot_eager"),
+        (PPO, {"rehearsal": rehearsed(3)}, gym.spaces.Discrete(3), "aot_eager"),
+        (PPO, {"rehearsal": rehearsed(2, torch.zeros(P, 1, 2))}, FORCE, "aot_eager"),
     ],
-    ids=["ppo", "kl-rate", "kl-limit", "self-imitation"],
+    ids=["ppo", "kl-rate", "kl-limit", "self-imitation", "rehearsal", "rehearsal-force"],
 )
 def test_compiled_steps_of_rollouts_equal_plain_ones(
     kind: Any,
@@ -138,13 +147,16 @@ def test_compiled_steps_of_rollouts_equal_plain_ones(
 ) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     states, reports = [], []
+    more = {"rehearsal": settings.get("rehearsal")}
+    settings = {k: v for k, v in settings.items() if k not in more}
     for compile in (False, True):
         config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16, compile=compile)
         algorithm: Any = make_algorithm(config, OBS, space)
         state = algorithm.init([Seeds(m) for m in range(P)])
         for u in range(3):  # each with other numbers of rows
             generators = [(Seeds(u) / m).torch() for m in range(P)]
-            _, report = algorithm.update(state, rollout(space, u), generators)
+            data = replace(rollout(space, u), **more)
+            _, report = algorithm.update(state, data, generators)
             reports.append(report.metrics)
         states.append(state)
     for field in fields(states[0]):
