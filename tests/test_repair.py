@@ -16,7 +16,6 @@ from small_runs import assert_same
 import skillweave as sw
 from skillweave.algorithms import ppo
 from skillweave.api import Run
-from skillweave.collecting import skill_collector
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
@@ -174,7 +173,7 @@ def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rehearses: bool
 ) -> None:
     # All episodes start after the other skill, so nothing else keeps what was learnt at the start.
-    monkeypatch.setattr(skill_collector, "NAMED_SHARE", 1.0)
+    monkeypatch.setattr(repair, "REHEARSED_SHARE", 1.0)
     if not rehearses:
         monkeypatch.setattr(ppo, "REHEARSAL_COST", 0.0)
     (result,) = repaired(run, tmp_path / "new", steps=10_240).repairs

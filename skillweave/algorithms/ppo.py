@@ -38,7 +38,7 @@ from skillweave.types import Array
 
 REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
-REHEARSAL_COST = 0.3
+REHEARSAL_COST = 0.2
 """Cost of a nat of KL in the rehearsal's observations, where advantages have a deviation of 1."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 

@@ -917,8 +917,8 @@ class Run:
     ) -> Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
-        Half of the episodes begin after a call of the other skill, the others as usual. The skill
-        is paid its own reward, and more while the event holds that its calls are for: as much per
+        Most episodes begin after a call of the other skill, the others as usual. The skill is paid
+        its own reward, and more while the event holds that its calls are for: as much per
         step as calls that were done earned more than those that failed. A skill of PPO without a
         memory also rehearses: the KL from its earlier policy has a cost in the observations of its
         calls that were done after other skills (kickstarting, Schmitt et al. 2018), so that it

@@ -58,10 +58,11 @@ class SkillCollector(Collector):
         search_steps: reset an episode in which the skill cannot start within this many steps; None:
             it goes on.
         episode_calls: the most calls of the skill in an episode.
-        start_after: names among ``starters``; in half of the episodes a call of one of them comes
-            last before the skill starts.
+        start_after: names among ``starters``; a call of one of them comes last before the skill
+            starts in a share of the episodes.
         call_limit: the most steps of a call of the skill; None: its ``max_steps``.
         part: the skill's own part of observations and actions; None: it has all.
+        named_share: that share.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class SkillCollector(Collector):
         start_after: tuple[str, ...] = (),
         call_limit: int | None = None,
         part: OwnPart | None = None,
+        named_share: float = NAMED_SHARE,
     ) -> None:
         super().__init__(engine)
         if acting is not None:
@@ -84,6 +86,7 @@ class SkillCollector(Collector):
         self.skill, self.reflexes = skill, reflexes
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
+        self._named_share = named_share
         self.call_limit = call_limit
         """The most steps of a call of the skill; None: any number."""
         if call_limit is None and skill is not None:
@@ -143,7 +146,15 @@ class SkillCollector(Collector):
         starters = self._starters.skills if self._searches else None
         how = self._start_calls, self._search_steps, self._episode_calls, self._start_after
         return SkillCollector(
-            engine, acting, self.skill, self.reflexes, starters, *how, self.call_limit, self._part
+            engine,
+            acting,
+            self.skill,
+            self.reflexes,
+            starters,
+            *how,
+            self.call_limit,
+            self._part,
+            self._named_share,
         )
 
     def _prepare(self, request: Request) -> None:
@@ -380,7 +391,7 @@ class SkillCollector(Collector):
         if len(ids):
             left = self._rng.integers(self._start_calls + 1, size=len(ids))
             if self._start_after:
-                named = self._rng.random(len(ids)) < NAMED_SHARE
+                named = self._rng.random(len(ids)) < self._named_share
                 self.kept["named"][ids] = named
                 left += named
             self.kept["calls_left"][ids] = left

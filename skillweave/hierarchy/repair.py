@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.collecting.skill_collector import NAMED_SHARE
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.assembly import parts_of, policy_at
@@ -37,6 +38,8 @@ LARGEST_CHUNK = 200_000
 """The most steps that are recorded at once, as they are kept in memory."""
 NEVER = 200_000
 """Steps after which a pair of skills without a call is given up."""
+REHEARSED_SHARE = 0.75
+"""Share of the calls that begin after the other skill, where the skill rehearses the rest."""
 LONG_CALL = 1_000
 """Steps of a call without a limit that count for its bonus."""
 SEED = 7_000
@@ -81,7 +84,8 @@ def repair_stage(
     repair = entry["repair"]
     path = repair["skill"]
     level, role = roles.levels[level_of(path)], roles[path]
-    calls = level.apart.start_calls
+    calls, config = level.apart.start_calls, role.config
+    assert config is not None
 
     def learning_task(policies: Policies) -> LearningTask:
         others = {p: policy_at(roles, policies, p) for p in level.skills if p != path}
@@ -89,11 +93,11 @@ def repair_stage(
         limit = whole.limit(list(level.skills).index(path))
         assert role.skill is not None
         holds = event_of(role.skill, done)
-        bonus = repair.get("bonus", 0.0)
+        bonus, gamma = repair.get("bonus", 0.0), float(config.gamma)
         learning = role
         if holds is not None and bonus:
             # As much as if a call that ends by the event went on, and the event held.
-            rest = bonus * sum(role.config.gamma**k for k in range(limit or LONG_CALL))
+            rest = bonus * float(np.sum(gamma ** np.arange(limit or LONG_CALL)))
             learning = replace(role, skill=eager(role.skill, holds, bonus, rest))
         return skill_task(
             learning,
@@ -104,13 +108,13 @@ def repair_stage(
             start_after=(name_of(repair["after"]),),
             # Calls are what counts, and steps beyond their limit would take steps from the starts.
             call_limit=limit,
+            named_share=REHEARSED_SHARE if "rehearsal" in repair else NAMED_SHARE,
         )
 
-    assert role.config is not None
     return Stage(
         entry["name"],
         "skill",
-        role.config,
+        config,
         entry["budget"],
         learning_task,
         level=level.path,
@@ -145,7 +149,8 @@ def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: floa
         over = np.asarray(step.terminated, bool)
         if skill.defines("termination"):
             over = over | np.asarray(skill.termination(step), bool)
-        return own + np.asarray(holds(step), bool) * np.where(over, rest, bonus)
+        paid: Array = own + np.asarray(holds(step), bool) * np.where(over, rest, bonus)
+        return paid
 
     twin = copy.copy(skill)
     attributes = {"name": skill.name, "reward": reward}
@@ -281,7 +286,8 @@ def rehearsed_obs(
     steps = calls[log.owner]
     if not steps.any():
         return None
-    obs, goals = log.before[steps], goals_of(skill)
+    obs: Array = log.before[steps]
+    goals = goals_of(skill)
     if goals is None:
         return obs
     return goals.join(obs, goals.from_flat(log.goals[skill.name])[log.owner[steps]])

@@ -12,7 +12,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_collector import NAMED_SHARE, SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import Engine
 from skillweave.envs.make import EnvSpec, make_engine
@@ -87,6 +87,7 @@ def skill_task(
     episode_calls: int = 1,
     start_after: tuple[str, ...] = (),
     call_limit: int | None = None,
+    named_share: float = NAMED_SHARE,
 ) -> LearningTask:
     """Return the learning task of a skill's stage, or of a plain agent's.
 
@@ -96,10 +97,11 @@ def skill_task(
         start_calls: an episode starts after up to this many calls of ``starters``.
         search_steps: reset an episode in which the skill cannot start within this many steps.
         episode_calls: the most calls of the skill in an episode.
-        start_after: names among ``starters``; half of the episodes start after a call of one.
+        start_after: names among ``starters``; a share of the episodes start after a call of one.
         call_limit: the most steps of a call; None: the skill's own limit.
+        named_share: that share.
     """
-    search = start_calls, search_steps, episode_calls, start_after, call_limit
+    search = start_calls, search_steps, episode_calls, start_after, call_limit, named_share
     spec, skill = role.spec, role.skill
 
     def collector(
