@@ -357,15 +357,20 @@ def _fits(spec: EnvSpec, make: MakePool, reference: gym.Env[Any, Any]) -> bool:
         )
     for what in ("observation_space", "action_space"):
         theirs, ours = getattr(pool, what), getattr(reference, what)
-        alike = isinstance(theirs, type(ours)) and theirs.shape == ours.shape
-        if alike and parts(ours):  # of a Dict it has the names, the shapes and the types
-            alike = obs_dtype(theirs) == obs_dtype(ours)
-        if not alike or theirs.dtype != ours.dtype:
+        if not _alike(theirs, ours):
             raise EnvError(
                 f"{spec.name}: its pool's {what} is {short(theirs)}, but the environment's is "
                 f"{short(ours)}; wrap the pool in a PoolWrapper that makes them equal"
             )
     return True
+
+
+def _alike(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
+    """Return whether spaces have the same kind, shape and type, and their parts by name, too."""
+    if not isinstance(a, type(b)) or a.shape != b.shape or a.dtype != b.dtype:
+        return False
+    ones, others = parts(a) or {}, parts(b) or {}
+    return ones.keys() == others.keys() and all(_alike(ones[k], others[k]) for k in ones)
 
 
 def _step_seconds(env: gym.Env[Any, Any]) -> float:

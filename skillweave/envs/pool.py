@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import EnvError, MissingExtra
+from skillweave.errors import DeclarationError, EnvError, MissingExtra
 from skillweave.messages import close_matches, short
 from skillweave.spaces import pack, unpack
 from skillweave.types import Array
@@ -199,7 +199,16 @@ def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
 
     Returns:
         The function, for ``EnvSpec``. It has the name of ``pool``.
+
+    Raises:
+        DeclarationError: ``pool`` is no function.
     """
+    if not callable(pool):
+        raise DeclarationError(
+            f"one_of() got {short(pool)}; it takes the function that makes the pool: "
+            "def many(num_envs, threads, seed): return skillweave.envpool('CartPole-v1', num_envs, "
+            "threads, seed)"
+        )
 
     @functools.cache  # a simulator may take half a second to load
     def spaces() -> tuple[Any, Any]:

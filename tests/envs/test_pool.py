@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 import skillweave as sw
 from skillweave.envs.make import make_engine, workers_for
-from skillweave.errors import EnvError, MissingExtra
+from skillweave.errors import DeclarationError, EnvError, MissingExtra
 
 N = 5
 
@@ -231,6 +231,11 @@ def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_withou
     assert len(starts) > 1
 
 
+def test_one_of_takes_a_function():
+    with pytest.raises(DeclarationError, match=r"one_of\(\) got 'CartPole-v1'; it takes the func"):
+        sw.one_of("CartPole-v1")
+
+
 def test_a_pool_with_other_parts_is_told():
     def other(num_envs, threads, seed):
         space = gym.spaces.Dict(time=gym.spaces.Box(0, 1000, (2,)), root=gym.spaces.Discrete(1000))
@@ -238,6 +243,18 @@ def test_a_pool_with_other_parts_is_told():
 
     with pytest.raises(EnvError, match=r"later: its pool's observation_space is Dict"):
         make_engine(sw.EnvSpec(sw.one_of(later), pool=other), 2)
+
+
+def test_parts_of_a_pool_may_come_in_another_order():
+    def other(num_envs, threads, seed):
+        space = Parts.observation_space
+        turned = gym.spaces.Dict([(k, space[k]) for k in reversed(list(space))])
+        return sw.PoolWrapper(Parts(num_envs, threads, seed), turned)
+
+    engine = make_engine(sw.EnvSpec(sw.one_of(later), pool=other), 2)
+    assert type(engine).__name__ == "EnvPoolEngine"
+    obs = engine.reset(9)
+    assert (obs["root"].tolist(), obs["time"].tolist()) == ([9, 9], [[0.0], [0.0]])
 
 
 def test_one_environment_of_envpool_plays_the_episodes_of_its_seed():
