@@ -3,9 +3,10 @@
     python -m benchmarks.maze_points [--seeds 0 1] [--out runs/maze-points]
 
 The recipe ``mazes`` with one skill in place of its five, in as many steps: a million for the skill
-and the selector together. Neither sees walls; the selector chooses any point of the maze, and the
-skill rolls towards it, two metres at most. A score is the share of 60 episodes of
-Gymnasium-Robotics' maze that reach the goal, where the selector samples.
+and the selector together. Points are the middles of the maze's cells. The selector chooses any; the
+skill rolls to the cell in this direction that is two columns and two rows away at most. Neither
+sees walls. A score is the share of 60 episodes of Gymnasium-Robotics' maze that reach the goal,
+where the selector samples.
 """
 
 from __future__ import annotations
@@ -25,42 +26,48 @@ from skillweave import Apart, Array, Hierarchy, Network, Skill, Step, register_e
 from skillweave.recipes import _mazes, mazes
 from skillweave.recipes._mazes import PLACE, SPEED
 
-SKILL_STEPS, SELECTOR_STEPS = 150_000, 838_000
+SKILL_STEPS, SELECTOR_STEPS = 40_000, 948_000
 """Together they are the recipe's, a million."""
 EPISODES = 60
-RANGE = 2.0
-"""Metres to the furthest point of a call."""
+RANGE = 2
+"""Columns and rows to the furthest point of a call."""
 THERE = 0.3
 """Metres from the point at which a call ends."""
-CORNER = np.array([6.0, 4.5], np.float32)
-"""Metres from the middle of the maze to its north-eastern corner."""
-POINT = slice(6, 8)
-"""The place of the goal in what the skill's networks see."""
+CELLS = np.array([12, 9])
+"""Columns and rows of the maze, from its south-western corner."""
+
+
+def middle(cell: Array) -> Array:
+    """Return metres east and north of the middles of cells, (n, 2)."""
+    metres: Array = cell + 0.5 - CELLS / 2
+    return metres
+
+
+def cell_of(obs: Array) -> Array:
+    """Return the column and the row of the ball, (n, 2)."""
+    cell: Array = np.floor(obs[:, PLACE] + CELLS / 2).astype(np.int64)
+    return cell
 
 
 class GoTo(Skill):
     """Roll to a point, until it is there, or a wall is in the way."""
 
-    goal_space = gym.spaces.Box(-CORNER, CORNER)
+    goal_space = gym.spaces.MultiDiscrete(CELLS)
     max_steps = 100
     steps = SKILL_STEPS
 
     def goals(self, obs: Array, rng: np.random.Generator) -> Array:
-        """Return points in range, in all directions alike."""
-        angle, far = rng.uniform((0.0, THERE), (2.0 * np.pi, RANGE), (len(obs), 2)).T
-        way = far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        return self.inside(obs[:, PLACE] + way)
+        """Return cells in range."""
+        inner: Array = np.clip(
+            cell_of(obs) + rng.integers(-RANGE, RANGE + 1, (len(obs), 2)), 0, CELLS - 1
+        )
+        return inner
 
     def clip_goal(self, obs: Array, goal: Array) -> Array:
-        """Return the points in range that lie in the direction of the chosen ones."""
-        way = goal - obs[:, PLACE]
-        far = np.hypot(*way.T)[:, None]
-        return self.inside(obs[:, PLACE] + way * np.minimum(1.0, RANGE / np.maximum(far, 1e-6)))
-
-    def inside(self, points: Array) -> Array:
-        """Return points within the maze."""
-        inner: Array = np.clip(points, self.goal_space.low, self.goal_space.high)
-        return inner.astype(np.float32)
+        """Return the cells in range that are nearest to the chosen ones."""
+        here = cell_of(obs)
+        near: Array = np.clip(goal, here - RANGE, here + RANGE)
+        return near
 
     def reward(self, step: Step) -> Array:
         """Return metres a second by which the point comes nearer."""
@@ -69,12 +76,12 @@ class GoTo(Skill):
 
     def far(self, obs: Array, goal: Any) -> Array:
         """Return metres to the point, (n,)."""
-        metres: Array = np.hypot(*(goal - obs[:, PLACE]).T)
+        metres: Array = np.hypot(*(middle(goal) - obs[:, PLACE]).T)
         return metres
 
     def termination(self, step: Step) -> Array:
         """Return whether it is there, or stuck as the recipe's skills are."""
-        way = step.goal - step.next_obs[:, PLACE]
+        way = middle(step.goal) - step.next_obs[:, PLACE]
         way = way / np.maximum(np.hypot(*way.T), 1e-6)[:, None]
         before, after = ((o[:, SPEED] * way).sum(axis=1) for o in (step.obs, step.next_obs))
         stuck = (after < mazes.SLOW) & (after - before < mazes.GAIN) & (step.elapsed >= mazes.TRY)
@@ -99,11 +106,14 @@ class Motion:
         """Fill no weights: it has none."""
 
     def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
-        """Map (P, B, 8) to (P, B, 4)."""
+        """Map (P, B, 6 + 12 + 9) to (P, B, 4): the cell's column and row are one-hot."""
         import torch
 
         seen = inputs["vector"]
-        return torch.cat([seen[..., SPEED], seen[..., POINT] - seen[..., PLACE]], -1)
+        hot = torch.split(seen[..., 6:], CELLS.tolist(), -1)
+        cell = torch.stack([one.argmax(-1) for one in hot], -1)
+        point = cell + 0.5 - torch.as_tensor(CELLS) / 2
+        return torch.cat([seen[..., SPEED], point - seen[..., PLACE]], -1)
 
 
 register_encoder("motion to a point in a maze", Motion)
@@ -115,7 +125,7 @@ def declare(**how: Any) -> Hierarchy:
     settings: dict[str, Any] = {
         "call_steps": 25,
         "algorithm": replace(mazes.BALL, network=network),
-        "selector": replace(mazes.SELECTOR, ent_coef=0.01, ent_coef_final=0.0),
+        "selector": mazes.SELECTOR,
         "learn": "apart",
         "apart": Apart(selector_steps=SELECTOR_STEPS),
         "selection": mazes.SAMPLING,
