@@ -109,6 +109,52 @@ def hand_over(names: tuple[str, str]) -> Spec:
     return spec | {"description": "The chosen calls over two coordinates", "height": 300}
 
 
+def goal_map(name: str, rows: Sequence[dict[str, Any]]) -> Spec:
+    """Return a map of success over goals of two numbers: parts of the space, by colour."""
+    encoding: dict[str, Any] = {"tooltip": _of_goals()}
+    for axis, title in (("x", "first number of the goal"), ("y", "second number of the goal")):
+        encoding[axis] = number_axis(axis, title, axis={"tickCount": 5}, scale={"nice": False})
+        encoding[f"{axis}2"] = {"field": f"{axis}2"}
+    legend = {"format": ".0%", "title": "success", "gradientLength": 240, "tickCount": 3}
+    scale = {"domain": [0, 1], "range": ["#d55e00", "#f0e442", "#009e73"]}
+    encoding["color"] = {"field": "share", "type": "quantitative", "scale": scale, "legend": legend}
+    mark = {"type": "rect", "aria": False}
+    text = f"Success of {name} over its goals"
+    return chart(text, 340, data={"values": list(rows)}, mark=mark, encoding=encoding)
+
+
+def goal_bars(name: str, rows: Sequence[dict[str, Any]]) -> Spec:
+    """Return bars of success over goals of one number: a bar for each goal, or part of its range.
+
+    What has calls has a pale ground, so that no success and no call are different.
+    """
+    parts = "x2" in rows[0]
+    x: dict[str, Any] = {"field": "x", "type": "ordinal", "title": "goal", "sort": None}
+    x |= {"axis": {"labelAngle": 0}}
+    if parts:
+        x = number_axis("x", "goal", axis={"tickCount": 5}, scale={"nice": False})
+    shared = {"x": x, "tooltip": _of_goals()} | ({"x2": {"field": "x2"}} if parts else {})
+    y = number_axis("share", "success", axis={"format": ".0%"}, scale={"domain": [0, 1]})
+    mark = {"type": "rect" if parts else "bar", "aria": False}
+    layer = [
+        {
+            "mark": mark | {"color": color, "opacity": opacity},
+            "encoding": {"y": top, "y2": {"datum": 0}},
+        }
+        for color, opacity, top in (("#888888", 0.2, y | {"field": "top"}), ("#009e73", 1.0, y))
+    ]
+    values = [row | {"top": 1} for row in rows]
+    text = f"Success of {name} by its goals"
+    return chart(text, 240, data={"values": values}, encoding=shared, layer=layer)
+
+
+def _of_goals() -> list[dict[str, Any]]:
+    return [
+        {"field": "share", "type": "quantitative", "title": "success", "format": ".0%"},
+        {"field": "calls", "type": "quantitative", "title": "calls", "format": ",d"},
+    ]
+
+
 def family_tree(lineage: Lineage, color: str) -> Spec:
     """Return a chart of fitness by generation, each member joined to its parent."""
     path = {(b.generation, b.member) for b in lineage.path(lineage.winner)}

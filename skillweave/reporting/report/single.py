@@ -33,6 +33,7 @@ from skillweave.reporting.report.curves import (
     thinned,
 )
 from skillweave.reporting.report.film import Film, make_film
+from skillweave.reporting.report.goals import goal_pictures
 from skillweave.reporting.report.hand_over import Section, hand_over_section
 from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
 from skillweave.reporting.report.page import library, write_page
@@ -80,6 +81,8 @@ class Played:
     """The docstrings of the log's skills."""
     named: ObsNames | None
     """Names of the numbers in an observation."""
+    goals: list[dict[str, Any]]
+    """The pictures of skills with goals."""
 
 
 @global_generators(Seeds(0) / "report")
@@ -127,7 +130,11 @@ def play_episodes(
         missing.append(misfit)
     shown, left_out = episode_data(log, film, named)
     docs = [about(skill) for skill in log.skills]
-    return Played(score, log, film, shown, missing + left_out, colors, docs, named)
+    skills = dict(zip(log.labels, log.skills, strict=False))
+    goals: list[dict[str, Any]] = []
+    if any(skill.goal_space is not None for skill in skills.values()):
+        goals = goal_pictures(calls.logs(episode_seeds(seed, episodes)), skills)
+    return Played(score, log, film, shown, missing + left_out, colors, docs, named, goals)
 
 
 def write_report(
@@ -190,6 +197,7 @@ def write_report(
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
     context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False, "hand_over": None}
+    context["goals"] = []
     hand_film = None
     if section is not None:
         context |= section.context
@@ -371,6 +379,7 @@ def _skills(played: Played) -> dict[str, Any]:
         "episodes": len(log.episodes),
         "filmed": 0 if played.film is None else len(played.film.first),
         "has_skills": log.labels != (AGENT,),
+        "goals": played.goals,
     }
 
 
@@ -393,4 +402,5 @@ def _episodes(played: Played) -> dict[str, Any]:
         names = [log.labels[i] for i in used]
         decisions["spec"] = charts.choices(names, [colors[i] for i in used])
         data["decisions"] = decisions
+    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(played.goals)}
     return data

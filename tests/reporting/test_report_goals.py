@@ -1,0 +1,64 @@
+"""The pictures of success over goals in a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from goals.worlds import SPACES, GoTo, Rest, aim_of, declared
+
+from skillweave.reporting.report.single import play_episodes
+
+
+def walks(name: str, space: Any, left: float = 1.0) -> Any:
+    """A skill that goes to its goal, and slowly where the goal's first number is below 0.5."""
+
+    def policy(self: Any, obs: Any, goal: Any) -> Any:
+        slow = np.where(aim_of(goal)[:, :1] < 0.5, left, 1.0)
+        return np.clip(5 * (aim_of(goal) - obs), -1, 1) * slow
+
+    return type("Walk", (GoTo,), {"name": name, "goal_space": space, "policy": policy})()
+
+
+def chosen(obs: Any) -> Any:
+    r, kind = np.abs(np.sin(obs * 37)), np.abs(obs[:, 0] * 100).astype(int) % 4
+    goals = {"two": r, "number": 2 + (r[:, 0] * 9).astype(int) % 3, "one": r[:, :1]}
+    goals["other"] = {"at": r, "side": (r[:, 0] > 0.5).astype(int)}
+    return np.array(["two", "number", "one", "other"])[kind], goals
+
+
+def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
+    two = gym.spaces.Box(0, 1, (2,), np.float32)
+    one = gym.spaces.Box(0, np.inf, (1,), np.float32)
+    skills = [
+        walks("two", two, left=0.0),
+        walks("number", SPACES["number"]),
+        walks("one", one),
+        walks("other", SPACES["dict"]),
+    ]
+    run = declared(skills, selector=chosen).train(tmp_path / "run", quiet=True)
+    played = play_episodes(run.policy, run.declaration.spec, 30, 0, 0, True, 4)
+    found = {picture["name"]: picture for picture in played.goals}
+    assert set(found) == {"two", "number", "one"}  # goals of a Dict have none
+    for name, picture in found.items():
+        rows = picture["spec"]["data"]["values"]
+        calls = sum(row["calls"] for row in rows)
+        report = played.score.skills[name]
+        assert calls == report.calls
+        assert sum(row["done"] for row in rows) == report.succeeded
+        assert picture["words"].startswith(f"{report.succeeded:,} of {report.calls:,} calls")
+    rows = found["two"]["spec"]["data"]["values"]
+    assert all(0 <= row["x"] < row["x2"] <= 1 for row in rows)
+    left = [row["share"] for row in rows if row["x2"] <= 0.5]
+    right = [row["share"] for row in rows if row["x"] >= 0.5]
+    assert np.mean(left) < 0.3 < np.mean(right)
+    assert [row["x"] for row in found["number"]["spec"]["data"]["values"]] == ["2", "3", "4"]
+    assert max(row["x2"] for row in found["one"]["spec"]["data"]["values"]) <= 1.0
+
+
+def test_a_report_without_goals_has_none(tmp_path: Path) -> None:
+    rule = np.vectorize(lambda x: "rest")
+    run = declared([Rest()], selector=lambda obs: rule(obs[:, 0])).train(quiet=True)
+    assert play_episodes(run.policy, run.declaration.spec, 2, 0, 0, True, 2).goals == []
