@@ -19,7 +19,7 @@ ActingParams ActionHead Acts Agent AgentState Algorithm Apart Array Automaton CN
 DeclarationError Encoder EnvError EnvSpec Evaluation Evolution Export Goal Guide Heir Hierarchy
 HierarchyPolicy Interrupted LastAction LastCall Layout Lengths Linear MissingExtra Mutations Net
 Network OnPolicy OptionsEnv PPO ParameterGroup ParentSelection Part Player Policy PolicyError
-PoolWrapper RNN Range Ray Reflex Report Rollout Run RunError SAC Sample Seeds Selection
+PoolWrapper RNN Range Ray Reflex Report Residual Rollout Run RunError SAC Sample Seeds Selection
 SelfImitationPPO Skill SkillError SkillweaveError Step TD3 Together Tournament TrainDefaults
 TrainEvent TrainingError Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub
 from_onnx from_sb3 from_torch gae load load_policy make_options_env mask_logits masked_mean

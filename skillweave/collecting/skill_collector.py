@@ -61,8 +61,8 @@ class SkillCollector(Collector):
         start_after: names among ``starters``; a call of one of them comes last before the skill
             starts in a share of the episodes.
         call_limit: the most steps of a call of the skill; None: its ``max_steps``.
-        part: the skill's own part of observations and actions; None: it has all.
         named_share: that share.
+        part: the skill's own part of observations and actions; None: it has all.
     """
 
     def __init__(
@@ -77,8 +77,8 @@ class SkillCollector(Collector):
         episode_calls: int = 1,
         start_after: tuple[str, ...] = (),
         call_limit: int | None = None,
-        part: OwnPart | None = None,
         named_share: float = NAMED_SHARE,
+        part: OwnPart | None = None,
     ) -> None:
         super().__init__(engine)
         if acting is not None:
@@ -153,8 +153,8 @@ class SkillCollector(Collector):
             starters,
             *how,
             self.call_limit,
-            self._part,
             self._named_share,
+            self._part,
         )
 
     def _prepare(self, request: Request) -> None:

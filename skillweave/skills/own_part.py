@@ -289,7 +289,7 @@ def _leaf(rest: Any, space: Space[Any], where: str, path: tuple[str, ...]) -> _L
 
 @dataclass(frozen=True, eq=False)
 class _Written:
-    """What a skill writes of an action of some space."""
+    """The part that a skill writes of an action of some space."""
 
     space: Space[Any]
     """Of its own actions."""
