@@ -371,12 +371,9 @@ def test_goals_reach_the_label_of_a_film(tmp_path):
     assert np.allclose(policy.goal_now(memory), 0.9)
 
 
-def test_exports_of_hierarchies_with_goals_are_refused(tmp_path):
-    pytest.importorskip("onnx")
-    run = declared(algorithm=ON).train(tmp_path / "run", quiet=True)
-    with pytest.raises(PolicyError, match="'go_to' has goals, and hierarchies with goals cannot"):
-        run.export(tmp_path / "export")
+def test_the_policy_of_a_skill_with_goals_is_saved_and_loaded(tmp_path):
     pytest.importorskip("onnxruntime")
+    run = declared(algorithm=ON).train(tmp_path / "run", quiet=True)
     sw.save_policy(run.policy.skills.policies[0], tmp_path / "policy")
     loaded = go_to(policy=sw.load_policy(tmp_path / "policy"))
     other = declared([loaded]).train(tmp_path / "other", quiet=True)
