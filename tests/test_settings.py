@@ -135,7 +135,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
     },
     SkillCritic: ON_POLICY | {
         "batch_size": AT_LEAST_ONE, "update_epochs": AT_LEAST_ONE, "gae_lambda": FRACTION,
-        "adam_eps": POSITIVE, "max_grad_norm": POSITIVE, "deciding": FLAG,
+        "adam_eps": POSITIVE, "max_grad_norm": POSITIVE, "deciding": FLAG, "sees_goals": FLAG,
         "min_advantage_std": NON_NEGATIVE, "epsilon": FRACTION, "epsilon_final": or_none(FRACTION),
         "epsilon_fraction": FRACTION,
     },

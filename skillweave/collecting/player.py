@@ -359,8 +359,8 @@ class Player:
         memory["elapsed"][rows] = 0
         memory["end"][rows] = RUNNING
         for i, keys in enumerate(self._keys):
-            anew = changed | (i in self.goals and isinstance(self.actors[i], Player))
-            if keys and len(fresh := rows[anew & (skill == i)]):
+            afresh = changed | (i in self.goals and isinstance(self.actors[i], Player))
+            if keys and len(fresh := rows[afresh & (skill == i)]):
                 _put(self.of_skill(memory, i), fresh, self.actors[i].start(len(fresh)))
         for i, base in self._bases.items():
             if self._base_keys[i] and len(fresh := rows[changed & (skill == i)]):

@@ -386,11 +386,11 @@ class _Reading:
         choices = choice_space(int(plain.n), with_goals, names)
         interruption = None
         if fitted["critic"] is not None:
-            count, seen = gym.spaces.Discrete(len(skills)), self.spaces
+            count, before = gym.spaces.Discrete(len(skills)), self.spaces
             if with_goals:
-                self.spaces = with_goal(seen[0], goals_space(with_goals)), seen[1]
+                self.spaces = with_goal(before[0], goals_space(with_goals)), before[1]
             critic = self._network(dict(fitted["critic"]), f"{path}.critic", count)
-            self.spaces = seen
+            self.spaces = before
             interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
         kept = tuple(self.parts.get(f"{path}.skills[{i}].policy") for i in range(len(skills)))

@@ -479,7 +479,7 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             runner.feeds = {f"obs.observation{k[3:]}": x for k, x in before.items()}
         for i, entry in goals:
             if entry:
-                goal = self.goal if i == self.skill else blank(entry)
+                goal: Any = self.goal if i == self.skill else blank(entry)
                 for k, fields in entry["inputs"]:
                     name = f"obs.goal.{self.skills[i]['name']}{k[8:]}"
                     runner.feeds[name] = reduce(getitem, fields, goal)
