@@ -111,6 +111,10 @@ class ChoiceCodec(ActionCodec):
         last: int = self.columns[-1].stop
         return last
 
+    @cached_property
+    def _dtype(self) -> np.dtype[Any]:
+        return obs_dtype(self.space)
+
     def units(self, action: Any, at: int) -> Any:
         """Return the goals ``at`` of choices (…, size) as their own codec has them."""
         codec, part = self.goals[at][1], action[..., self.columns[at]]
@@ -121,7 +125,7 @@ class ChoiceCodec(ActionCodec):
 
     def to_env(self, action: Array) -> Array:
         """Convert policy units (n, size) to choices (n,)."""
-        choice = np.zeros(len(action), obs_dtype(self.space))
+        choice = np.zeros(len(action), self._dtype)
         choice[SKILL] = action[:, 0].astype(np.int64)
         for at, (name, codec, _) in enumerate(self.goals):
             choice[GOAL][name] = codec.to_env(self.units(action, at))
