@@ -917,14 +917,14 @@ class Run:
     ) -> Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
-        Most episodes begin after a call of the other skill, the others as usual. The skill is paid
-        its own reward, and more while the event holds that its calls are for: as much per
-        step as calls that were done earned more than those that failed. A skill of PPO without a
-        memory also rehearses: the KL from its earlier policy has a cost in the observations of its
-        calls that were done after other skills (kickstarting, Schmitt et al. 2018), so that it
-        does not forget. Before and after, calls are recorded, and the hand-overs counted: the new
-        weights are kept if this one is clearly better and no other one clearly worse. All other
-        weights stay as they are. What was done is in ``Run.repairs``.
+        Most episodes begin after a call of the other skill, the others as usual; half of them where
+        it does not rehearse. The skill is paid its own reward, and more while the event holds that
+        its calls are for: as much per step as calls that were done earned more than those that
+        failed. A skill of PPO without a memory also rehearses: the KL from its earlier policy has a
+        cost in the observations of its calls that were done after other skills (kickstarting,
+        Schmitt et al. 2018), so that it does not forget. Before and after, calls are recorded, and
+        the hand-overs counted: the new weights are kept if this one is clearly better and no other
+        one clearly worse. All other weights stay as they are. What was done is in ``Run.repairs``.
 
         Args:
             skill: the skill that fails, by its path.
