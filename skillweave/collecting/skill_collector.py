@@ -267,9 +267,10 @@ class SkillCollector(Collector):
             seen: (N, …), what the skill sees.
             rows: (k,) where it acts; elsewhere they are 0.
         """
-        if self._base is None:
+        if self._part is None or self._base is None:
             return None
-        action = np.zeros((self.num_envs, *self._base.action_space.shape), np.float64)
+        shape = self._part.action_space.shape or ()
+        action = np.zeros((self.num_envs, *shape), np.float64)
         if len(rows):
             turn = Turn(True, self._rng)
             action[rows] = self._base.act(self._base_memory, rows, seen[rows], None, turn)
