@@ -48,6 +48,7 @@ def skills(sees: Any) -> Any:
     return [Arm(), type("Hook", (Hook,), {"sees": sees})()]
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize(
     "sees",
     [
@@ -67,6 +68,7 @@ def test_learnt_skills_with_parts(sees, rest, tmp_path):
     compare(run.policy, tmp_path / "out", export.functions)
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("kind", ["several", "bits", "one"])
 def test_choices_with_parts(kind, tmp_path):
     def declared() -> Any:
@@ -122,6 +124,7 @@ def middle(obs: Any) -> Any:
     return np.concatenate([-0.5 * obs["arm"], -0.25 * obs["hook"]], axis=1)
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", ["function", "every", "module"])
 @pytest.mark.parametrize("acts", [None, (0, 2)])
 def test_corrections(name, acts, tmp_path):

@@ -63,6 +63,7 @@ def bases() -> dict[str, Any]:
     }
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", bases())
 @pytest.mark.parametrize("how", ["together", "apart", "SAC"])
 def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
@@ -92,6 +93,7 @@ def episode(policy: Any, steps: int = 20, seed: int = 0) -> Any:
     return np.array(env.actions)
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", bases())
 def test_the_correction_is_added_to_the_ready_policy(name):
     ready = bases()[name]
@@ -149,6 +151,7 @@ def test_a_call_after_another_skill_starts_the_ready_policy_afresh():
     assert np.allclose(actions[8:12], [0.8, 0.8, 0.8, 1.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_ready_policy_of_a_run_is_kept(tmp_path):
     class Module(nn.Linear):
         pass
@@ -188,6 +191,7 @@ def test_a_correction_of_a_part():
     assert np.abs(actions[0, :2] - np.clip(-0.5 * obs["arm"], -1, 1)).max() <= 0.2
 
 
+@pytest.mark.slow
 def test_a_hierarchy_is_corrected():
     def turns(obs: Any) -> Any:
         return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, "swing", "lift")
@@ -211,6 +215,7 @@ def one(obs: Any) -> Any:
     return np.full((len(obs), 1), -0.5, np.float32)
 
 
+@pytest.mark.slow
 def test_a_population_learns_corrections():
     evolve = {"better": sw.Evolution(population=2, generations=2)}
     run = crane([Better()], learn="apart", steps=1200).train(evolve=evolve, quiet=True)

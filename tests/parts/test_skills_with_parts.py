@@ -113,6 +113,7 @@ def skills_for(kind: str) -> Any:
     return [left, right, type("All", (sw.Skill,), {})()]
 
 
+@pytest.mark.fast_cases(2)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
     kind, how = ALGORITHMS[name]
@@ -151,6 +152,7 @@ def test_a_run_without_its_code_has_the_parts(tmp_path):
         gym.registry.pop("Crane-v0")
 
 
+@pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("skills", "rest", "says"),
     [
@@ -207,6 +209,7 @@ def named_turns(obs: Any, names: tuple[str, str]) -> Any:
     return np.where(obs["camera"][:, 0, 0, 0] // 4 % 2 == 0, *names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", ["together", "apart"])
 def test_a_nested_hierarchy_learns(learn, tmp_path):
     def hierarchy() -> sw.Hierarchy:
@@ -287,6 +290,7 @@ class Sideways(sw.Skill):
         return -np.abs(step.next_obs["arm"] - step.goal).sum(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learn", ["together", "apart"])
 def test_a_skill_has_goals_and_a_part(learn, tmp_path):
     def hierarchy() -> sw.Hierarchy:
@@ -356,6 +360,7 @@ def test_a_mask_that_leaves_no_choice_is_an_error():
         crane([low, free], env=on("one", True)).train(quiet=True)
 
 
+@pytest.mark.slow
 def test_a_population_learns_parts(tmp_path):
     how = {"learn": "apart", "rest": "hold", "steps": 1200}
     evolve = {"arm": sw.Evolution(population=2, generations=2)}
