@@ -93,11 +93,6 @@ class PolicyActor:
         self._policy, self._blamed = policy, blamed
         self.watches = getattr(type(policy), "observe", None) is not Memoryless.observe
 
-    @property
-    def action_space(self) -> gym.Space[Any]:
-        """The space of the policy's actions; a selector may have none."""
-        return self._policy.action_space
-
     def start(self, n: int) -> Memory:
         """Return the policy's fresh memory."""
         return self._policy.start(n)
