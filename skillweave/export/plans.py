@@ -30,9 +30,16 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
     """Return the entry of a planner in ``policy.json``, without its file, and the file's bytes.
 
     Raises:
-        PolicyError: each episode has a goal of its own, for which the runner cannot plan.
+        PolicyError: each episode has a goal of its own, for which the runner cannot plan; or the
+            plan chooses goals of skills, which the runner cannot.
     """
     task, graph, machine = planner.task, planner.graph, planner.machine
+    if planner.goal_spaces:
+        raise PolicyError(
+            f"{name} is a plan that chooses goals ({', '.join(planner.goal_spaces)}), which the "
+            "runner does not: export a selector that starts from the plan, "
+            "planned.with_selector(...).train(...), or act with run.player()"
+        )
     if isinstance(task, GoalTask) and task.columns is not None:
         raise PolicyError(
             f"{name} plans again for each goal that it observes, which the runner does not: export "

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from goals.worlds import Rest, declared, go_to
 from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait
 
 from skillweave import EnvSpec, Lengths
@@ -157,3 +158,18 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
     export = exported(planner)
     assert "selector.features.wait" in export.code
     played(Noisy(), Runner(tmp_path, code=export.functions), 1)
+
+
+def test_a_plan_that_chooses_goals_is_refused(tmp_path: Path) -> None:
+    """With many different goals, and with a few, each of which is as another skill."""
+
+    def near_corner(obs: Any) -> Any:
+        return (obs > 0.5).all(1)
+
+    for goals in (None, lambda self, obs, rng: np.sign(rng.uniform(-1, 1, (len(obs), 2)))):
+        own = {} if goals is None else {"goals": goals}
+        walk = go_to(policy=lambda self, obs, goal: np.clip(5 * (goal - obs), -1, 1), **own)
+        run = declared([walk, Rest()]).train(tmp_path / f"{goals is None}", quiet=True)
+        planned = run.plan(near_corner, run.log_calls(600))
+        with pytest.raises(PolicyError, match=r"a plan that chooses goals \(go_to\).*with_selector"):
+            planned.export(tmp_path / "x")
