@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +36,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
     does: these say where a call ends though the skill does not see them, behind which wall, for
     example. A number that differs between episodes and never changes within one, as the place of a
     goal, only divides the log: it counts where it helps to predict where the skill's calls end, or
-    where the task reads it.
+    where the task reads it, or reads a reward, ``info`` or an end that it helps to predict.
 
     Args:
         log: the calls.
@@ -53,8 +53,10 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
     varies = before.std(0) > CONSTANT * np.maximum(1.0, np.abs(before.mean(0)))
     fixed = np.flatnonzero((changes == 0) & varies).tolist()
     moves = np.flatnonzero(changes > MOST_STEPS).tolist()
-    if fixed and task is not None and _reads_fixed(task, log):
-        fixed = []
+    if fixed and task is not None:
+        free = [place for place in np.flatnonzero(varies).tolist() if place not in fixed]
+        if _reads_fixed(task, log) or _pays_by(task, log, after, free, fixed):
+            fixed = []
     start, end = before[log.offset[:-1]], after[log.offset[1:] - 1]
     places: list[Places] = []
     for skill, seen in enumerate(log.sees):
@@ -79,19 +81,51 @@ def _help(
     if len(rows) < FEWEST:
         return True
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(np.int64)]
-    moved = _standard(end[rows][:, rest].astype(np.float64) - start[rows][:, rest])
+    moved = end[rows][:, rest].astype(np.float64) - start[rows][:, rest]
     goal = log.goals.get(log.skills[skill])
     own = np.zeros((len(rows), 0)) if goal is None else goal[rows]
 
-    def error(places: Collection[int]) -> float:
-        seen = np.concatenate([start[rows][:, list(places)], own], 1)
-        points = _standard(seen.astype(np.float64)).astype(np.float32)
-        near, _ = nearest(points, points, NEIGHBOURS + 1, np.arange(len(rows)))
-        others = near != np.arange(len(rows))[:, None]
-        mean = (moved[near] * others[..., None]).sum(1) / others.sum(1)[:, None]
-        return float(np.square(mean - moved).mean())
+    def points(places: list[int]) -> Array:
+        return np.concatenate([start[rows][:, places], own], 1)
 
-    return error([*rest, *more]) < BETTER * error(rest)
+    return _predict(points(rest), points([*rest, *more]), moved)
+
+
+def _pays_by(
+    task: RewardMachine, log: CallColumns, after: Array, rest: list[int], more: list[int]
+) -> bool:
+    """Return whether ``more`` numbers beside ``rest`` help to predict what a task reads of steps.
+
+    The environment's reward, ``info`` and ends may follow from numbers that the task does not read.
+
+    Raises:
+        RunError: see ``read_log``.
+    """
+    if not rest or not (task.rewards or any(event.reads != "obs" for event in task.events)):
+        return False
+    known = read_log(task, log)
+    read = np.concatenate([known.events, known.values], 1)
+    odd = (read != np.median(read, 0)).any(1)  # seldom steps, as those that pay, count as much
+    rows = np.concatenate([
+        some[np.linspace(0, len(some) - 1, min(len(some), MOST // 2)).astype(np.int64)]
+        for some in map(np.flatnonzero, (odd, ~odd))
+    ])  # fmt: skip
+    at = after[rows]
+    return len(rows) > FEWEST and _predict(at[:, rest], at[:, [*rest, *more]], read[rows])
+
+
+def _predict(few: Array, many: Array, values: Array) -> bool:
+    """Return whether points ``many`` (n, F) predict values (n, D) better than ``few``."""
+    wanted = _standard(values.astype(np.float64))
+
+    def error(seen: Array) -> float:
+        points = _standard(seen.astype(np.float64)).astype(np.float32)
+        near, _ = nearest(points, points, NEIGHBOURS + 1, np.arange(len(points)))
+        others = near != np.arange(len(points))[:, None]
+        mean = (wanted[near] * others[..., None]).sum(1) / others.sum(1)[:, None]
+        return float(np.square(mean - wanted).mean())
+
+    return error(many) < BETTER * error(few)
 
 
 def _standard(values: Array) -> Array:

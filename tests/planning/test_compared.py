@@ -76,6 +76,22 @@ def test_a_goal_that_the_task_reads_counts(task: Any, wanted: list[int]) -> None
     assert planner.compared == {"go": wanted}
 
 
+@pytest.mark.parametrize("of_info", [False, True])
+def test_a_goal_counts_where_the_environment_pays_for_it(of_info: bool) -> None:
+    """A task that reads the reward reads the goal without its number."""
+    log = walks(to_goal=False)
+    home = (log.next_obs[:, 0] == log.next_obs[:, 1]).astype(np.float32)
+    column = home if of_info else np.zeros_like(home)
+    log = replace(log, reward=home - column, info={"home": column, "luck": home[::-1].copy()})
+
+    def pays(step: Any) -> Any:
+        return step.info["home"] if of_info else step.reward
+
+    assert Planner(log, pays).compared == {"go": [0, 1]}
+    assert Planner(log, lambda step: step.next_obs[:, 0] == 8).compared == {"go": [0]}
+    assert Planner(log, lambda step: step.info["luck"]).compared == {"go": [0]}
+
+
 def test_parts_of_a_dict() -> None:
     """Observations with "observation", "achieved_goal" and "desired_goal"."""
     plain = walks(to_goal=False)
