@@ -73,6 +73,12 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
         and (odd := odd_key(function, argument.info, ids))
     ):
         return f"; {odd}"
+    if step and argument.goal is None and "NoneType" in text:
+        return (
+            "; if it reads step.goal: that is None here, as only methods of a skill with a "
+            "goal_space get goals. The predicates and rewards of a task, and success as a word of "
+            "a mission, know no goal: write the predicate without it"
+        )
     if "read-only" in text:
         return "; its argument is read-only: change a copy"
     if "truth value of an array" in text:

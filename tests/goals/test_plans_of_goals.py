@@ -13,6 +13,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 
 import skillweave as sw
+from skillweave.errors import SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.selectors import LastCall
 from skillweave.skills.goal_spaces import choice_space, draw_from, from_numbers, numbers_in
@@ -254,3 +255,22 @@ def test_a_trained_selector_starts_from_a_plan_with_goals(tmp_path: Any) -> None
     assert other <= 0.2
     again = declared_again.load(tmp_path / "run")
     assert again.evaluate(3, quiet=True).returns == trained.evaluate(3, quiet=True).returns
+
+
+def of_its_goal(step: Any) -> Any:
+    return np.abs(step.next_obs - step.goal).max(1) < 0.3
+
+
+def of_a_part_of_its_goal(step: Any) -> Any:
+    return step.goal[:, 0] > 0
+
+
+@pytest.mark.parametrize("task", ["go_to", of_its_goal, of_a_part_of_its_goal])
+def test_a_task_knows_no_goal(task: Any) -> None:
+    run = ready()
+    log = run.log_calls(200)
+    with pytest.raises(SkillError, match="step.goal: that is None here, .* write the predicate"):
+        run.plan(task, log)
+    if callable(task):
+        with pytest.raises(SkillError, match="step.goal: that is None here, .* write the pred"):
+            log.hand_over(done={"go_to": task})
