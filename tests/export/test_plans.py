@@ -171,5 +171,7 @@ def test_a_plan_that_chooses_goals_is_refused(tmp_path: Path) -> None:
         walk = go_to(policy=lambda self, obs, goal: np.clip(5 * (goal - obs), -1, 1), **own)
         run = declared([walk, Rest()]).train(tmp_path / f"{goals is None}", quiet=True)
         planned = run.plan(near_corner, run.log_calls(600))
-        with pytest.raises(PolicyError, match=r"a plan that chooses goals \(go_to\).*with_selector"):
+        with pytest.raises(
+            PolicyError, match=r"a plan that chooses goals \(go_to\).*with_selector"
+        ):
             planned.export(tmp_path / "x")

@@ -269,8 +269,8 @@ def of_a_part_of_its_goal(step: Any) -> Any:
 def test_a_task_knows_no_goal(task: Any) -> None:
     run = ready()
     log = run.log_calls(200)
-    with pytest.raises(SkillError, match="step.goal: that is None here, .* write the predicate"):
+    with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the predicate"):
         run.plan(task, log)
     if callable(task):
-        with pytest.raises(SkillError, match="step.goal: that is None here, .* write the pred"):
+        with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the pred"):
             log.hand_over(done={"go_to": task})
