@@ -15,7 +15,7 @@ from skillweave.algorithms.parameters import ParameterGroup, member_setting
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.experience import Report
-from skillweave.networks.heads import ActionHead, ChoiceHead
+from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
 from skillweave.ops.moments import merge_moments
@@ -162,7 +162,7 @@ class Algorithm:
     config: Any
     layout: Layout
     acting: Layout
-    head: ActionHead | ChoiceHead
+    head: ActionHead | JointHead
     memory_size: int = 0
     """M, the size of an environment's recurrent state; 0: the networks have none."""
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import gymnasium as gym
 
 from skillweave.algorithms.schedules import LearningRate, check_rate
-from skillweave.errors import DeclarationError, RunError
+from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.named import Named
 from skillweave.networks.config import Network, check_critic
 from skillweave.reading import as_json, fit, shown
@@ -465,10 +465,11 @@ class Registration:
 _SPACES = gym.spaces
 _HOME = "skillweave.algorithms"
 _ANY = (_SPACES.Discrete, _SPACES.MultiDiscrete, _SPACES.MultiBinary, _SPACES.Box)
+_ALL = (*_ANY, _SPACES.Dict, _SPACES.Tuple)
 _REGISTERED: dict[str, Registration] = {
-    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ANY, chooses_goals="all"),
+    "PPO": Registration(PPO, f"{_HOME}.ppo:PPOAlgorithm", _ALL, chooses_goals="all"),
     "SelfImitationPPO": Registration(
-        SelfImitationPPO, f"{_HOME}.self_imitation:SelfImitationAlgorithm", _ANY
+        SelfImitationPPO, f"{_HOME}.self_imitation:SelfImitationAlgorithm", _ALL
     ),
     "SkillCritic": Registration(
         SkillCritic, f"{_HOME}.skill_critic:SkillCriticAlgorithm", (_SPACES.Discrete,), acts=False
@@ -522,13 +523,22 @@ def check_spaces(config: Any, action_space: gym.Space[Any], where: str = "") -> 
     if (goal_spaces := getattr(action_space, "goal_spaces", None)) is not None:
         _check_goals(config, goal_spaces, where)
         return
-    if not isinstance(action_space, registration_of(config).action_spaces):
-        able = [k for k, r in _REGISTERED.items() if r.acts]
-        able = [k for k in able if isinstance(action_space, _REGISTERED[k].action_spaces)]
+    if not _acts_in(registration_of(config), action_space):
+        able = [k for k, r in _REGISTERED.items() if r.acts and _acts_in(r, action_space)]
         raise DeclarationError(
             f"{where}{type(config).__name__} cannot act in {action_space}; "
             + (f"{', '.join(able)} can" if able else "no algorithm here can")
         )
+
+
+def _acts_in(registration: Registration, space: gym.Space[Any]) -> bool:
+    """Return whether an algorithm supports an action space.
+
+    Whole numbers of a Box are choices, as those of MultiDiscrete are.
+    """
+    if isinstance(space, _SPACES.Box) and space.dtype.kind != "f":
+        return _SPACES.MultiDiscrete in registration.action_spaces
+    return isinstance(space, registration.action_spaces)
 
 
 def _check_goals(config: Any, spaces: Mapping[str, gym.Space[Any]], where: str) -> None:
@@ -539,14 +549,18 @@ def _check_goals(config: Any, spaces: Mapping[str, gym.Space[Any]], where: str) 
     if able == "discrete" and not wrong:
         return
     if able == "all":
+        from skillweave.spaces.action_codec import action_codec  # needs torch
+
         for name, space in spaces.items():
-            real = isinstance(space, _SPACES.Box) and space.dtype.kind == "f"
-            if not real and not isinstance(space, choices):
+            try:
+                action_codec(space)
+            except EnvError:
                 raise DeclarationError(
                     f"{where}{type(config).__name__} cannot choose goals of {space}, which {name!r}"
-                    " has (goal_space): give it goals of Box with real numbers, Discrete, "
-                    "MultiDiscrete or MultiBinary, or a ready selector that returns (names, goals)"
-                )
+                    " has (goal_space): give it goals of Box (whole numbers with at most 256 "
+                    "values each, 10,000 in all), Discrete, MultiDiscrete, MultiBinary, Dict or "
+                    "Tuple of these, or a ready selector that returns (names, goals)"
+                ) from None
         return
     kind = "goals" if able == "no" else f"goals of {spaces[wrong[0]]}"
     raise DeclarationError(

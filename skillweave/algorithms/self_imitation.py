@@ -70,7 +70,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         """Create the state of fresh members, which have no kept row yet."""
         lead = (len(seeds), self.config.imitation_rows)
         width = self.codec.size
-        action = self.codec.from_env(np.asarray(self.action_space.sample())[None])
+        action = self.codec.zeros(1)
         space: gym.Space[Any] = self.observation_space
         obs = to_tensor(np.zeros((1, *obs_shape(space)), obs_dtype(space)))[0]
         return State(

@@ -11,7 +11,8 @@ from skillweave.arguments import checked_names
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.spaces import obs_dtype, obs_shape, put_observation
+from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces.packing import parts
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -121,7 +122,8 @@ class Player:
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
-        return action[0]
+        joint = parts(self.policy.action_space) is not None
+        return env_form(self.policy.action_space, action[0]) if joint else action[0]
 
     def _choose_goal(self, seen: Array) -> None:
         """Set the goal of the episode that starts with an observation (1, …)."""
@@ -135,7 +137,7 @@ class Player:
 
     def _allowed(self, mask: Any) -> Array:
         """Return a mask as a batch of one."""
-        if not isinstance(self.policy.action_space, DISCRETE):
+        if not isinstance(self.policy.action_space, DISCRETE):  # masks are ignored, as in training
             return np.ones((1, 1), bool)
         try:
             allowed = checked_mask(mask, self.policy.action_space)

@@ -380,9 +380,7 @@ class HierarchyCollector(Collector):
     @staticmethod
     def _no_actions(lead: tuple[int, int], space: gym.Space[Any]) -> Array:
         """Return the actions of a skill that has not acted, (T, N, …) in policy units."""
-        codec = action_codec(space)
-        units = codec.from_env(np.asarray(codec.space.sample())[None])
-        return np.zeros((*lead, *units.shape[1:]), units.dtype)
+        return action_codec(space).zeros(*lead)
 
     @staticmethod
     def _inside(

@@ -19,6 +19,7 @@ from skillweave.collecting.restored import ranges_of, stored_goals
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.infos import allowed_rows, random_actions
 from skillweave.skills.goals import Goals
+from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import Array, Memory, Step, prefixed
 
 
@@ -81,7 +82,7 @@ class StartPolicy:
         self._call(ids[~self._runs(ids)], obs, rng, last)
         runs = self._runs(ids)
         called, free = ids[runs], ids[~runs]
-        action: Array = np.empty((len(ids), *self._space.shape), self._space.dtype)  # type: ignore[misc]
+        action: Array = np.zeros((len(ids), *obs_shape(self._space)), obs_dtype(self._space))
         if len(called):
             allowed, turn = allowed_rows(mask, called), Turn(rng=rng, last_action=last_action)
             action[runs] = self._player.act_in_calls(

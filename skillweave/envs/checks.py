@@ -164,11 +164,19 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         """Give a notice where a key or attribute that is not used looks like an action mask."""
         space = self.env.observation_space
         actions = self.env.action_space
-        if not self._chooses or self._masks is not None or MASK in info:
-            return
-        if observes_mask(space, actions):
-            return
         observed = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+        if not self._chooses:
+            if not _is_real(actions) and (
+                MASK in info or MASK in observed or _attribute(self.env, "action_masks") is not None
+            ):
+                notice(
+                    f"{self._name}: its action mask is not used, as actions of {short(actions)} "
+                    "have none: every action counts as allowed. If that is wrong, let a wrapper "
+                    "(gymnasium.wrappers.TransformAction) make a MultiDiscrete of it"
+                )
+            return
+        if self._masks is not None or MASK in info or observes_mask(space, actions):
+            return
         names = (MASK, *LIKE_MASKS)
         similar = [f"info[{n!r}]" for n in names if n in info]
         similar += [f"the observation's {n!r}" for n in names if n in observed]
@@ -245,6 +253,11 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def _wrong(self, what: str) -> EnvError:
         where = f"environment {self._number}, " if self._number is not None else ""
         return EnvError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
+
+
+def _is_real(space: gym.Space[Any]) -> bool:
+    """Return whether actions are real numbers alone, which nobody expects to have masks."""
+    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)
 
 
 def _attribute(env: gym.Env[Any, Any], name: str) -> Any:

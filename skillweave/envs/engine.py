@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,7 +27,8 @@ from skillweave.envs.infos import ActionMasks, batched_infos
 from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.notices import are_collected, notice
 from skillweave.seeding import GlobalDraws
-from skillweave.spaces import obs_dtype, obs_shape, put_observation
+from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces.packing import parts
 from skillweave.types import Array, Step
 
 LOOKS = 12
@@ -135,12 +136,13 @@ class GymnasiumEngine:
         self._watch = Watch(name, self.observation_space, num_envs, first)
         self._name = name
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
-        empty = gym.vector.utils.create_empty_array(self.action_space, num_envs, np.zeros)
+        self._action_dtype = obs_dtype(self.action_space)
+        shape = num_envs, *obs_shape(self.action_space)
         self._all = np.arange(num_envs)
         self._root = 0
         self._episode = np.zeros(num_envs, np.int64)  # episodes started since the root seed
         self._seed = np.zeros(num_envs, np.int64)  # of the open episode
-        self._history = History(num_envs, np.asarray(empty))
+        self._history = History(num_envs, np.zeros(shape, self._action_dtype))
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
@@ -230,7 +232,7 @@ class GymnasiumEngine:
     def _act(self, action: Array, ids: Array | None) -> RawStep:
         rows = self._all if ids is None else ids
         # A copy: environments receive views of it, and may keep them.
-        acted = np.array(action, self.action_space.dtype)
+        acted = np.array(action, self._action_dtype)
         if self._draws.looks:
             self._draws.begin()
         next_obs, reward, terminated, truncated, info = self._envs.act(acted, rows)
@@ -270,6 +272,7 @@ class SyncEnvs:
         self._parts = self._dtype.names is not None
         self._over = np.zeros(len(self.envs), bool)  # True where the episode has ended
         self._discrete = isinstance(self.action_space, gym.spaces.Discrete)
+        self._joint = parts(self.action_space) is not None
 
     def begin(self, ids: Array, seeds: Array) -> tuple[Array, dict[str, Any]]:
         """Reset environments ``ids`` (n,) to ``seeds`` (n,).
@@ -301,8 +304,12 @@ class SyncEnvs:
         reward = np.zeros(n)
         terminated = np.zeros(n, bool)
         truncated = np.zeros(n, bool)
-        # A row without axes is a NumPy scalar, which a Box does not contain.
-        each = action.tolist() if self._discrete else map(np.asarray, action)
+        each: Iterable[Any]
+        if self._joint:
+            each = (env_form(self.action_space, one) for one in action)
+        else:
+            # A row without axes is a NumPy scalar, which a Box does not contain.
+            each = action.tolist() if self._discrete else map(np.asarray, action)
         for row, (i, one) in enumerate(zip(ids.tolist(), each, strict=True)):
             result = self.envs[i].step(one)
             observation, reward[row], terminated[row], truncated[row], info = result

@@ -79,10 +79,10 @@ class History:
         Raises:
             ValueError: it is not a history of N environments.
         """
-        length = state["length"]
+        length, action = state["length"], self._packed(state["action"])
         begins = state["begins"]
         fits = length.shape == self.length.shape and length.dtype.kind == "i"
-        if not fits or length.min(initial=0) < 0 or length.sum() != len(state["action"]):
+        if not fits or length.min(initial=0) < 0 or length.sum() != len(action):
             raise ValueError("lengths and actions of the history do not belong together")
         if begins.shape[1:] != (2,) or (begins < 0).any() or (begins[:, 0] > length.max()).any():
             raise ValueError("the history's episodes begin outside its actions")
@@ -92,5 +92,14 @@ class History:
         self._action = np.zeros((capacity, *self._action.shape[1:]), self._action.dtype)
         self._begins = np.zeros((capacity, len(self.length)), bool)
         done = np.arange(longest)[:, None] < self.length
-        self._action[:longest][done] = state["action"]
+        self._action[:longest][done] = action
         self._begins[tuple(begins.T)] = True
+
+    def _packed(self, action: Array) -> Array:
+        """Return actions of a file (n, …), where those with parts are bytes (n, K)."""
+        dtype = self._action.dtype
+        if dtype.fields is None or action.dtype == dtype:
+            return action
+        if action.dtype != np.uint8 or action.shape[1:] != (dtype.itemsize,):
+            raise ValueError(f"actions are {action.dtype} {action.shape}, not bytes of {dtype}")
+        return np.ascontiguousarray(action).view(dtype).reshape(len(action))

@@ -12,7 +12,7 @@ import numpy as np
 from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
-from skillweave.spaces import action_codec
+from skillweave.spaces import action_codec, obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Step
 
 
@@ -357,7 +357,9 @@ def random_actions(
 ) -> Array:
     """Draw n actions at random from a space, among those that ``mask`` (n, A) allows."""
     space.seed(int(rng.integers(2**31)))
-    drawn = np.stack([np.asarray(space.sample()) for _ in range(n)])
+    drawn = np.zeros((n, *obs_shape(space)), obs_dtype(space))
+    for row in range(n):
+        put_observation(space, drawn, row, space.sample())
     if mask is None:
         return drawn
     codec = action_codec(space)

@@ -26,7 +26,7 @@ from skillweave.messages import close_matches, error_text, short, shortened
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Check, check_fields
-from skillweave.spaces import obs_dtype, obs_shape, put_observation
+from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 
 MOST = 65_536
@@ -378,7 +378,6 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
     space = env.observation_space
     rng = np.random.default_rng(0)
     masks = ActionMasks(env.action_space, 1, observation_space=space)
-    discrete = isinstance(env.action_space, gym.spaces.Discrete)
     means = []
 
     def see(obs: Any, info: dict[str, Any], ended: bool = False) -> None:
@@ -392,9 +391,10 @@ def _step_seconds(env: gym.Env[Any, Any]) -> float:
         steps = 0
         until = time.perf_counter() + PIECE_SECONDS
         while steps == 0 or (steps < PIECE_STEPS and time.perf_counter() < until):
-            action = random_actions(env.action_space, 1, rng, masks.now)[0]
+            drawn = random_actions(env.action_space, 1, rng, masks.now)
+            action = env_form(env.action_space, drawn[0])
             began = time.perf_counter()
-            obs, _, terminated, truncated, info = env.step(int(action) if discrete else action)
+            obs, _, terminated, truncated, info = env.step(action)
             spent += time.perf_counter() - began
             steps += 1
             see(obs, info, terminated or truncated)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import MissingExtra, PolicyError
-from skillweave.networks.heads import ChoiceHead
+from skillweave.networks.heads import ActionHead, ChoiceHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
 from skillweave.spaces import ActionCodec, ChoiceCodec, ChoiceSpace, obs_dtype, obs_shape
 from skillweave.spaces.choices import NumberedChoiceCodec
@@ -197,11 +197,15 @@ def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
     if not isinstance(codec, ChoiceCodec):
         return _in_env_units(codec, action, getattr(head, "squash", False))
     assert isinstance(head, ChoiceHead)
-    parts = [action[..., :1]]
-    for i, goal in enumerate(head.goals):
-        in_env = _in_env_units(goal.codec, codec.units(action, i), goal.squash)
-        parts.append(in_env.reshape(1, -1))
-    return torch.cat([x.double() for x in parts], dim=1)
+    return _row(head, action)
+
+
+def _row(head: ActionHead | JointHead, action: Tensor) -> Tensor:
+    """Convert an action (1, …) with its parts to a row of numbers in the environment's units."""
+    if not isinstance(head, JointHead):
+        return _in_env_units(head.codec, action, head.squash).reshape(1, -1).double()
+    units = [head.codec.units(action, i) for i in range(len(head.heads))]
+    return torch.cat([_row(part, x) for part, x in zip(head.heads, units, strict=True)], dim=1)
 
 
 def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:

@@ -51,11 +51,6 @@ def part_entry(
         PolicyError: the runner cannot follow it.
     """
     whole, written, rest = part.whole_action_space, part.written, part.rest
-    if isinstance(whole, gym.spaces.Dict | gym.spaces.Tuple):
-        raise PolicyError(
-            f"{part.who} writes a part of a Dict action, which no runner follows yet: flatten the "
-            "actions with a wrapper, or keep to this library where it acts"
-        )
     if part.is_within:
         raise PolicyError(
             f"{part.who} acts where observations hold the state of a task, which no runner "

@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from skillweave.envs.infos import observes_mask
+from skillweave.errors import PolicyError
 from skillweave.export.graphs import dtype_to_json, inputs_of
 from skillweave.export.states import States
+from skillweave.messages import short
 from skillweave.runs.files import write_bytes
 from skillweave.skills.foreign_policy import checksum
 from skillweave.spaces import obs_dtype, obs_shape, space_to_json
@@ -58,6 +62,12 @@ def write_export(
         PolicyError: a part of it cannot be exported; the message names it, and what to do.
         MissingExtra: the packages that write ONNX are not installed.
     """
+    if isinstance(policy.action_space, gym.spaces.Dict | gym.spaces.Tuple):
+        raise PolicyError(
+            f"actions of {short(policy.action_space, 200)} cannot be exported, as the runner "
+            "returns one array: let a wrapper (gymnasium.wrappers.TransformAction) make a Box or a "
+            "MultiDiscrete of them and train with it, or act by run.player() where this library is"
+        )
     states = States(policy.action_space)
     entry = states.policy(policy)
     space = policy.observation_space

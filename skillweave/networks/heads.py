@@ -21,7 +21,7 @@ from skillweave.ops.distributions import (
     normal_stats,
     tanh_log_det,
 )
-from skillweave.spaces import ActionCodec, ChoiceCodec
+from skillweave.spaces import ActionCodec, ChoiceCodec, JointCodec
 from skillweave.spaces.choices import chosen
 from skillweave.types import Array
 
@@ -261,71 +261,61 @@ class ActionHead:
         return x[..., self._columns.on(x.device)]
 
 
-class ChoiceHead:
-    """The distribution of a skill and its goal: log π(k, g) = log π(k) + log π(g | k).
+class JointHead:
+    """The distribution of actions with several parts, which are independent of each other.
 
-    A network computes the logits of the choices, then the parameters of each skill's goal. The
-    goals of skills that are not chosen are drawn, but count for nothing; of the entropy that of the
-    chosen skill's goal counts. Its methods are those of ``ActionHead``; actions are (..., W) float
-    in policy units: the number of the choice, then all goals.
+    A network computes the parameters of each part, one after another. log π is the sum over the
+    parts, and so is the entropy. Its methods are those of ``ActionHead``; actions are (..., W)
+    float in policy units.
 
     Args:
-        codec: the codec of the choices.
+        codec: the codec of the actions.
         std: "parameter": deviations are parameters; "state": the network computes them.
-        squash: apply tanh to goals of a Box.
+        squash: apply tanh to parts of a Box.
     """
 
     discrete = False
     std_in_head = False
+    choices = 0
 
     def __init__(
         self,
-        codec: ChoiceCodec,
+        codec: JointCodec,
         std: Literal["parameter", "state"] = "parameter",
         squash: bool = False,
     ) -> None:
         self.codec = codec
-        self.choices = codec.choices
-        self.goals = tuple(ActionHead(part, std, squash) for _, part, _ in codec.goals)
-        self._owners = tuple(owner for _, _, owner in codec.goals)
-        self.width = self.choices + sum(head.width for head in self.goals)
-        self.log_std_size = sum(head.log_std_size for head in self.goals)
-        self.std_columns = [
+        self.heads: tuple[ActionHead | JointHead, ...] = tuple(
+            head_of(part, std, squash) for _, part in codec.members
+        )
+        self.width: int = sum(head.width for head in self.heads)
+        self.log_std_size: int = sum(head.log_std_size for head in self.heads)
+        self.squash: bool = any(head.squash for head in self.heads)
+        starts = [sum(h.width for h in self.heads[:i]) for i in range(len(self.heads))]
+        self.std_columns: list[int] = [
             first + column
-            for first, head in zip(
-                self._starts([h.width for h in self.goals]), self.goals, strict=True
-            )
+            for first, head in zip(starts, self.heads, strict=True)
             for column in head.std_columns
         ]
 
     @property
     def noises(self) -> tuple[tuple[str, int], ...]:
         """Return the kinds and widths of the noise of ``act``; see ``ActionHead``."""
-        return (("gumbel", self.choices), *(one for head in self.goals for one in head.noises))
-
-    def _starts(self, widths: Sequence[int]) -> list[int]:
-        """Return the first column of each goal, after the logits of the choices."""
-        return [self.choices + sum(widths[:i]) for i in range(len(widths))]
+        return tuple(one for head in self.heads for one in head.noises)
 
     def noise(self, generators: Sequence[torch.Generator], steps: int, batch: int) -> Tensor:
         """Draw noise for calls of ``act``; see ``ActionHead``."""
-        shape = (steps, batch, self.choices)
-        drawn = [gumbel(torch.rand(shape, generator=g, **FLOAT)) for g in generators]
-        parts = [torch.stack(drawn, dim=1)]
-        parts += [head.noise(generators, steps, batch) for head in self.goals]
-        return torch.cat(parts, dim=-1)
+        return torch.cat([head.noise(generators, steps, batch) for head in self.heads], dim=-1)
 
     def act(self, dist_params: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
-        """Return greedy or sampled choices with goals, (..., W)."""
-        logits, goals = self._split(dist_params, log_std)
-        drawn = self._split_noise(noise)
-        if drawn is None:
-            number = logits.argmax(-1)
-        else:
-            number = categorical_sample(logits, drawn[0])
-        parts = [number[..., None].to(dist_params.dtype)]
-        for i, (head, params, std) in enumerate(goals):
-            action = head.act(params, std, None if drawn is None else drawn[1 + i])
+        """Return greedy or sampled actions, (..., W)."""
+        drawn: Sequence[Tensor | None] = [None] * len(self.heads)
+        if noise is not None:
+            widths = [sum(size for _, size in head.noises) for head in self.heads]
+            drawn = noise.split(widths, dim=-1)
+        parts = []
+        for (head, params, std), one in zip(self._split(dist_params, log_std), drawn, strict=True):
+            action = head.act(params, std, one)
             action = action if not head.discrete or head.codec.multi else action[..., None]
             parts.append(action.to(dist_params.dtype))
         return torch.cat(parts, dim=-1)
@@ -333,13 +323,103 @@ class ChoiceHead:
     def stats(
         self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Compute log-probabilities of choices and the entropy; see ``ActionHead``."""
-        logits, goals = self._split(dist_params, log_std)
-        number = action[..., 0]
-        log_prob, entropy = categorical_stats(mask_logits(logits, mask), number.long())
-        for i, (head, params, std) in enumerate(goals):
+        """Compute log-probabilities of actions and the entropy; there is no ``mask``."""
+        log_prob = entropy = torch.zeros_like(dist_params[..., 0])
+        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)):
             one, spread = head.stats(params, std, None, self.codec.units(action, i))
-            counts = chosen(number, self._owners[i])
+            log_prob, entropy = log_prob + one, entropy + spread
+        return log_prob, entropy
+
+    def surplus(self, dist_params: Tensor, log_std: Tensor | None) -> Tensor | None:
+        """Compute the cost of too much entropy; see ``ActionHead``."""
+        found = [
+            head.surplus(params, std) for head, params, std in self._split(dist_params, log_std)
+        ]
+        costs = [cost for cost in found if cost is not None]
+        return sum(costs[1:], costs[0]) if costs else None
+
+    def kl(
+        self,
+        dist_params: Tensor,
+        log_std: Tensor | None,
+        other: Tensor,
+        other_log_std: Tensor | None,
+        mask: Tensor | None,
+    ) -> Tensor:
+        """Compute KL(p ‖ q), the sum over the parts; there is no ``mask``."""
+        pairs = zip(
+            self._split(dist_params, log_std), self._split(other, other_log_std), strict=True
+        )
+        total = torch.zeros_like(dist_params[..., 0])
+        for (head, params, std), (_, theirs, their_std) in pairs:
+            total = total + head.kl(params, std, theirs, their_std, None)
+        return total
+
+    def to_env(self, action: Array) -> Array:
+        """Convert an ``action`` (n, W) from policy units to the environment's (n,)."""
+        return self.codec.to_env(self.squashed(action) if self.squash else action)
+
+    def squashed(self, action: Array) -> Array:
+        """Return actions (n, W) with tanh applied to the parts that need it."""
+        action = action.copy()
+        for head, columns in zip(self.heads, self.codec.columns, strict=True):
+            part = action[:, columns]
+            if isinstance(head, JointHead):
+                action[:, columns] = head.squashed(part)
+            elif head.squash:
+                action[:, columns] = torch.from_numpy(part).tanh().numpy()
+        return action
+
+    def _split(
+        self, dist_params: Tensor, log_std: Tensor | None
+    ) -> list[tuple[ActionHead | JointHead, Tensor, Tensor | None]]:
+        """Return the head, parameters and log deviation of each part."""
+        found, start, first = [], 0, 0
+        for head in self.heads:
+            params = dist_params[..., start : start + head.width]
+            std = None
+            if head.log_std_size:
+                assert log_std is not None
+                std = log_std[..., first : first + head.log_std_size]
+            found.append((head, params, std))
+            start, first = start + head.width, first + head.log_std_size
+        return found
+
+
+class ChoiceHead(JointHead):
+    """The distribution of a skill and its goal: log π(k, g) = log π(k) + log π(g | k).
+
+    A network computes the logits of the choices, then the parameters of each skill's goal. The
+    goals of skills that are not chosen are drawn, but count for nothing; of the entropy that of the
+    chosen skill's goal counts. Actions are the number of the choice, then all goals.
+
+    Args:
+        codec: the codec of the choices.
+        std: as of ``JointHead``.
+        squash: apply tanh to goals of a Box.
+    """
+
+    codec: ChoiceCodec
+
+    def __init__(
+        self,
+        codec: ChoiceCodec,
+        std: Literal["parameter", "state"] = "parameter",
+        squash: bool = False,
+    ) -> None:
+        super().__init__(codec, std, squash)
+        self.choices = codec.choices
+        self.goals = self.heads[1:]
+
+    def stats(
+        self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Compute log-probabilities of choices and the entropy; see ``ActionHead``."""
+        (choice, logits, _), *goals = self._split(dist_params, log_std)
+        log_prob, entropy = choice.stats(logits, None, mask, self.codec.units(action, 0))
+        for i, (head, params, std) in enumerate(goals):
+            one, spread = head.stats(params, std, None, self.codec.units(action, 1 + i))
+            counts = chosen(action[..., 0], self.codec.owners[i])
             log_prob = log_prob + torch.where(counts, one, 0.0)
             entropy = entropy + torch.where(counts, spread, 0.0)
         return log_prob, entropy
@@ -347,17 +427,11 @@ class ChoiceHead:
     def of_goals(self, dist_params: Tensor, log_std: Tensor | None, action: Tensor) -> Tensor:
         """Compute log π(g | k) of choices (…, W), (…); 0 where the chosen skill has no goals."""
         log_prob = torch.zeros_like(dist_params[..., 0])
-        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)[1]):
-            one = head.stats(params, std, None, self.codec.units(action, i))[0]
-            log_prob = log_prob + torch.where(chosen(action[..., 0], self._owners[i]), one, 0.0)
+        for i, (head, params, std) in enumerate(self._split(dist_params, log_std)[1:]):
+            one = head.stats(params, std, None, self.codec.units(action, 1 + i))[0]
+            counts = chosen(action[..., 0], self.codec.owners[i])
+            log_prob = log_prob + torch.where(counts, one, 0.0)
         return log_prob
-
-    def surplus(self, dist_params: Tensor, log_std: Tensor | None) -> Tensor | None:
-        """Compute the cost of too much entropy of goals; see ``ActionHead``."""
-        _, goals = self._split(dist_params, log_std)
-        found = [head.surplus(params, std) for head, params, std in goals]
-        costs = [cost for cost in found if cost is not None]
-        return sum(costs[1:], costs[0]) if costs else None
 
     def kl(
         self,
@@ -371,55 +445,26 @@ class ChoiceHead:
 
         A guide is q by its choices alone: ``other`` (..., choices) has no goals.
         """
-        logits, goals = self._split(dist_params, log_std)
-        masked = mask_logits(logits, mask)
-        of_choices = categorical_kl(masked, mask_logits(other[..., : self.choices], mask))
+        (choice, logits, _), *goals = self._split(dist_params, log_std)
+        of_choices = choice.kl(logits, None, other[..., : self.choices], None, mask)
         if other.shape[-1] == self.choices:
             return of_choices
-        share, total = masked.softmax(-1), of_choices
+        share, total = mask_logits(logits, mask).softmax(-1), of_choices
         for owner, mine, theirs in zip(
-            self._owners, goals, self._split(other, other_log_std)[1], strict=True
+            self.codec.owners, goals, self._split(other, other_log_std)[1:], strict=True
         ):
             head, params, std = mine
             divergence = head.kl(params, std, theirs[1], theirs[2], None)
             total = total + share[..., owner[0] : owner[1]].sum(-1) * divergence
         return total
 
-    def to_env(self, action: Array) -> Array:
-        """Convert an ``action`` (n, W) from policy units to choices (n,)."""
-        if not any(head.squash for head in self.goals):
-            return self.codec.to_env(action)
-        action = action.copy()
-        for head, columns in zip(self.goals, self.codec.columns, strict=True):
-            if head.squash:
-                action[:, columns] = torch.from_numpy(action[:, columns]).tanh().numpy()
-        return self.codec.to_env(action)
-
-    def _split(
-        self, dist_params: Tensor, log_std: Tensor | None
-    ) -> tuple[Tensor, list[tuple[ActionHead, Tensor, Tensor | None]]]:
-        """Return the logits of choices; and the head, parameters and deviation of each goal."""
-        goals, start, first = [], self.choices, 0
-        for head in self.goals:
-            params = dist_params[..., start : start + head.width]
-            std = None
-            if head.log_std_size:
-                assert log_std is not None
-                std = log_std[..., first : first + head.log_std_size]
-            goals.append((head, params, std))
-            start, first = start + head.width, first + head.log_std_size
-        return dist_params[..., : self.choices], goals
-
-    def _split_noise(self, noise: Tensor | None) -> list[Tensor] | None:
-        if noise is None:
-            return None
-        return list(noise.split([size for _, size in self.noises], dim=-1))
-
 
 def head_of(
     codec: ActionCodec, std: Literal["parameter", "state"] = "parameter", squash: bool = False
-) -> ActionHead | ChoiceHead:
+) -> ActionHead | JointHead:
     """Return the head of an action space, or of a selector's choices with goals."""
     if isinstance(codec, ChoiceCodec):
         return ChoiceHead(codec, std, squash)
+    if isinstance(codec, JointCodec):
+        return JointHead(codec, std, squash)
     return ActionHead(codec, std, squash)

@@ -149,8 +149,12 @@ def _fields(
     for name, kind in TYPES.items():
         _check(name, columns[name], shapes[name], np.dtype(kind))
     for name, rows in (("start", calls), ("next_obs", steps)):
-        columns[name] = _observations(name, columns[name], spaces["observation_space"], rows)
-    _check("action", columns["action"], (steps, *(spaces["action_space"].shape or ())), None)
+        columns[name] = _packed(name, columns[name], spaces["observation_space"], rows)
+    acts = spaces["action_space"]
+    if obs_dtype(acts).fields is None:
+        _check("action", columns["action"], (steps, *(acts.shape or ())), None)
+    else:
+        columns["action"] = _packed("action", columns["action"], acts, steps)
     for key in info:
         _check(INFO + key, columns[INFO + key], (steps, *columns[INFO + key].shape[1:]), None)
     for name in goals:
@@ -180,8 +184,8 @@ def _check(name: str, x: Array, shape: tuple[int, ...], dtype: Any) -> None:
         raise ValueError(f"{name!r} is not finite")
 
 
-def _observations(name: str, x: Array, space: gym.Space[Any], rows: int) -> Array:
-    """Return observations as they were, structured ones from their bytes."""
+def _packed(name: str, x: Array, space: gym.Space[Any], rows: int) -> Array:
+    """Return observations or actions as they were, structured ones from their bytes."""
     dtype = obs_dtype(space)
     if dtype.fields is None:
         _check(name, x, (rows, *obs_shape(space)), dtype)

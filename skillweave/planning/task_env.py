@@ -16,7 +16,7 @@ from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.task import Task
 from skillweave.spaces import obs_dtype, obs_shape
-from skillweave.spaces.packing import put_observation
+from skillweave.spaces.packing import parts, put_observation
 from skillweave.types import Array, Step
 
 OBSERVATION, TASK = "observation", "task"
@@ -112,7 +112,7 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         after = self._batch_of_one(obs)
         step = Step(
             obs=self._obs,
-            action=np.asarray(action)[None],
+            action=self._packed(action),
             next_obs=after,
             reward=np.array([reward], np.float32),
             terminated=np.array([terminated], bool),
@@ -143,6 +143,15 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
             return obs
         own = obs if isinstance(self._own, gym.spaces.Dict) else {OBSERVATION: obs}
         return {**own, TASK: self.machine.observe(self._state)[0]}
+
+    def _packed(self, action: Any) -> Array:
+        """Return an action as skills see it, (1, *action_shape)."""
+        space = self.action_space
+        if parts(space) is None:
+            return np.asarray(action)[None]
+        batch = np.zeros(1, obs_dtype(space))
+        put_observation(space, batch, 0, action)
+        return batch
 
     def _batch_of_one(self, obs: Any) -> Array:
         """Return an observation as skills see it, (1, *obs_shape)."""

@@ -6,10 +6,11 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from gymnasium import Space
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, SkillError
@@ -17,7 +18,7 @@ from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
-from skillweave.skills.goal_spaces import draw_from
+from skillweave.skills.goal_spaces import draw_from, repeated
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import as_array, called, checked_actions
 from skillweave.skills.own_part import declared_acts, declared_sees
@@ -351,6 +352,9 @@ class Reflex:
     def fixed(self, space: Space[Any]) -> Array:
         """Return a fixed action as an element of ``space``, (...)."""
         label, shape = f"{self._label}: action", space.shape or ()
+        if isinstance(space, Dict | Tuple):
+            batch = repeated(space, self.action, 1)
+            return cast(Array, checked_actions(batch, 1, space, label, DeclarationError)[0])
         value = as_array(self.action, label, DeclarationError)
         # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
         row = np.full(shape, value) if value.shape == () else value
@@ -368,7 +372,7 @@ class Reflex:
             return np.repeat(self.fixed(space)[None], n, axis=0)
         result = called(self.action, obs, label)
         actions = checked_actions(result, n, space, label, SkillError)
-        probe(self.action, obs, n, label, space.shape or ())
+        probe(self.action, obs, n, label, space)
         return actions
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
@@ -139,10 +140,15 @@ def checked_actions(
 ) -> Array:
     """Convert ``value`` to actions (n, *shape) of ``space``, clipped to the bounds of a Box.
 
+    Actions of a Dict or Tuple are a dict or tuple of arrays, or one array of ``pack``; they become
+    one array (n,).
+
     Raises:
         PolicyError: the shape or the type of number is wrong, or an action does not exist; the
             message names ``who`` and the space. ``kind`` is the type of the error.
     """
+    if isinstance(space, Dict | Tuple):
+        return _checked_parts(value, n, space, who, kind)
     action, shape = as_array(value, who, kind), (n, *(space.shape or ()))
     if action.shape != shape:
         raise kind(
@@ -162,6 +168,33 @@ def checked_actions(
         wrong = action[(action < bounds[0]) | (action >= bounds[1])][0]
         raise kind(f"{who} returned {wrong}, which is no action of {space}")
     return action.astype(space.dtype, copy=False)
+
+
+def _checked_parts(
+    value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError]
+) -> Array:
+    """Convert the parts of actions to one array (n,); see ``checked_actions``."""
+    from skillweave.spaces.packing import obs_dtype, parts  # needs torch
+
+    named = parts(space) or {}
+    given: Any = value
+    if isinstance(value, tuple | list) and isinstance(space, Tuple):
+        given = dict(zip(map(str, range(len(value))), value, strict=True))
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        given = {name: value[name] for name in value.dtype.names}
+    if not isinstance(given, Mapping) or set(given) != set(named):
+        what = f"a dict of arrays for {', '.join(map(repr, named))}"
+        if isinstance(space, Tuple):
+            what = f"a tuple of {len(named)} arrays"
+        has = short(list(given)) if isinstance(given, Mapping) else short(value)
+        raise kind(
+            f"{who} returned {has}, but {what} was expected, each with a row for each of the {n} "
+            f"environments: actions are of {short(space)}"
+        )
+    action = np.zeros(n, obs_dtype(space))
+    for name, part in named.items():
+        action[name] = checked_actions(given[name], n, part, f"{who}: part {name!r}", kind)
+    return action
 
 
 def decoded(
@@ -184,6 +217,12 @@ def decoded(
     if output.dtype.kind in "iub" or isinstance(space, Box):
         flat = output.shape == (n, int(np.prod(shape)))  # the last layer of a network is flat
         return checked_actions(output.reshape(n, *shape) if flat else output, n, space, who)
+    if isinstance(space, Dict | Tuple):
+        raise PolicyError(
+            f"{who} is a network, whose one output cannot be read as actions of {short(space)}: "
+            "call it in a function that returns a dict or tuple of arrays, or let its skill write "
+            "one part alone (acts)"
+        )
     width = _width(space)
     if output.shape != (n, width):
         raise PolicyError(

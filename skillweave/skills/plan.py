@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError
@@ -305,6 +305,10 @@ class Plan:
     ) -> None:
         self.mapping = mapping
         self.who = who
+        if mapping.chunk is not None and isinstance(action_space, Dict | Tuple):
+            raise PolicyError(
+                f"{who}: chunk needs actions of one array, but they are of {short(action_space)}"
+            )
         self.spaces = observation_space, action_space
         self.outputs = Outputs(mapping.acts, action_space, who)
         self.states = tuple(states)
@@ -336,9 +340,11 @@ class Plan:
         if self.mapping.remembers_output:
             memory["last"] = np.zeros((n, self.outputs.count), np.float64)
         if self.mapping.period > 1:
+            from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
+
             action = self.spaces[1]
-            held = (n, self.mapping.chunk or 1, *(action.shape or ()))
-            memory |= {"phase": np.zeros(n, np.int64), "held": np.zeros(held, action.dtype)}
+            held = (n, self.mapping.chunk or 1, *obs_shape(action))
+            memory |= {"phase": np.zeros(n, np.int64), "held": np.zeros(held, obs_dtype(action))}
         return memory
 
     def read(self, obs: Array, last: Array | None, goal: Array | None) -> dict[str, Array]:

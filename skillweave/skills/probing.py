@@ -22,9 +22,11 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium import Space
 
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import error_text
+from skillweave.skills.goal_spaces import parts_of
 from skillweave.types import Array, Step, read_only
 
 MOST = 256
@@ -76,7 +78,7 @@ def probe(
     given: Step | Array | tuple[Any, ...],
     n: int,
     who: str,
-    shape: tuple[int, ...] = (),
+    space: Space[Any] | None = None,
     kind: type[SkillweaveError] = SkillError,
     answered: Array | None = None,
 ) -> None:
@@ -87,7 +89,7 @@ def probe(
         given: its argument, or arguments: a step, or arrays whose first axis has n rows.
         n: environments.
         who: the function's name in messages.
-        shape: the shape of its result for one environment.
+        space: of its result for one environment; None: a number.
         kind: the type of the error: PolicyError if the function is a policy.
         answered: (n,) what it has returned, and must return again; None: it may change.
 
@@ -116,12 +118,23 @@ def probe(
                     f"{who} answers for {n} environments, but for {m} it raised "
                     f"{error_text(error)}: {AXIS}"
                 ) from error
-            actual, wanted = np.shape(answer), (m, *shape)
-            if actual != wanted and certain:
-                raise kind(
-                    f"{who} returned shape {actual} for {m} environments, but {wanted} was "
-                    f"expected; for {n} its shape was right by chance: {AXIS}"
-                )
+            for part, shape in _leaves(answer, space):
+                actual, wanted = np.shape(part), (m, *shape)
+                if actual != wanted and certain:
+                    raise kind(
+                        f"{who} returned shape {actual} for {m} environments, but {wanted} was "
+                        f"expected; for {n} its shape was right by chance: {AXIS}"
+                    )
+
+
+def _leaves(answer: Any, space: Space[Any] | None) -> Iterator[tuple[Any, tuple[int, ...]]]:
+    """Yield the parts of a result of ``space``, and the shape of each for one environment."""
+    inner = None if space is None else parts_of(space)
+    if inner is None:
+        yield answer, () if space is None else space.shape or ()
+        return
+    for i, (name, part) in enumerate(inner.items()):
+        yield from _leaves(answer[i if isinstance(answer, tuple | list) else name], part)
 
 
 def _check_again(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
@@ -22,7 +23,7 @@ from skillweave.skills.mapped import (
     state_shapes,
 )
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called, required_arguments
+from skillweave.skills.outputs import as_array, called, checked_actions, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.types import Array, Memory, read_only
 
@@ -88,7 +89,8 @@ class ScriptedPolicy(MappedPolicy):
         action, after = parted(value, mapping, who)
         # Copies: the function may return the same arrays each time.
         arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
-        return as_array(action, who, PolicyError), rows_first(arrays, mapping.state, who)
+        n = len(next(iter(arguments.values())))
+        return self._array(action, n), rows_first(arrays, mapping.state, who)
 
     @property
     def takes_goal(self) -> bool:
@@ -120,14 +122,24 @@ class ScriptedPolicy(MappedPolicy):
                 return function(obs, goal=goal) if by_name else function(obs, goal)
 
             action = called(both, given, who, kind=PolicyError)
-            return as_array(action, who, PolicyError)
-        action = as_array(called(function, given, who, kind=PolicyError), who, PolicyError)
+            return self._array(action, len(given))
+        value = called(function, given, who, kind=PolicyError)
+        action = self._array(value, len(given))
         mapping = self.mapping
-        if self.action_space is not None and mapping.acts is None and mapping.chunk is None:
-            shape = self.action_space.shape or ()
-            if action.shape == (len(given), *shape):
-                probe(self.function, given, len(given), who, shape, PolicyError)
+        space, n = self.action_space, len(given)
+        if space is not None and mapping.acts is None and mapping.chunk is None:
+            shape = space.shape or ()
+            if action.shape == (n, *shape):
+                probe(function, given, n, who, space, PolicyError)
         return action
+
+    def _array(self, value: Any, n: int) -> Array:
+        """Return what the function returned for n observations as one array."""
+        if isinstance(value, Mapping):
+            self.must_be_bound()
+        if isinstance(self.action_space, Dict | Tuple):
+            return checked_actions(value, n, self.action_space, self._who)
+        return as_array(value, self._who, PolicyError)
 
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
         """Return the declared shapes of its state, in float64."""

@@ -4,7 +4,7 @@
 networks; ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
-from skillweave.spaces.action_codec import ActionCodec, action_codec
+from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
 from skillweave.spaces.choices import (
     ChoiceCodec,
     ChoiceSpace,
@@ -13,17 +13,19 @@ from skillweave.spaces.choices import (
     numbered_choice_codec,
 )
 from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
-from skillweave.spaces.packing import obs_dtype, obs_shape, pack, put_observation, unpack
+from skillweave.spaces.packing import env_form, obs_dtype, obs_shape, pack, put_observation, unpack
 from skillweave.spaces.saving import same_space, space_from_json, space_to_json
 
 __all__ = [
     "ActionCodec",
     "ChoiceCodec",
     "ChoiceSpace",
+    "JointCodec",
     "NumberedChoiceCodec",
     "ObsCodec",
     "action_codec",
     "choice_codec",
+    "env_form",
     "numbered_choice_codec",
     "obs_codec",
     "obs_dtype",

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import EnvError
-from skillweave.spaces.action_advice import unsupported_action
-from skillweave.spaces.packing import check_size
+from skillweave.spaces.action_advice import unsupported_action, values_of
+from skillweave.spaces.packing import check_size, obs_dtype, parts
 from skillweave.types import Array
 
 
@@ -22,14 +22,15 @@ from skillweave.types import Array
 class ActionCodec:
     """A converter of actions of one space.
 
-    In policy units, discrete actions count from 0: (n,) int64, or (n, K) if ``multi``. Actions of a
-    Box are (n, A) float32, where each dimension with two bounds spans [−1, 1].
+    In policy units, discrete actions count from 0: (n,) int64, or (n, K) if ``multi``; so do the
+    whole numbers of a Box. Real numbers of a Box are (n, A) float32, where each dimension with two
+    bounds spans [−1, 1].
     """
 
     space: gym.Space[Any]
-    parts: tuple[int, ...]  # number of values of each part; () for a Box
-    low: Array | None = None  # (A,) of a Box; the first values, if they are not all 0
-    high: Array | None = None  # (A,) of a Box
+    parts: tuple[int, ...]  # number of values of each part; () for real numbers
+    low: Array | None = None  # (A,) of real numbers; the first values, if they are not all 0
+    high: Array | None = None  # (A,) of real numbers
 
     @property
     def discrete(self) -> bool:
@@ -39,7 +40,8 @@ class ActionCodec:
     @property
     def multi(self) -> bool:
         """Return whether an action has several discrete parts."""
-        return isinstance(self.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
+        several = gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
+        return bool(self.parts) and isinstance(self.space, several)
 
     @cached_property
     def size(self) -> int:
@@ -72,6 +74,12 @@ class ActionCodec:
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
         return units.astype(np.float32)
 
+    def zeros(self, *lead: int) -> Array:
+        """Return actions (*lead, …) in policy units whose numbers are 0."""
+        if not self.discrete:
+            return np.zeros((*lead, self.size), np.float32)
+        return np.zeros((*lead, *([len(self.parts)] if self.multi else [])), np.int64)
+
     def check(self, action: Tensor) -> None:
         """Raise a ValueError where actions in policy units (…) are not in this space."""
         if self.discrete:
@@ -93,12 +101,80 @@ class ActionCodec:
         return self.low, span, np.isfinite(span)
 
 
+@dataclass(frozen=True)
+class JointCodec(ActionCodec):
+    """A converter of actions with several parts, each of which has a codec.
+
+    In policy units an action is a row of float32: its parts, one after another, each as its own
+    codec has them.
+    """
+
+    members: tuple[tuple[str, ActionCodec], ...] = ()
+    """The names and codecs of the parts."""
+
+    @cached_property
+    def columns(self) -> tuple[slice, ...]:
+        """Return the columns of each part in policy units."""
+        found, start = [], 0
+        for _, codec in self.members:
+            width = max(1, len(codec.parts)) if codec.discrete else codec.size
+            found.append(slice(start, start + width))
+            start += width
+        return tuple(found)
+
+    @cached_property
+    def size(self) -> int:
+        """Return the numbers of an action in policy units."""
+        last: int = self.columns[-1].stop
+        return last
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """Return the type of actions in the environment's units."""
+        return obs_dtype(self.space)
+
+    def units(self, action: Any, at: int) -> Any:
+        """Return the parts ``at`` of actions (…, size) as their own codec has them."""
+        codec, part = self.members[at][1], action[..., self.columns[at]]
+        if not codec.discrete:
+            return part
+        part = part.long() if isinstance(part, Tensor) else part.astype(np.int64)
+        return part if codec.multi else part[..., 0]
+
+    def to_env(self, action: Array) -> Array:
+        """Convert policy units (n, size) to actions (n,), a part of which is ``action[name]``."""
+        found = np.zeros(len(action), self.dtype)
+        for at, (name, codec) in enumerate(self.members):
+            found[name] = codec.to_env(self.units(action, at))
+        return found
+
+    def from_env(self, action: Array) -> Array:
+        """Convert actions (n,) to policy units (n, size)."""
+        found = np.zeros((len(action), self.size), np.float32)
+        for at, (name, codec) in enumerate(self.members):
+            units = codec.from_env(np.asarray(action[name]))
+            found[:, self.columns[at]] = units.reshape(len(units), -1)
+        return found
+
+    def check(self, action: Tensor) -> None:
+        """Raise a ValueError where actions in policy units (…, size) are not in this space."""
+        if not bool(action.isfinite().all()):
+            raise ValueError("an action of its rows is not finite")
+        for at, (_, codec) in enumerate(self.members):
+            part = action[..., self.columns[at]]
+            if codec.discrete and not bool((part == part.trunc()).all()):
+                raise ValueError("an action of its rows does not exist")
+            codec.check(self.units(action, at))
+
+
 def action_codec(space: gym.Space[Any]) -> ActionCodec:
     """Return the codec of an action space.
 
     Raises:
         EnvError: the space is not supported; the message names supported ones.
     """
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        return _joint(space)
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
     if not isinstance(space, kinds):
         raise unsupported_action(space)
@@ -111,9 +187,33 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
         return ActionCodec(space, tuple(space.nvec.reshape(-1).tolist()), _first(space.start))
     if isinstance(space, gym.spaces.MultiBinary):
         return ActionCodec(space, (2,) * int(np.prod(space.shape)))
-    if isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating):
-        return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
-    raise unsupported_action(space)
+    if not np.issubdtype(space.dtype, np.floating):
+        counts = values_of(space)
+        if counts is None:
+            raise unsupported_action(space)
+        return ActionCodec(space, tuple(counts.tolist()), _first(space.low.reshape(-1)))
+    return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
+
+
+def _joint(space: gym.Space[Any]) -> JointCodec:
+    """Return the codec of a Dict or Tuple.
+
+    Raises:
+        EnvError: one of its parts is not supported.
+    """
+    named = parts(space)
+    assert named is not None
+    members = tuple((name, action_codec(part)) for name, part in named.items())
+    codec = JointCodec(space, (), members=members)
+    check_size(space, "action", _outputs(codec))
+    return codec
+
+
+def _outputs(codec: ActionCodec) -> int:
+    """Return the number of logits and means of an action."""
+    if not isinstance(codec, JointCodec):
+        return codec.size
+    return sum(_outputs(part) for _, part in codec.members)
 
 
 def _width(space: gym.Space[Any]) -> int:

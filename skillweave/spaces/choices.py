@@ -18,7 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.errors import EnvError
-from skillweave.spaces.action_codec import ActionCodec, action_codec
+from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
 from skillweave.spaces.packing import obs_dtype
 from skillweave.types import Array
 
@@ -78,77 +78,36 @@ def _leaves(goal: Array) -> list[Array]:
 
 
 @dataclass(frozen=True)
-class ChoiceCodec(ActionCodec):
+class ChoiceCodec(JointCodec):
     """A converter of choices with goals.
 
     In policy units a choice is a row of float32: its number, then the goals of all skills, each as
-    an ``ActionCodec`` has them.
+    its own codec has them. Its members are "skill" and each skill that has goals.
     """
 
-    goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
-    """Of each skill with goals: its name, their codec, and the numbers that choose it."""
+    owners: tuple[tuple[int, int], ...] = ()
+    """Of each skill with goals the numbers that choose it."""
 
     @property
     def choices(self) -> int:
         """Return the number of choices."""
-        space = self.space
-        assert isinstance(space, ChoiceSpace)
-        return space.choices
-
-    @cached_property
-    def columns(self) -> tuple[slice, ...]:
-        """Return the columns of each skill's goal in policy units."""
-        found, start = [], 1
-        for _, codec, _ in self.goals:
-            width = max(1, len(codec.parts)) if codec.discrete else codec.size
-            found.append(slice(start, start + width))
-            start += width
-        return tuple(found)
-
-    @cached_property
-    def size(self) -> int:
-        """Return the numbers of a choice in policy units."""
-        last: int = self.columns[-1].stop
-        return last
-
-    @cached_property
-    def _dtype(self) -> np.dtype[Any]:
-        return obs_dtype(self.space)
-
-    def units(self, action: Any, at: int) -> Any:
-        """Return the goals ``at`` of choices (…, size) as their own codec has them."""
-        codec, part = self.goals[at][1], action[..., self.columns[at]]
-        if not codec.discrete:
-            return part
-        part = part.long() if isinstance(part, Tensor) else part.astype(np.int64)
-        return part if codec.multi else part[..., 0]
+        return self.members[0][1].size
 
     def to_env(self, action: Array) -> Array:
         """Convert policy units (n, size) to choices (n,)."""
-        choice = np.zeros(len(action), self._dtype)
-        choice[SKILL] = action[:, 0].astype(np.int64)
-        for at, (name, codec, _) in enumerate(self.goals):
-            choice[GOAL][name] = codec.to_env(self.units(action, at))
+        choice = np.zeros(len(action), self.dtype)
+        for at, (name, codec) in enumerate(self.members):
+            part = choice[GOAL] if at else choice
+            part[name] = codec.to_env(self.units(action, at))
         return choice
 
     def from_env(self, action: Array) -> Array:
         """Convert choices (n,) to policy units (n, size)."""
         found = np.zeros((len(action), self.size), np.float32)
-        found[:, 0] = action[SKILL]
-        for at, (name, codec, _) in enumerate(self.goals):
-            units = codec.from_env(np.asarray(action[GOAL][name]))
+        for at, (name, codec) in enumerate(self.members):
+            units = codec.from_env(np.asarray((action[GOAL] if at else action)[name]))
             found[:, self.columns[at]] = units.reshape(len(units), -1)
         return found
-
-    def check(self, action: Tensor) -> None:
-        """Raise a ValueError where choices in policy units (…, size) do not exist."""
-        if not bool(action.isfinite().all()):
-            raise ValueError("a choice of its rows is not finite")
-        number = action[..., 0]
-        if not bool(((number >= 0) & (number < self.choices) & (number == number.trunc())).all()):
-            raise ValueError("a choice of its rows does not exist")
-        for at, (_, codec, _) in enumerate(self.goals):
-            codec.check(self.units(action, at))
 
 
 def choice_codec(space: ChoiceSpace) -> ChoiceCodec:
@@ -157,10 +116,10 @@ def choice_codec(space: ChoiceSpace) -> ChoiceCodec:
     Raises:
         EnvError: a goal cannot be chosen by a network; the message names the space.
     """
-    goals = tuple(
-        (name, action_codec(part), space.owners[name]) for name, part in space.goal_spaces.items()
-    )
-    return ChoiceCodec(space, (), goals=goals)
+    goals = tuple((name, action_codec(part)) for name, part in space.goal_spaces.items())
+    members = ((SKILL, action_codec(space[SKILL])), *goals)
+    owners = tuple(space.owners[name] for name in space.goal_spaces)
+    return ChoiceCodec(space, (), members=members, owners=owners)
 
 
 MOST = 10_000
@@ -172,7 +131,7 @@ class NumberedChoiceCodec(ActionCodec):
     """A converter of choices whose goals are discrete: each skill with each goal has a number."""
 
     goals: tuple[tuple[str, ActionCodec, tuple[int, int]], ...] = ()
-    """As of ``ChoiceCodec``."""
+    """Of each skill with goals: its name, their codec, and the numbers that choose it."""
 
     @cached_property
     def table(self) -> Array:

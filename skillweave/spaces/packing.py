@@ -173,6 +173,16 @@ def unpack(space: gym.Space[Any], array: Array) -> Any:
     return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
 
 
+def env_form(space: gym.Space[Any], packed: Any) -> Any:
+    """Return one packed action as the environment takes it: dicts and tuples of ints and arrays."""
+    inner = parts(space)
+    if inner is None:
+        # A part without axes is a NumPy scalar, which a Box does not contain.
+        return int(packed) if isinstance(space, gym.spaces.Discrete) else np.asarray(packed)
+    values = {name: env_form(part, packed[name]) for name, part in inner.items()}
+    return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
+
+
 def _values(space: gym.Space[Any], batched: Any) -> Iterable[Any]:
     """Return the parts of a batch in the order of the space, which a dict may not have."""
     if isinstance(space, gym.spaces.Dict):

@@ -35,6 +35,7 @@ from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.seeding import Seeds, global_generators
+from skillweave.spaces import env_form
 from skillweave.types import Array
 
 MOST_FRAMES = 1_200
@@ -361,7 +362,7 @@ def _replay(
             if t >= first and (t - first) % every == 0:
                 video.add(enlarged(frame_of(env)))
             action = np.asarray(log.action[step])
-            if not engine.action_space.contains(action[()]):
+            if not engine.action_space.contains(env_form(engine.action_space, action)):
                 raise EnvError(f"the log has the action {short(action)}, which does not exist")
             obs = engine.step(action[None], row).next_obs
             t += 1

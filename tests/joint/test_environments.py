@@ -1,0 +1,169 @@
+"""Environments whose actions have several parts, or are whole numbers: trained and acted in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Ready, Whole, by_hand, on, reach
+from small_runs import assert_same, reports_every, stopped_run
+
+import skillweave as sw
+from skillweave.hierarchy.roles import roles_of
+from skillweave.planning import CallLog
+from skillweave.runs.directory import RunDirectory
+from skillweave.training.plain_agent import load_agent_of
+
+often = reports_every(40)
+OFTEN = sw.TrainDefaults(checkpoint_every=60)
+LEARNS = sw.PPO(num_envs=8, n_steps=64, learning_rate=3e-3, ent_coef=0.0, network=sw.Network((32,)))
+
+
+def played(policy: Any, kind: str = "dict", steps: int = 10) -> list[Any]:
+    """Return the actions of an episode, each of which the environment has checked."""
+    env, player = Reach(kind), sw.Player(policy)
+    obs, _ = env.reset(seed=0)
+    for _ in range(steps):
+        obs, *_ = env.step(player.act(obs))
+    return env.actions
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SPACES)
+def test_a_plain_agent_learns(kind, tmp_path):
+    run = sw.train_agent(on(kind), LEARNS, 12_000, tmp_path / "run", quiet=True)
+    assert run.evaluate(10, quiet=True).mean > 7  # the best: 10; random actions: about 0
+
+
+@pytest.mark.fast_cases(2)
+@pytest.mark.parametrize("squash", [False, True])
+@pytest.mark.parametrize("kind", SPACES)
+def test_a_plain_agent_acts_as_it_is_evaluated(kind, squash, tmp_path):
+    algorithm = sw.PPO(num_envs=4, n_steps=16, squash_actions=squash, network=SMALL)
+    run = sw.train_agent(on(kind), algorithm, 100, tmp_path / "run", quiet=True)
+    stored = load_agent_of(RunDirectory.open(run.path))
+    returns = sw.evaluate(stored, on(kind), episodes=3).returns
+    assert run.evaluate(3, quiet=True).returns == returns
+    assert len(played(run.policy, kind)) == 10
+
+
+def declared(name: str) -> sw.Hierarchy:
+    how: dict[str, Any] = {
+        "together": {"learn": "together"},
+        "apart": {"learn": "apart"},
+        "held": {"rest": {"arm": ("hold", 0.5), "grip": "hold"}},
+        "recurrent": {"algorithm": replace(ON, network=sw.Network((8,), rnn=sw.RNN("gru", 6)))},
+        "self-imitation": {"algorithm": sw.SelfImitationPPO(num_envs=4, n_steps=16, network=SMALL)},
+        "nested": {},
+    }[name]
+    skills: Any = None
+    if name == "nested":
+        inner = reach([Arm(), Ready()], name="inner", call_steps=2)
+        skills = [inner, Grip(), Whole()]
+    return reach(skills, train_defaults=OFTEN, **how)
+
+
+@pytest.mark.fast_cases(1)
+@pytest.mark.parametrize(
+    "name", ["together", "held", "apart", "recurrent", "self-imitation", "nested"]
+)
+def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
+    whole = declared(name).train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(declared(name), tmp_path / "cut", 3)
+    declared(name).resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    returns = whole.evaluate(3).returns
+    assert declared(name).load(whole.path).evaluate(3).returns == returns
+
+
+def test_each_skill_writes_its_part():
+    roles = roles_of(reach())
+    assert roles["arm"].action_space == SPACES["dict"]["arm"]
+    assert roles["grip"].action_space == SPACES["dict"]["grip"]
+    assert roles["whole"].action_space == SPACES["dict"]
+
+    def in_turn(obs: Any) -> Any:
+        return np.where(obs[:, 0] > 0, "arm", "grip")
+
+    run = reach([Arm(), Grip()], selector=in_turn, call_steps=1).train(quiet=True)
+    actions = played(run.policy)
+    assert {a["grip"] for a in actions if a["arm"].any()} == {3}  # zero is no action, but 3 is
+    assert any(a["arm"].any() for a in actions)
+    assert any(a["grip"] == 4 for a in actions if not a["arm"].any())
+    held = reach([Arm(), Grip()], selector=in_turn, call_steps=1, rest={"arm": "hold"})
+    env, player = Reach(), held.train(quiet=True).player()
+    obs, _ = env.reset(seed=0)
+    for i in range(10):
+        is_arm = obs[0] > 0
+        obs, *_ = env.step(player.act(obs))
+        if not is_arm and i:
+            assert (env.actions[i]["arm"] == env.actions[i - 1]["arm"]).all()
+
+
+def test_scripts_and_reflexes_return_dicts():
+    best = sw.evaluate(sw.from_function(by_hand), on(), episodes=2)
+    assert np.allclose(best.returns, 10.0)
+    held = sw.from_function(by_hand, every=2)
+    assert sw.evaluate(held, on(), episodes=2).mean < 9
+    shut = sw.Reflex(lambda obs: obs[:, 0] > 0, {"arm": [0.5, 0.5], "grip": 4})
+
+    def opened(obs: Any) -> Any:
+        return {**by_hand(obs), "grip": np.full(len(obs), 3)}
+
+    computed = sw.Reflex(lambda obs: obs[:, 0] < -0.5, opened)
+    run = reach([Ready(), Whole()], reflexes=[shut, computed]).train(quiet=True)
+    env, player = Reach(), run.player()
+    obs, _ = env.reset(seed=0)
+    for _ in range(10):
+        seen = obs
+        obs, *_ = env.step(player.act(obs))
+        if seen[0] > 0:
+            assert (env.actions[-1]["arm"] == 0.5).all()
+            assert env.actions[-1]["grip"] == 4
+        elif seen[0] < -0.5:
+            assert env.actions[-1]["grip"] == 3
+
+
+def test_a_tuple_is_written_by_its_places():
+    class Second(sw.Skill):
+        acts = "1"
+
+        def reward(self, step: sw.Step) -> Any:
+            return (step.action["1"] == 4).astype(np.float32)
+
+    class Both(sw.Skill):
+        def policy(self, obs: Any) -> Any:
+            return obs[:, :2], np.full(len(obs), 3)
+
+    run = reach([Second(), Both()], env=on("tuple")).train(quiet=True)
+    assert all(type(action) is tuple for action in played(run.policy, "tuple"))
+
+
+def test_calls_are_logged_and_planned_with_their_actions(tmp_path):
+    run = reach().train(tmp_path / "run", quiet=True)
+    log = run.log_calls(200, num_envs=2)
+    assert log.action.dtype.names == ("arm", "grip")
+    assert set(np.unique(log.action["grip"])) == {3, 4}
+    log.save(tmp_path / "calls.safetensors")
+    again = CallLog.load(tmp_path / "calls.safetensors")
+    assert (again.action == log.action).all()
+
+
+def test_foreign_libraries_choose_skills():
+    run = reach().train(quiet=True)
+    env = sw.make_options_env(run, 2, 0.99)
+    env.reset(seed=0)
+    for skill in range(4):
+        _, reward, *_ = env.step(np.full(2, skill))
+        assert np.isfinite(reward).all()
+
+
+@pytest.mark.slow
+def test_a_film_and_a_report_play_again(tmp_path):
+    run = reach(env=Reach).train(tmp_path / "run", quiet=True)
+    run.render(tmp_path / "film.gif")
+    assert (tmp_path / "film.gif").stat().st_size > 1000
+    run.report(tmp_path / "report.html")
+    assert (tmp_path / "report.html").stat().st_size > 10_000
