@@ -49,6 +49,29 @@ def test_a_plain_agent_acts_as_it_is_evaluated(kind, squash, tmp_path):
     assert len(played(run.policy, kind)) == 10
 
 
+@pytest.mark.parametrize("algorithm", [sw.SAC(), sw.DQN(), sw.TD3()], ids=["SAC", "DQN", "TD3"])
+def test_other_algorithms_say_which_one_can(algorithm, tmp_path):
+    words = r"cannot act in Dict.*; PPO, SelfImitationPPO can"
+    with pytest.raises(sw.DeclarationError, match=words):
+        sw.train_agent(on("dict"), algorithm, 100, tmp_path / "run", quiet=True)
+
+
+def test_an_export_is_refused(tmp_path):
+    pytest.importorskip("onnx")
+    run = sw.train_agent(on("dict"), ON, 64, tmp_path / "run", quiet=True)
+    with pytest.raises(sw.PolicyError, match=r"actions of Dict.* cannot be exported"):
+        run.export(tmp_path / "export")
+
+
+def test_a_mask_that_is_not_used_is_said(tmp_path):
+    def masked() -> Reach:
+        return Reach("dict", info={"action_mask": np.ones(2, bool)})
+
+    spec = replace(on("dict"), env=masked, kwargs={})
+    with pytest.warns(UserWarning, match="its action mask is not used, as actions of Dict"):
+        sw.train_agent(spec, ON, 64, tmp_path / "run", quiet=True)
+
+
 def declared(name: str) -> sw.Hierarchy:
     how: dict[str, Any] = {
         "together": {"learn": "together"},
