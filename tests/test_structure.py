@@ -73,7 +73,7 @@ ROOMS: dict[str, set[str]] = {
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},
     "export": LEARNING | {"training", "hierarchy"},
-    "reporting": BASE | {"skills", "envs", "runs", "planning", "training", "hierarchy"},
+    "reporting": BASE | {"spaces", "skills", "envs", "runs", "planning", "training", "hierarchy"},
     "shipped": {"errors"},
     "api": EVERYTHING,
     "recipes": {"shipped", "skillweave", "api"},
@@ -96,6 +96,7 @@ LEAVES: dict[str, set[str]] = {
         "reading",
         "networks.config",
         "algorithms.schedules",
+        "spaces.action_codec",  # where it is called, as it needs torch
     },
     "algorithms.schedules": {"errors", "types", "messages", "settings", "named"},
     "evolution.config": {
