@@ -19,7 +19,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 
 from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError, SkillError
-from skillweave.messages import short
+from skillweave.messages import observed, short
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import example_of, leaf_paths, outside, part_at, parts_of
 from skillweave.skills.mapping import (
@@ -83,6 +83,11 @@ def declared_acts(acts: Any, who: str) -> Any:
         return tuple(names)
     if isinstance(acts, int | np.integer) and not isinstance(acts, bool):
         acts = (acts,)
+    if callable(acts) and not isinstance(acts, Acts):
+        raise DeclarationError(
+            f"{who}: acts is a function, but it names the part of the action that the skill "
+            "writes, acts = (0, 1, 2): what computes actions is policy(self, obs)"
+        )
     if isinstance(acts, slice | range | list | tuple | np.ndarray):
         try:
             acts = Acts(to=acts)
@@ -433,6 +438,11 @@ class OwnPart:
             self.action_space = self.written.space
             if not isinstance(action_space, Discrete):
                 self.rest = Rest(rest, action_space)
+            elif not (isinstance(rest, str) and rest == ZERO):
+                raise DeclarationError(
+                    f"rest is {short(rest)}, but an action is one choice ({short(action_space)}), "
+                    "of which nothing is left: leave out rest"
+                )
 
     def to_json(self) -> dict[str, Any]:
         """Return what was declared as JSON."""
@@ -457,7 +467,7 @@ class OwnPart:
         except PolicyError as error:
             raise DeclarationError(str(error)) from None
         assert self._plan.inputs is not None
-        self.inputs = self._plan.inputs
+        self.inputs, self._computes = self._plan.inputs, bool(mapping.functions())
         spaces = {name: self._input_space(name, given) for name, given in self.inputs.items()}
         self.observation_space = spaces[""] if set(spaces) == {""} else Dict(list(spaces.items()))
 
@@ -506,6 +516,8 @@ class OwnPart:
         lead = obs.shape[: obs.ndim - self._ndim]
         flat = obs if len(lead) == 1 else obs.reshape(-1, *obs.shape[len(lead) :])
         seen = self._plan.read(flat, None, None)
+        if self._computes:
+            self._check_finite(seen, flat)
         space = self.observation_space
         if "" in seen:
             assert isinstance(space, Box)
@@ -515,6 +527,17 @@ class OwnPart:
         for name, value in seen.items():
             joint[name] = value.reshape(joint[name].shape)
         return joint.reshape(lead)
+
+    def _check_finite(self, seen: Mapping[str, Array], obs: Array) -> None:
+        """Raise a SkillError where functions of ``sees`` made NaN or infinity of ``obs`` (n, …)."""
+        for value in seen.values():
+            finite = np.isfinite(value)
+            if not finite.all():
+                row = int(np.argwhere(~finite)[0, 0])
+                raise SkillError(
+                    f"{self.who}: sees gives {observed(value[row])}, which is not finite, for the "
+                    f"observation {observed(obs[row])}: let its functions return finite numbers"
+                )
 
     def mask(self, mask: Array | None) -> Array | None:
         """Return which of its own choices a mask (…, A) allows; all where it allows none."""

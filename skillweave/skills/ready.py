@@ -60,6 +60,11 @@ def _as_policy(value: Any, skill: Skill) -> Policy:
         value = value.__func__
     if callable(value):
         return from_function(value)
+    own = getattr(value, "policy", None)  # of a run, or of a skill that is ready
+    if hasattr(own, "act") and hasattr(own, "start"):
+        raise DeclarationError(
+            f"{where} {short(value)}, which has a policy, but is none: write its .policy"
+        )
     raise DeclarationError(
         f"{where} {short(value)}, which cannot act; give a function of observations, a torch "
         "module, from_sb3(...), from_onnx(...), or a policy"

@@ -43,6 +43,13 @@ METHODS = {
 """Names of a skill's methods in other libraries, with the names of this library."""
 
 VALUES = {
+    "act": "acts",
+    "actions": "acts",
+    "observes": "sees",
+    "reads": "sees",
+    "rest": "Hierarchy.rest",
+    "see": "sees",
+    "writes": "acts",
     "max_episode_steps": "max_steps",
     "time_limit": "max_steps",
     "timeout": "max_steps",

@@ -172,6 +172,7 @@ def mine(**attributes: Any) -> sw.Skill:
         ({"acts": sw.Acts(to=(0,), scale=2.0)}, "acts has a scale.*give the places alone"),
         ({"acts": sw.Acts(to=(0,), rest=0.0)}, r"acts has rest.*Hierarchy\(..., rest=...\)"),
         ({"acts": sw.Acts()}, "it must be the places"),
+        ({"acts": lambda self, obs: obs}, r"acts is a function.*policy\(self, obs\)"),
         ({"sees": 1.5}, r"sees is 1.5; it must be the key"),
         ({"sees": ()}, "sees is empty"),
         ({"sees": sw.Goal()}, r"sees has Goal\(\).*already: leave it out"),
@@ -197,6 +198,14 @@ def test_what_a_skill_cannot_declare(attributes, says):
         (None, 0, (0.0, 1.0), BOX, "rest is .* but the action has 3 numbers"),
         (None, 0, (0.0, 1.0, "stop"), BOX, "rest is .* but the action has 3 numbers"),
         (None, 0, 0.5, MultiDiscrete([2, 2]), "has whole numbers"),
+        (
+            None,
+            (0, 2),
+            "hold",
+            Discrete(4),
+            "rest is 'hold', but an action is one choice.*leave out",
+        ),
+        (None, (0, 2), 0, Discrete(4), "rest is 0, but an action is one choice"),
         (None, "arm", {"leg": 0.0}, ROBOT, "rest has 'leg', which the action does not have"),
         (None, "arm", 0.0, ROBOT, "give a dict by its keys"),
         (None, "arm", None, ROBOT, "rest is None; it must be 'zero', 'hold'"),
@@ -209,6 +218,24 @@ def test_what_a_skill_cannot_declare(attributes, says):
 def test_what_does_not_fit_the_spaces(sees, acts, rest, space, says):
     with pytest.raises(sw.DeclarationError, match=says):
         part(sees, acts, rest, space)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "meant"),
+    [({"act": 0}, "acts"), ({"see": "arm"}, "sees"), ({"acts": 0, "rest": 0.0}, "Hierarchy.rest")],
+)
+def test_a_misspelt_part_is_noticed(attributes, meant):
+    with pytest.warns(UserWarning, match=f"is '{meant}' meant"):
+        mine(**attributes).validate()
+
+
+def test_a_function_that_gives_no_number_is_an_error():
+    own = part(("hook", lambda obs: np.where(obs["hook"] == 0.0, np.inf, obs["arm"])))
+    obs = observations()
+    assert own.see(obs).shape == (4, 3)
+    obs["hook"][1] = 0.0
+    with pytest.raises(sw.SkillError, match=r"skill 'x': sees gives .*inf.*finite numbers"):
+        own.see(obs)
 
 
 def test_tuples_of_actions_have_names():

@@ -259,6 +259,13 @@ def test_what_does_not_fit_is_refused_before_training(skill, env, says):
         crane([skill], env=world).train(quiet=True)
 
 
+def test_what_has_a_policy_is_not_one():
+    ready = crane([Arm()], steps=130).train(quiet=True)
+    for value in (ready, ready.as_skill("ready")):
+        with pytest.raises(sw.DeclarationError, match=r"has a policy, but is none.*\.policy"):
+            crane([declared(value)]).train(quiet=True)
+
+
 def test_a_ready_policy_of_another_shape_is_refused():
     with pytest.raises(sw.PolicyError, match=r"skill 'better'.*\(2, 3\) was expected"):
         crane([declared(lambda obs: obs["arm"])]).train(quiet=True)
