@@ -97,16 +97,8 @@ class GoTo(Skill):
         return there
 
 
-class Motion:
+class Motion(mazes.Motion):
     """An encoder without parameters: the speed, and where the point is from here."""
-
-    size = 4
-
-    def __init__(self, obs: Any) -> None:
-        self.shapes: dict[str, tuple[int, ...]] = {}
-
-    def init_(self, views: Any, generators: Any) -> None:
-        """Fill no weights: it has none."""
 
     def __call__(self, views: Any, inputs: Mapping[str, Any]) -> Any:
         """Map (P, B, 6 + 12 + 9) to (P, B, 4): the cell's column and row are one-hot."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from small_runs import assert_same, stopped_run
 
 import skillweave as sw
 
@@ -97,3 +100,15 @@ def crane(skills: Any = None, **how: Any) -> sw.Hierarchy:
         "selector": ON,
     } | how
     return sw.Hierarchy(settings.pop("env"), skills or [Arm(), Hook()], **settings)
+
+
+def goes_on_and_loads(hierarchy: Callable[[], sw.Hierarchy], folder: Path) -> None:
+    """Assert that a stopped run ends with the same weights, and that these load in both ways."""
+    whole = hierarchy().train(folder / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), folder / "cut", 3)
+    hierarchy().resume(folder / "cut", quiet=True)
+    assert_same(folder / "cut", whole.path)
+    returns = whole.evaluate(3).returns
+    assert hierarchy().load(whole.path).evaluate(3).returns == returns
+    file = whole.save_weights(folder / "weights.safetensors")
+    assert hierarchy().load_weights(file).evaluate(3).returns == returns

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import SMALL, Arm, Crane, Hook, crane
-from small_runs import assert_same, reports_every, stopped_run
+from crane import SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
+from small_runs import reports_every
 from torch import nn
 
 import skillweave as sw
@@ -75,14 +75,7 @@ def test_a_stopped_run_ends_with_the_same_weights(name, how, tmp_path):
         skills = [declared(copy.deepcopy(base)), type("Other", (sw.Skill,), {})()]
         return crane(skills, train_defaults=OFTEN, **settings)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
-    returns = whole.evaluate(3).returns
-    assert hierarchy().load(whole.path).evaluate(3).returns == returns
-    file = whole.save_weights(tmp_path / "weights.safetensors")
-    assert hierarchy().load_weights(file).evaluate(3).returns == returns
+    goes_on_and_loads(hierarchy, tmp_path)
 
 
 def episode(policy: Any, steps: int = 20, seed: int = 0) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from crane import ON, SMALL, Arm, Crane, Hook, crane
+from crane import ON, SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
 from small_runs import assert_same, reports_every, stopped_run
 
 import skillweave as sw
@@ -123,14 +123,7 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
         defaults = {"env": on(kind), "train_defaults": OFTEN}
         return crane(skills_for(kind), **(defaults | rest | how))
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
-    returns = whole.evaluate(3).returns
-    assert hierarchy().load(whole.path).evaluate(3).returns == returns
-    file = whole.save_weights(tmp_path / "weights.safetensors")
-    assert hierarchy().load_weights(file).evaluate(3).returns == returns
+    goes_on_and_loads(hierarchy, tmp_path)
 
 
 def test_a_run_without_its_code_has_the_parts(tmp_path):
