@@ -4,12 +4,14 @@
 
 The networks are untrained and all of the same size. A ratio is the median over rounds of a
 policy's actions per second, divided by those of Stable-Baselines3's ``predict`` in the same round.
+Then two hierarchies with goals, beside the same without.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +22,10 @@ import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.hierarchy.fitting import ready_policies
+from skillweave.hierarchy.roles import roles_of
 from skillweave.seeding import Seeds
+from skillweave.skills.goal_spaces import with_goal
 
 ENV = "CartPole-v1"
 NETWORK = sw.Network((64, 64))
@@ -50,6 +55,27 @@ class Inner(sw.Skill):
     """A hierarchy of the others."""
 
 
+POINT = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+class LeftOf(Left):
+    """Has a goal; ends by itself."""
+
+    goal_space = POINT
+
+
+class RightOf(Right):
+    """Has a goal; may start only in some places."""
+
+    goal_space = POINT
+
+
+class CenterOf(Center):
+    """Has a goal; lasts as long as calls do."""
+
+    goal_space = POINT
+
+
 def network(observations: Any, actions: Any, seed: int) -> AgentPolicy:
     """Return an untrained policy."""
     algorithm = make_algorithm(sw.PPO(network=NETWORK), observations, actions)
@@ -69,14 +95,46 @@ def policies() -> dict[str, Any]:
     return {"flat": act[0], "hierarchy": inner, "nested": nested}
 
 
+def policies_with_goals(plain: Any) -> dict[str, tuple[Any, Any]]:
+    """Return policies with goals, each beside the one without; ``plain`` is one of networks.
+
+    The second pair is of modules from elsewhere: two actions are swapped by a mapping, and the
+    inputs are the observation's last two numbers, its first two, and the goal.
+    """
+    env = gym.make(ENV)
+    skills = (LeftOf(), RightOf(), CenterOf())
+    seen = with_goal(env.observation_space, POINT)
+    act = tuple(network(seen, env.action_space, i) for i in range(3))
+    choices = SkillSet(skills, act).choice_space
+    selector = network(env.observation_space, choices, 3)
+    goals = sw.HierarchyPolicy(selector, SkillSet(skills, act, call_steps=20))
+    mapping = {"sees": (2, 3, 0, 1, sw.Goal()), "acts": sw.Acts(to=(1, 0))}
+    modules = of_modules((Left(), Right(), Center()), plain.selector, 4, {})
+    mapped = of_modules(skills, selector, 6, mapping)
+    return {"goals": (goals, plain), "modules, goals and a mapping": (mapped, modules)}
+
+
+def of_modules(
+    skills: Sequence[sw.Skill], selector: Any, inputs: int, mapping: dict[str, Any]
+) -> sw.HierarchyPolicy:
+    """Return a hierarchy of modules that have this number of inputs."""
+    for skill in skills:
+        wide, narrow = torch.nn.Linear(inputs, 64), torch.nn.Linear(64, 2)
+        layers = wide, torch.nn.Tanh(), torch.nn.Linear(64, 64), torch.nn.Tanh(), narrow
+        skill.policy = sw.from_torch(torch.nn.Sequential(*layers), **mapping)
+    act = ready_policies(roles_of(sw.Hierarchy(ENV, skills)))
+    ready = SkillSet(tuple(skills), tuple(act[s.name] for s in skills), call_steps=20)
+    return sw.HierarchyPolicy(selector, ready)
+
+
 def acts_per_second(policy: Any, steps: int) -> float:
     """Play episodes with a player; only acting is timed."""
     env, player, seconds = gym.make(ENV), sw.Player(policy), 0.0
     obs, info = env.reset(seed=0)
     for _ in range(steps):
-        before = time.perf_counter()
+        before = time.process_time()
         action = player.act(obs, info=info)
-        seconds += time.perf_counter() - before
+        seconds += time.process_time() - before
         obs, _, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             obs, info = env.reset()
@@ -93,9 +151,9 @@ def stable_baselines3(steps: int) -> float:
     obs, _ = env.reset(seed=0)
     seconds = 0.0
     for _ in range(steps):
-        before = time.perf_counter()
+        before = time.process_time()
         action, _ = model.predict(obs, deterministic=True)
-        seconds += time.perf_counter() - before
+        seconds += time.process_time() - before
         obs, _, terminated, truncated, _ = env.step(int(np.asarray(action)))
         if terminated or truncated:
             obs, _ = env.reset()
@@ -114,6 +172,12 @@ def main() -> None:
         speeds["Stable-Baselines3"].append(stable_baselines3(given.steps))
         for name, policy in made.items():
             speeds[name].append(acts_per_second(policy, given.steps))
+    pairs = policies_with_goals(made["hierarchy"])
+    beside: dict[str, list[float]] = {name: [] for name in pairs}
+    for _ in range(given.rounds):
+        for name, pair in pairs.items():
+            with_goals, without = (acts_per_second(policy, given.steps) for policy in pair)
+            beside[name].append(without / with_goals)
     baseline = speeds["Stable-Baselines3"]
     ratios = {
         name: median(a / b for a, b in zip(own, baseline, strict=True))
@@ -121,9 +185,12 @@ def main() -> None:
     }
     rows = [[name, f"{median(own):,.0f}", f"{ratios[name]:.2f}"] for name, own in speeds.items()]
     print(table(["policy", "actions per second", "ratio"], rows))
-    report(
-        "acting", {"actions per second": {k: median(v) for k, v in speeds.items()}, "ratio": ratios}
+    times = {name: median(own) for name, own in beside.items()}
+    print(
+        table(["with", "time of an action ÷ without"], [[k, f"{v:.2f}"] for k, v in times.items()])
     )
+    each = {name: median(own) for name, own in speeds.items()}
+    report("acting", {"actions per second": each, "ratio": ratios, "time with goals": times})
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.messages import as_path, shown_path, whole_number
+from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner, record_calls
 from skillweave.planning.run_log import hand_over_json, hand_over_of
@@ -500,6 +500,7 @@ class Run:
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
+        goal: Any = None,
         num_envs: int | None = None,
         max_steps: int | None = None,
         save: bool = False,
@@ -519,6 +520,8 @@ class Run:
                 reflexes are in force, also where it was trained without them. Returns are the
                 environment's; ``skills`` has its call in each episode, from the step in which it
                 may start to its own end, by its own reward and success.
+            goal: of this skill in all episodes, where it has goals; None: its ``goals()`` draw one
+                for each. ``goals`` and ``reached`` of the result are of each episode.
             num_envs: environments that exist at once; None: at most as many as in training. It
                 does not change the result of a greedy policy; what is sampled differs with it.
             max_steps: an episode that nothing has ended by then is cut; None: see ``evaluate``.
@@ -535,15 +538,15 @@ class Run:
             Returns, lengths, and what each skill did.
 
         Raises:
-            DeclarationError: no such skill or engine; or ``save`` or ``log_calls`` where it cannot
-                be.
+            DeclarationError: no such skill or engine; a goal without a skill that has goals; or
+                ``save`` or ``log_calls`` where it cannot be.
         """
         if save and (skill is not None or engine != "sync"):
             raise DeclarationError("save keeps a whole policy's score: leave out skill and engine")
         if save:
             self._check_written()
             must_be_own(self.path)  # an error comes before anything is played
-        policy = self._policy(skill)
+        policy = self._policy(skill, goal, "evaluate()")
         if log_calls:
             self._check_logged()
         with EpisodeProgress(episodes, quiet=quiet) as progress:
@@ -573,6 +576,7 @@ class Run:
         seed: int = 0,
         deterministic: bool = True,
         skill: str | None = None,
+        goal: Any = None,
         max_steps: int | None = None,
         quiet: bool = False,
     ) -> Film:
@@ -588,13 +592,14 @@ class Run:
             seed: picks them.
             deterministic: act greedily, else sample.
             skill: show this skill alone, as in ``evaluate``.
+            goal: of this skill, as in ``evaluate``.
             max_steps: an episode that nothing has ended by then is cut.
             quiet: no progress; else it is shown where a film takes longer than a second.
 
         Returns:
             ``path``, and what was filmed, as plain JSON.
         """
-        policy = self._policy(skill)
+        policy = self._policy(skill, goal, "render()")
         path = self._film_path(skill) if path is None else as_path(path, "path")
         must_be_own(path.parent)
         seed = whole_number(seed, "seed", 0)
@@ -992,9 +997,18 @@ class Run:
         stages = self.declaration.stages()
         return max((stage.config.num_envs for stage in stages), default=None)
 
-    def _policy(self, skill: str | None) -> Policy:
-        if skill is None:
-            return self.policy
+    def _policy(self, skill: str | None, goal: Any = None, who: str = "") -> Policy:
+        """Return the policy, or that of one skill alone, with this goal, for a method ``who``."""
+        if goal is not None:
+            if skill is None:
+                raise DeclarationError(
+                    f"{who}: goal is {short(goal)}, but the selector chooses goals: name the skill "
+                    'that is to act alone, skill="go_to"'
+                )
+            return self._alone(skill).with_goal(goal, who)
+        return self.policy if skill is None else self._alone(skill)
+
+    def _alone(self, skill: str) -> SkillAlone:
         if not isinstance(self.policy, HierarchyPolicy):
             raise DeclarationError("this is a plain agent: it has no skills")
         self.hierarchy.skill(skill)

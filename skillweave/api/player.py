@@ -10,6 +10,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
 from skillweave.errors import DeclarationError
+from skillweave.hierarchy.policy import SkillAlone
 from skillweave.messages import short
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
@@ -59,7 +60,6 @@ class Player:
         self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
         self._seed = seed
         self._rng = np.random.default_rng(seed)
-        self._goal: Array | None = None  # (1, …)
         self.reset(goal=goal)
 
     def reset(self, *, goal: Any = None) -> None:
@@ -72,15 +72,14 @@ class Player:
             DeclarationError: a goal is given to a policy that takes none.
             SkillError: the goal is out of the skill's ``goal_space``; the goal before stays.
         """
-        goals: Any = getattr(self.policy, "goals", None)
-        if goal is not None and goals is None:
-            raise DeclarationError(
-                f"the goal {short(goal)} is given to a policy that takes none: name a skill "
-                'with goals, run.player(skill="go_to", goal=...)'
-            )
         if goal is not None:
-            self._goal = goals.one(goal, "the player")
-        self._needs_goal = goals is not None
+            if not isinstance(self.policy, SkillAlone):
+                raise DeclarationError(
+                    f"the goal {short(goal)} is given to a policy that takes none: name a skill "
+                    'with goals, run.player(skill="go_to", goal=...)'
+                )
+            self.policy = self.policy.with_goal(goal, "the player")
+        self._needs_goal = isinstance(self.policy, SkillAlone)
         self.memory: Memory = self.policy.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
@@ -116,24 +115,15 @@ class Player:
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
-        if self._needs_goal:
-            self._choose_goal(seen)
+        if self._needs_goal:  # of a skill that acts alone, where the episode starts
+            self.policy.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
+            self._needs_goal = False  # only now: without its goal it must not act
         action, self.memory = self.policy.act(
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
         joint = parts(self.policy.action_space) is not None
         return env_form(self.policy.action_space, action[0]) if joint else action[0]
-
-    def _choose_goal(self, seen: Array) -> None:
-        """Set the goal of the episode that starts with an observation (1, …)."""
-        alone: Any = self.policy
-        if self._goal is None:
-            alone.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
-        else:
-            goal = alone.goals.fitted(seen, self._goal.copy(), "the player")
-            self.memory["goal"] = alone.goals.stored(goal)
-        self._needs_goal = False  # only now: without its goal it must not act
 
     def _allowed(self, mask: Any) -> Array:
         """Return a mask as a batch of one."""

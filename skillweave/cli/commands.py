@@ -140,6 +140,8 @@ class Watched(Output):
     """The file that declares the hierarchy, unless it is a shipped recipe."""
     skill: str | None = None
     """One skill alone, with the hierarchy's reflexes in force."""
+    goal: str | None = None
+    """Its goal, as JSON, such as --goal "[0.5, 0.8]"; default: its goals() draw one."""
     seed: int = 0
     """Picks the episodes."""
     deterministic: bool = True

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -95,14 +96,27 @@ def _evaluate(command: commands.Evaluate) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
+        goal=_goal(command),
         num_envs=command.num_envs,
         quiet=command.quiet,
     )
     result = {"target": command.target, "env": trained.declaration.spec.name, "seed": command.seed}
     result |= {"deterministic": command.deterministic, "skill": command.skill}
+    result |= {} if command.goal is None else {"goal": _goal(command)}
     if command.skill is None and Path(command.target).is_dir() and not command.pretrained:
         save_score(trained, score, command.seed, command.deterministic)
     print_result(command, result | score.to_json(), score.for_people())
+
+
+def _goal(command: commands.Watched) -> Any:
+    """Return the goal of --goal; None: it is not given."""
+    try:
+        return None if command.goal is None else json.loads(command.goal)
+    except ValueError as error:
+        raise DeclarationError(
+            f"--goal {command.goal} is no JSON ({error}); write a list for a vector, "
+            '--goal "[0.5, 0.8]", or a number'
+        ) from error
 
 
 def _render(command: commands.Render) -> None:
@@ -114,6 +128,7 @@ def _render(command: commands.Render) -> None:
         seed=command.seed,
         deterministic=command.deterministic,
         skill=command.skill,
+        goal=_goal(command),
         quiet=command.quiet,
     )
     returns = ", ".join(f"{e['return']:.0f}" for e in result["episodes"])

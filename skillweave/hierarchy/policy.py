@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,6 +15,8 @@ from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.errors import DeclarationError
+from skillweave.messages import short
 from skillweave.skills import apply_reflexes
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
@@ -141,7 +144,7 @@ class SkillAlone:
 
     It acts from an episode's start to its end, whatever its initiation set and ends. Its memory is
     the memory of the skill's policy. A skill that has goals is given one in each episode, by
-    ``choose_goals``.
+    ``choose_goals``: the one of ``with_goal``, or one that is drawn.
 
     Args:
         skills: the skill and those beside it.
@@ -166,6 +169,24 @@ class SkillAlone:
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
         self.acting = self.policy.acting
+        self._goal: Array | None = None  # (1, …), of all episodes; None: drawn for each
+        self._gives = ""
+
+    def with_goal(self, goal: Any, who: str) -> SkillAlone:
+        """Return a copy that has one goal in all episodes; ``who`` gives it, for messages.
+
+        Raises:
+            DeclarationError: the skill has no goals.
+            SkillError: the goal is out of its ``goal_space``.
+        """
+        if self.goals is None:
+            raise DeclarationError(
+                f"{who}: goal is {short(goal)}, but skill {self.path!r} has no goals: leave it "
+                "out, or give the skill a goal_space"
+            )
+        alone = copy.copy(self)
+        alone._goal, alone._gives = self.goals.one(goal, who), who
+        return alone
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""
@@ -211,7 +232,7 @@ class SkillAlone:
         return below.goal_now(memory, row) if isinstance(below, HierarchyPolicy) else None
 
     def choose_goals(self, memory: Memory, rows: Array, obs: Array, rngs: Sequence[Any]) -> None:
-        """Draw a goal for each episode that starts in ``rows`` (k,), by ``Skill.goals``.
+        """Set the goal of each episode that starts in ``rows`` (k,); ``Skill.goals`` draws it.
 
         Args:
             memory: of all environments, changed in place.
@@ -220,8 +241,14 @@ class SkillAlone:
         """
         if self.goals is not None:
             for i, rng in enumerate(rngs):
-                drawn = self.goals.stored(self.goals.draw(obs[i : i + 1], rng))
-                memory["goal"][rows[i]] = drawn[0]
+                memory["goal"][rows[i]] = self.goals.stored(self._next_goal(obs[i : i + 1], rng))[0]
+
+    def _next_goal(self, obs: Array, rng: Any) -> Array:
+        """Return the goal of an episode that starts in ``obs`` (1, …), (1, …)."""
+        assert self.goals is not None
+        if self._goal is None:
+            return self.goals.draw(obs, rng)
+        return self.goals.fitted(obs, self._goal.copy(), self._gives)
 
     def act(
         self,

@@ -34,7 +34,7 @@ from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.reflex_tally import ReflexTally
-from skillweave.training.skill_report import SkillReport, all_steps, tally_of
+from skillweave.training.skill_report import CallTally, SkillReport, all_steps, tally_of
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
 
@@ -90,6 +90,32 @@ class Evaluation:
             DeclarationError: no calls were logged.
         """
         return {path: log for path, log in self._logged().items() if path}
+
+    @property
+    def goals(self) -> Array:
+        """The goal of each episode, (episodes, …), of a skill that acted alone; it is not saved.
+
+        Raises:
+            DeclarationError: no skill with goals acted alone.
+        """
+        return self._of_alone("goals", "no skill with goals acted alone in this evaluation")
+
+    @property
+    def reached(self) -> Array:
+        """The success of each episode's call, (episodes,) bool, of a skill that acted alone.
+
+        It is not saved.
+
+        Raises:
+            DeclarationError: no skill that defines success acted alone.
+        """
+        return self._of_alone("reached", "no skill that defines success acted alone")
+
+    def _of_alone(self, name: str, missing: str) -> Array:
+        found: Array | None = vars(self).get(f"_{name}")
+        if found is None:
+            raise DeclarationError(f'{missing}: evaluate(skill="go_to") scores a skill alone')
+        return found
 
     def _logged(self) -> dict[str, CallLog]:
         logs: dict[str, CallLog] | None = vars(self).get("_logs")
@@ -412,6 +438,8 @@ def _scored(
         alone,
     )
     vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
+    if isinstance(tally, CallTally):
+        vars(evaluation).update(_goals=tally.goals, _reached=tally.reached)
     return evaluation
 
 

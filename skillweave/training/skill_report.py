@@ -319,11 +319,22 @@ class CallTally:
         self._done = np.zeros(episodes, bool)
         self._elapsed = np.zeros(episodes, np.int64)
         self._returns = np.zeros(episodes)
-        self._succeeded = 0
+        self._goals_of = goals_of(skill)
+        self.goals: Array | None = None
+        """(episodes, …) the goal of each; None: the skill has none."""
+        if self._goals_of is not None:
+            self.goals = self._goals_of.read(self._goals_of.start(episodes)).copy()
+        self.reached: Array | None = None
+        """(episodes,) bool: the call in each has succeeded; None: the skill defines no success."""
+        if skill.defines("success"):
+            self.reached = np.zeros(episodes, bool)
         self._ended = dict.fromkeys(ENDS.values(), 0)
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
+        if self.goals is not None and self._goals_of is not None:
+            assert played.chosen is not None
+            self.goals[played.episode] = self._goals_of.read(played.chosen["goal"])
         waiting = np.flatnonzero(~self._running[played.episode] & ~self._done[played.episode])
         if len(waiting):
             obs = played.step.obs[waiting]
@@ -353,11 +364,11 @@ class CallTally:
             return
         for reason, name in ENDS.items():
             self._ended[name] += int((why == reason).sum())
-        if self._skill.defines("success"):
+        if self.reached is not None:
             ended_rows = rows[over]
             last = _outcome(self._skill, played, self._elapsed[played.episode], ended_rows)
             assert last.success is not None
-            self._succeeded += int(last.success.sum())
+            self.reached[episode[over]] = last.success
         self._running[episode[over]] = False
         self._done[episode[over]] = True
 
@@ -369,7 +380,7 @@ class CallTally:
             steps=int(self._elapsed.sum()),
             calls=calls,
             ended=dict(self._ended),
-            succeeded=self._succeeded if self._skill.defines("success") else None,
+            succeeded=None if self.reached is None else int(self.reached.sum()),
             return_sum=float(self._returns.sum()) if has_reward else None,
             first=calls,
         )
