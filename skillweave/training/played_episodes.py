@@ -12,6 +12,7 @@ from skillweave.paths import join
 from skillweave.planning.recorder import Recorder
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import ENDS
 from skillweave.types import Array
@@ -36,6 +37,8 @@ class Call:
     """Sum of the skill's own reward; None: unknown."""
     succeeded: bool | None
     """Result of the skill's ``success`` for the last step; None: it defines none."""
+    goal: str = ""
+    """Its goal in words; empty: it has none."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,8 @@ class PlayedEpisodes:
             if (name := join(path, skill.name)) not in leaves:
                 continue
             judged = bool(self.skills) and not isinstance(skill, RecordedSkill)
+            goals = recorder.goals.get(skill.name)
+            aims = None if goals is None else goals.from_flat(log.goals[skill.name])
             for row in np.flatnonzero(skills == i).tolist():
                 won = bool(log.succeeded[row]) if skill.defines("success") else None
                 call = Call(
@@ -106,6 +111,7 @@ class PlayedEpisodes:
                     float(returns[row]),
                     float(own[row]) if judged else None,
                     won,
+                    "" if aims is None else shown_goal(aims[row]),
                 )
                 self.episodes[int(log.episode[row])].calls.append(call)
 

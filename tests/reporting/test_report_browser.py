@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from goals.worlds import declared
 from reporting.cart import RECIPE
 from reporting.walkway import CALLS, declare
 
@@ -38,11 +39,16 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A report by hand, one of a run with a population, one unfinished, and a comparison."""
     folder = tmp_path_factory.mktemp("pages")
     run = declare().train(folder / "walk", quiet=True)
-    found = {k: folder / f"{k}.html" for k in ("walk", "evolved", "unfinished", "comparison")}
+    names = ("walk", "evolved", "goals", "unfinished", "comparison")
+    found = {k: folder / f"{k}.html" for k in names}
     run.log_calls(200, num_envs=2)
     how: dict[str, Any] = {"episodes": 5, "filmed": 2}
     opened = RunDirectory.open(folder / "walk")
     write_report(opened, found["walk"], run.policy, run.declaration.spec, **how)
+    aims = declared().train(folder / "goals", quiet=True)
+    write_report(
+        RunDirectory.open(aims.path), found["goals"], aims.policy, aims.declaration.spec, episodes=2
+    )
     recipe = folder / "cart.py"
     recipe.write_text(RECIPE)
     train = ["train", str(recipe), "--quiet", "--evaluate", "3", "-o"]
@@ -114,7 +120,7 @@ def selected(page: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ["walk", "evolved", "unfinished", "comparison"])
+@pytest.mark.parametrize("name", ["walk", "evolved", "goals", "unfinished", "comparison"])
 def test_it_opens_without_errors_and_network_at_any_width(
     browser: Any, pages: dict[str, Path], name: str, scheme: str
 ) -> None:
@@ -237,6 +243,24 @@ def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
         "#calls tbody tr:nth-child(4) td", "all => all.map(e => e.innerText)"
     )
     assert cells == ["4", "go", "7", "2", "with the episode", "+11", "+4", "yes"]
+
+
+def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> None:
+    opened = Opened(browser, pages["goals"])
+    call = opened.page.locator("#timelines .call").first
+    call.click()
+    episode = json.loads(opened.page.locator("#data").text_content())["episodes"][0]
+    goal = episode["goals"][0]
+    assert goal.startswith("(")
+    pairs = opened.page.locator("#call div").all_text_contents()
+    assert f"Goal{goal}" in pairs
+    assert call.get_attribute("title").startswith(f"call 1: go_to {goal}, from step 0")
+    opened.page.locator("#table summary").click()
+    assert opened.page.locator("#calls tbody tr").first.locator("td").nth(1).text_content() == (
+        f"go_to {goal}"
+    )
+    assert (opened.said, opened.foreign()) == ([], [])
+    opened.page.close()
 
 
 def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from goals.worlds import SPACES, GoTo, Rest, aim_of, declared
 
 from skillweave.reporting.report.single import play_episodes
+from skillweave.skills.goal_spaces import shown_goal
 
 
 def walks(name: str, space: Any, left: float = 1.0) -> Any:
@@ -56,6 +57,35 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
     assert np.mean(left) < 0.3 < np.mean(right)
     assert [row["x"] for row in found["number"]["spec"]["data"]["values"]] == ["2", "3", "4"]
     assert max(row["x2"] for row in found["one"]["spec"]["data"]["values"]) <= 1.0
+
+
+def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
+    two, number = walks("two", SPACES["box"]), walks("number", SPACES["number"])
+
+    def selector(obs: Any) -> Any:
+        names = np.where(obs[:, 0] < 0, "two", np.where(obs[:, 1] < 0, "number", "rest"))
+        return names, {"two": obs.clip(-1, 1), "number": np.full(len(obs), 3)}
+
+    run = declared([two, number, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
+    played = play_episodes(run.policy, run.declaration.spec, 12, 0, 0, True, 4)
+    seen = set()
+    for shown, episode in zip(played.shown, played.log.episodes, strict=True):
+        for words, call in zip(shown.get("goals", [""] * 99), episode.calls, strict=False):
+            skill = played.log.labels[call.skill]
+            goal = shown_goal(call.obs.clip(-1, 1)) if skill == "two" else "3"
+            assert words == ("" if skill == "rest" else goal)
+            seen.add(skill)
+    assert seen == {"two", "number", "rest"}
+
+
+def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
+    def selector(obs: Any) -> Any:
+        return ["two"] * len(obs), np.zeros((len(obs), 2))
+
+    run = declared([walks("two", SPACES["box"])], selector=selector).train(tmp_path / "run")
+    played = play_episodes(run.policy, run.declaration.spec, 4, 0, 0, True, 2)
+    encoding = played.goals[0]["spec"]["encoding"]
+    assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
 
 
 def test_a_report_without_goals_has_none(tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def _episode(
     entry |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
     _, observed = seen(episode.calls[:MOST_CALLS_OF_ONE], named)
     entry |= {"seen": observed} if observed else {}
+    goals = [c.goal for c in episode.calls[:MOST_CALLS_OF_ONE]]
+    entry |= {"goals": goals} if any(goals) else {}
     return entry | {"totals": totals, "calls": calls}
 
 

@@ -109,30 +109,42 @@ def hand_over(names: tuple[str, str]) -> Spec:
     return spec | {"description": "The chosen calls over two coordinates", "height": 300}
 
 
-def goal_map(name: str, rows: Sequence[dict[str, Any]]) -> Spec:
-    """Return a map of success over goals of two numbers: parts of the space, by colour."""
+def goal_map(name: str, rows: Sequence[dict[str, Any]], ranges: Sequence[Sequence[float]]) -> Spec:
+    """Return a map of success over goals of two numbers: parts of the space, by colour.
+
+    Args:
+        rows: the parts that have calls.
+        ranges: the lowest and the highest value of each number.
+    """
     encoding: dict[str, Any] = {"tooltip": _of_goals()}
-    for axis, title in (("x", "first number of the goal"), ("y", "second number of the goal")):
-        encoding[axis] = number_axis(axis, title, axis={"tickCount": 5}, scale={"nice": False})
+    titles = ("first number of the goal", "second number of the goal")
+    for axis, title, span in zip("xy", titles, ranges, strict=True):
+        scale: dict[str, Any] = {"nice": False, "domain": list(span)}
+        encoding[axis] = number_axis(axis, title, axis={"tickCount": 5}, scale=scale)
         encoding[f"{axis}2"] = {"field": f"{axis}2"}
     legend = {"format": ".0%", "title": "success", "gradientLength": 240, "tickCount": 3}
-    scale = {"domain": [0, 1], "range": ["#d55e00", "#f0e442", "#009e73"]}
-    encoding["color"] = {"field": "share", "type": "quantitative", "scale": scale, "legend": legend}
+    hues = {"domain": [0, 1], "range": ["#d55e00", "#f0e442", "#009e73"]}
+    encoding["color"] = {"field": "share", "type": "quantitative", "scale": hues, "legend": legend}
     mark = {"type": "rect", "aria": False}
     text = f"Success of {name} over its goals"
     return chart(text, 340, data={"values": list(rows)}, mark=mark, encoding=encoding)
 
 
-def goal_bars(name: str, rows: Sequence[dict[str, Any]]) -> Spec:
+def goal_bars(name: str, rows: Sequence[dict[str, Any]], ranges: Sequence[Sequence[float]]) -> Spec:
     """Return bars of success over goals of one number: a bar for each goal, or part of its range.
 
     What has calls has a pale ground, so that no success and no call are different.
+
+    Args:
+        rows: the goals or parts that have calls.
+        ranges: the lowest and the highest value of the number; empty: goals are choices.
     """
-    parts = "x2" in rows[0]
+    parts = bool(ranges)
     x: dict[str, Any] = {"field": "x", "type": "ordinal", "title": "goal", "sort": None}
     x |= {"axis": {"labelAngle": 0}}
     if parts:
-        x = number_axis("x", "goal", axis={"tickCount": 5}, scale={"nice": False})
+        scale = {"nice": False, "domain": list(ranges[0])}
+        x = number_axis("x", "goal", axis={"tickCount": 5}, scale=scale)
     shared = {"x": x, "tooltip": _of_goals()} | ({"x2": {"field": "x2"}} if parts else {})
     y = number_axis("share", "success", axis={"format": ".0%"}, scale={"domain": [0, 1]})
     mark = {"type": "rect" if parts else "bar", "aria": False}

@@ -44,24 +44,29 @@ def goal_pictures(logs: Mapping[str, CallLog], skills: Mapping[str, Skill]) -> l
             if path not in skills or not mine.any():
                 continue
             space, goals, done = skills[path].goal_space, every[mine], log.succeeded[mine]
-            rows = _rows(space, goals, done)
-            if rows is None:
+            rows, ranges = _rows(space, goals, done)
+            if not rows:
                 continue
             draw = charts.goal_map if goals.shape[1] == 2 else charts.goal_bars
             share = f"{int(done.sum()):,} of {len(done):,} calls ({percent(float(done.mean()))})"
-            found.append({"name": path, "words": share, "spec": draw(path, rows)})
+            found.append({"name": path, "words": share, "spec": draw(path, rows, ranges)})
     return found
 
 
-def _rows(space: gym.Space[Any] | None, goals: Array, done: Array) -> list[dict[str, Any]] | None:
-    """Return the parts of a goal space with calls in them; None: it has no picture."""
+def _rows(
+    space: gym.Space[Any] | None, goals: Array, done: Array
+) -> tuple[list[dict[str, Any]], list[list[float]]]:
+    """Return the parts of a goal space with calls in them, and the range of each number.
+
+    Without parts the space has no picture; without ranges the parts are choices.
+    """
     if isinstance(space, gym.spaces.Discrete) and space.n <= MOST_GOALS:
         return [
             {"x": str(int(value))} | _counted(done[goals[:, 0] == value])
             for value in np.unique(goals[:, 0])
-        ]
+        ], []
     if not isinstance(space, gym.spaces.Box) or goals.shape[1] not in (1, 2):
-        return None
+        return [], []
     numbers = goals.shape[1]
     count = int(np.clip((len(goals) / CALLS_OF_A_PART) ** (1 / numbers), 2, MOST_PARTS))
     edges = [_edges(space, goals[:, i], i, count) for i in range(numbers)]
@@ -76,7 +81,7 @@ def _rows(space: gym.Space[Any] | None, goals: Array, done: Array) -> list[dict[
         for axis, edge, p in zip("xy", edges, place, strict=False):
             row |= {axis: float(edge[p]), f"{axis}2": float(edge[p + 1])}
         rows.append(row)
-    return rows
+    return rows, [[float(edge[0]), float(edge[-1])] for edge in edges]
 
 
 def _counted(done: Array) -> dict[str, Any]:

@@ -241,18 +241,21 @@
     if (episode.frame === null || filmed < 2) return "";
     return place === 0 ? "the worst" : place === filmed - 1 ? "the best" : filmed === 3 ? "the median" : "";
   };
-  const words = ([skill, start, steps, why, reward, , succeeded], i) =>
-    `call ${i + 1}: ${data.labels[skill]}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
+  // The skill of a call, with its goal.
+  const called = (episode, i) =>
+    [data.labels[episode.calls[i][0]], episode.goals?.[i]].filter(Boolean).join(" ");
+  const words = (episode, [, start, steps, why, reward, , succeeded], i) =>
+    `call ${i + 1}: ${called(episode, i)}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
     `reward ${signed(reward)}${succeeded === null ? "" : succeeded ? ", success" : ", no success"}`;
 
   const result = ({ return: total }) =>
     data.binary ? (total > 0 ? "solved" : "not solved") : `return ${signed(total)}`;
   const timeline = (episode, place) => {
-    const called = nameOf(episode);
+    const rank = nameOf(episode);
     const cut = episode.cut ? ", cut before its end" : "";
     const count = episode.calls.length === 1 ? "1 call" : `${episode.calls.length} calls`;
     const title = make("h3", { id: `episode-${place}` }, make("strong", {}, `Episode ${episode.number}`),
-      `${called ? ` (${called})` : ""}: ${result(episode)}, ${episode.steps} steps, ${count}${cut}`);
+      `${rank ? ` (${rank})` : ""}: ${result(episode)}, ${episode.steps} steps, ${count}${cut}`);
     const track = make("div", {
       class: "track", role: "listbox", tabindex: 0, "aria-labelledby": `episode-${place}`,
       "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest[shownFirst(episode, place) ? 0 : 1]}%`,
@@ -260,8 +263,8 @@
     const options = episode.calls.map((call, i) => {
       const [skill, start, steps] = call;
       const option = make("div", {
-        class: "call", role: "option", id: `call-${place}-${i}`, "aria-selected": "false", title: words(call, i),
-        "aria-label": words(call, i),
+        class: "call", role: "option", id: `call-${place}-${i}`, "aria-selected": "false", title: words(episode, call, i),
+        "aria-label": words(episode, call, i),
         style: `left:${(100 * start) / episode.steps}%;width:${(100 * steps) / episode.steps}%`,
       }, make("span", { style: `background:${data.colors[skill]};color:${data.inks[skill]}` },
         make("b", { class: room(data.labels[skill]) }, data.labels[skill])));
@@ -315,6 +318,7 @@
       ["Ended", data.why[why] ?? "–"],
       ["Reward", signed(reward)],
     ];
+    if (episode.goals?.[i]) rows.splice(1, 0, ["Goal", episode.goals[i]]);
     if (own !== null) rows.push(["Its own reward", signed(own)]);
     if (succeeded !== null) rows.push(["Success", outcome(succeeded)]);
     if (video && episode.frame === null) rows.push(["Film", "this episode is not in it"]);
@@ -326,12 +330,12 @@
   };
 
   const fillTable = (place) => {
-    const rows = data.episodes[place].calls.map(([skill, start, steps, why, reward, own, succeeded], i) => {
+    const rows = data.episodes[place].calls.map(([, start, steps, why, reward, own, succeeded], i) => {
       const button = make("button", { type: "button", "aria-label": `Show call ${i + 1}` }, String(i + 1));
       button.addEventListener("click", () => choose(place, i));
       const cell = (text, numeric) => make("td", numeric ? { class: "num" } : {}, String(text));
       const first = make("td", { class: "num" }, button);
-      return make("tr", {}, first, cell(data.labels[skill]), cell(start, true), cell(steps, true),
+      return make("tr", {}, first, cell(called(data.episodes[place], i)), cell(start, true), cell(steps, true),
         cell(data.why[why] ?? "–"), cell(signed(reward), true), cell(own === null ? "–" : signed(own), true),
         cell(outcome(succeeded)));
     });
@@ -350,10 +354,10 @@
   const filmed = data.episodes.map((e, place) => ({ e, place })).filter(({ e }) => e.frame !== null);
   const lastFrame = ({ e }) => e.frame + Math.ceil(e.steps / data.film.every);
 
-  // Captions say who acts, in full screen too.
-  load(video, "film", data.film.fps, filmed.flatMap((f) => f.e.calls.map(([skill, start, steps]) => {
+  // Captions name the acting skill and its goal, in full screen too.
+  load(video, "film", data.film.fps, filmed.flatMap((f) => f.e.calls.map(([, start, steps], i) => {
     const [from, to] = [start, start + steps].map((s) => f.e.frame + Math.ceil(s / data.film.every));
-    return [from, to, data.labels[skill]];
+    return [from, to, called(f.e, i)];
   })));
 
   const head = make("div", { class: "head" });
@@ -367,7 +371,7 @@
     tracks[at.place].track.append(head);
     head.style.left = `${(100 * step) / at.e.steps}%`;
     $("now").textContent = `Episode ${at.e.number} · step ${step} of ${at.e.steps} · ` +
-      `${over ? "over" : data.labels[at.e.calls[found][0]]} · return so far ${signed(total)}`;
+      `${over ? "over" : called(at.e, found)} · return so far ${signed(total)}`;
     if (!video.paused && (chosen.episode !== at.place || chosen.call !== found)) choose(at.place, found, false);
   };
   video.addEventListener("timeupdate", follow);
