@@ -14,7 +14,12 @@ from gymnasium.vector.utils import batch_space
 
 from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.messages import error_text, short
+from skillweave.notices import notice
 from skillweave.types import Array, Memory, Memoryless, Policy
+
+SEES = "let sees= give the parts that it takes"
+ACTS = "let acts= say what its outputs mean"
+"""What to do about a policy with other spaces, for messages."""
 
 
 class Foreign(Memoryless):
@@ -28,6 +33,8 @@ class Foreign(Memoryless):
     """The name of its kind in ``run.json``."""
     suffix: str = ""
     """The suffix of the file of its ``content``."""
+    maps = False
+    """Other observations and actions can be mapped, by ``sees`` and ``acts``."""
 
     def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
         self.name = self._who = name
@@ -97,10 +104,18 @@ class Foreign(Memoryless):
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
-            space = short(self.observation_space, 300)
             raise PolicyError(
-                f"{self._who} fails on observations of {space}: {error_text(error)}"
+                f"{self._who} fails on {self.given}: {error_text(error)}{self.after_failure(error)}"
             ) from error
+
+    @property
+    def given(self) -> str:
+        """Return what the policy is given, for messages."""
+        return f"observations of {short(self.observation_space, 300)}"
+
+    def after_failure(self, error: BaseException) -> str:
+        """Return advice where the policy failed when it was tried out; empty: none."""
+        return ""
 
 
 def fitted(
@@ -120,19 +135,39 @@ def checked_fit(
     policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
 ) -> Policy:
     """Return a bound policy, after it was tried out; see ``fitted``."""
-    from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
-
-    for kind, mine, theirs in (
-        ("observation_space", policy.observation_space, observation_space),
-        ("action_space", policy.action_space, action_space),
-    ):
-        if not same_space(mine, theirs):
-            raise PolicyError(
-                f"{who}: its policy has {kind} {mine}, but the environment {env} has {theirs}"
-            )
+    check_spaces(policy, observation_space, action_space, f"{who}: its policy", env)
     if isinstance(policy, Foreign):
         policy.try_out()
     return policy
+
+
+def check_spaces(
+    policy: Policy, observation_space: Space[Any], action_space: Space[Any], whose: str, env: str
+) -> None:
+    """Raise a PolicyError where the spaces of a policy are not those of the environment ``env``.
+
+    If only the bounds of actions differ, a notice says that its numbers are not scaled. ``whose``
+    begins messages.
+    """
+    from skillweave.spaces import other_bounds, same_space  # needs torch, which declaring does not
+
+    for kind, mine, theirs, advice in (
+        ("observation_space", policy.observation_space, observation_space, SEES),
+        ("action_space", policy.action_space, action_space, ACTS),
+    ):
+        if not same_space(mine, theirs):
+            maps = isinstance(policy, Foreign) and policy.maps
+            raise PolicyError(
+                f"{whose} has {kind} {mine}, but the environment {env} has {theirs}"
+                + (f": {advice}" if maps else "")
+            )
+    if other_bounds(policy.action_space, action_space):
+        notice(
+            f"{whose} has actions of {short(policy.action_space, 200)}, but the environment {env} "
+            f"takes {short(action_space, 200)}: its numbers are used as they are, and clipped. To "
+            "scale those of a policy from elsewhere, give it acts=Acts(scale=...); those of others "
+            "gymnasium.wrappers.RescaleAction scales. Acts() says that they are right"
+        )
 
 
 class Source(TypedDict):

@@ -11,9 +11,10 @@ from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
+from gymnasium.spaces import Dict, Tuple
 
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.skills.foreign_policy import Foreign
+from skillweave.skills.foreign_policy import SEES, Foreign
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
@@ -28,6 +29,7 @@ class MappedPolicy(Foreign):
     ``last``, the last output; ``phase``, the steps since the last inference; ``held``, its actions.
     """
 
+    maps = True
     logits = True
     """Outputs that are no whole numbers are logits of choices."""
 
@@ -115,6 +117,22 @@ class MappedPolicy(Foreign):
     def has_goals(self) -> bool:
         """Return whether it is the policy of a skill with goals, and takes them by itself."""
         return self._goals is not None
+
+    @property
+    def given(self) -> str:
+        """Return the inputs that ``sees`` gives, or the observations, for messages."""
+        inputs = None if self._plan is None else self._plan.inputs
+        if inputs is None:
+            return super().given
+        named = (f"{name}: {x.described}" if name else x.described for name, x in inputs.items())
+        return f"the inputs that sees gives, {'; '.join(named)}"
+
+    def after_failure(self, error: BaseException) -> str:
+        """Return advice where an argument is missing, or whole observations are given."""
+        if not self.mapping.state and "required positional argument" in str(error):
+            return "; one with a recurrent state needs state=, the shape of this state"
+        whole = self.mapping.sees is None and isinstance(self.observation_space, Dict | Tuple)
+        return f"; {SEES}" if whole else ""
 
     advice = "write Goal() at its place in sees"
     """How the policy is given the goal, for messages."""

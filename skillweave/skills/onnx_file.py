@@ -14,7 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError
 from skillweave.messages import short, shortened
 from skillweave.reading import check_file
-from skillweave.skills.foreign_policy import checksum
+from skillweave.skills.foreign_policy import SEES, checksum
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.skills.plan import Shapes
@@ -123,7 +123,7 @@ class OnnxPolicy(MappedPolicy):
             shape = f"({', '.join(map(str, mine))})"
             raise PolicyError(
                 f"{bound._who} takes observations of shape {shape}, but the environment has "
-                f"{observation_space}: let sees= give the parts that it takes"
+                f"{observation_space}: {SEES}"
             )
         return bound
 

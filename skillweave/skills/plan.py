@@ -237,6 +237,12 @@ class Input:
         return x.reshape(len(x), *self.shape) if self.reshaped else x
 
     @property
+    def described(self) -> str:
+        """Return how many numbers it has, and of which sources, for messages."""
+        sizes = ", ".join(f"{_described(source)} {n}" for source, n in self.sources)
+        return f"{int(np.prod(self.shape))} numbers ({shortened(sizes, 300)})"
+
+    @property
     def leaves(self) -> list[tuple[Leaf | None, bool]]:
         """Return the leaf that each piece reads, and True if it reads all of it as it is.
 
@@ -489,10 +495,9 @@ class Plan:
                 exact = (1,) * len(wanted)
                 self.inputs[name] = replace(given, shape=exact, reshaped=True)
                 continue
-            sizes = ", ".join(f"{_described(source)} {n}" for source, n in given.sources)
             numbers = _product(wanted)
             size = int(np.prod(given.shape))
-            text = f"{self.who}: {field} gives {size} numbers ({shortened(sizes, 300)})"
+            text = f"{self.who}: {field} gives {given.described}"
             if numbers is None or numbers == size:
                 shape = "(" + ", ".join("n" if x is None else str(x) for x in wanted) + ")"
                 raise PolicyError(

@@ -14,7 +14,7 @@ from skillweave.spaces.choices import (
 )
 from skillweave.spaces.observations import ObsCodec, obs_codec, to_tensor
 from skillweave.spaces.packing import env_form, obs_dtype, obs_shape, pack, put_observation, unpack
-from skillweave.spaces.saving import same_space, space_from_json, space_to_json
+from skillweave.spaces.saving import other_bounds, same_space, space_from_json, space_to_json
 
 __all__ = [
     "ActionCodec",
@@ -30,6 +30,7 @@ __all__ = [
     "obs_codec",
     "obs_dtype",
     "obs_shape",
+    "other_bounds",
     "pack",
     "put_observation",
     "same_space",

@@ -198,6 +198,22 @@ def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
     return all(np.array_equal(x, y) for x, y in bounds)  # pixels are scaled by them
 
 
+def other_bounds(a: gym.Space[Any], b: gym.Space[Any]) -> bool:
+    """Return whether numbers of two spaces, of which ``same_space`` is true, have other bounds.
+
+    An infinite bound is not another one.
+    """
+    inner, other = parts(a), parts(b)
+    if inner is not None and other is not None:
+        return any(other_bounds(inner[name], other[name]) for name in inner)
+    if not isinstance(a, gym.spaces.Box) or not isinstance(b, gym.spaces.Box):
+        return False
+    pairs = ((getattr(a, k).astype(float), getattr(b, k).astype(float)) for k in ("low", "high"))
+    return any(
+        (np.isfinite(x) & np.isfinite(y) & ~np.isclose(x, y, rtol=1e-4)).any() for x, y in pairs
+    )
+
+
 def _dtype_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     """Return the type of a space of choices, if it is not the default."""
     return {} if space.dtype == np.int64 else {"dtype": str(space.dtype)}

@@ -20,7 +20,7 @@ from skillweave.envs.engine import Engine, checksums
 from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
-from skillweave.errors import DeclarationError, PolicyError, SkillweaveError
+from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
@@ -28,8 +28,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Count
 from skillweave.skills import Skill
-from skillweave.skills.foreign_policy import Foreign
-from skillweave.spaces import same_space
+from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
@@ -319,7 +318,7 @@ def _evaluate(
         spaces = envs.observation_space, envs.action_space
         if isinstance(policy, Foreign):
             policy = policy.bind(*spaces, "the policy")
-        _check_spaces(policy, *spaces, spec.name)
+        check_spaces(policy, *spaces, "the policy", spec.name)
         if isinstance(policy, Foreign):
             policy.try_out()
         seeds: Any = episode_seeds(seed, episodes)
@@ -441,14 +440,3 @@ def _scored(
     if isinstance(tally, CallTally):
         vars(evaluation).update(_goals=tally.goals, _reached=tally.reached)
     return evaluation
-
-
-def _check_spaces(policy: Policy, observation: Any, action: Any, name: str) -> None:
-    for kind, of_policy, of_env in (
-        ("observation", policy.observation_space, observation),
-        ("action", policy.action_space, action),
-    ):
-        if not same_space(of_policy, of_env):
-            raise PolicyError(
-                f"the policy was made for the {kind} space {of_policy}, but {name} has {of_env}"
-            )

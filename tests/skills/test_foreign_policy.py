@@ -10,7 +10,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
 
-from skillweave import evaluate, from_function, from_onnx, from_sb3, from_torch
+from skillweave import Acts, evaluate, from_function, from_onnx, from_sb3, from_torch
 from skillweave.errors import MissingExtra, PolicyError, SkillweaveError
 from skillweave.skills import Skill, ready_policy
 from skillweave.skills.foreign_policy import Foreign, as_recorded, fitted, source_of
@@ -192,6 +192,42 @@ def test_other_spaces_are_both_named(zip_file, tmp_path):
     assert str(EIGHT) in said
     assert "Discrete(5)" in says(from_torch(linear()), OBS, Discrete(5))
     assert "Discrete(3)" in says(from_function(lean, action_space=Discrete(3)))
+
+
+def test_actions_with_other_bounds_are_said_once_and_acts_settles_it(recwarn):
+    sb3 = pytest.importorskip("stable_baselines3")
+    model = sb3.A2C("MlpPolicy", "Pendulum-v1", device="cpu")  # actions from -2 to 2
+    seen, wide = model.observation_space, Box(-40, 40, (1,))
+    for policy in (from_sb3(model), from_sb3(model, sees=slice(0, 3))):
+        with pytest.warns(UserWarning, match="clipped") as said:
+            fit(policy, seen, wide)
+        text = str(said[0].message)
+        assert str(model.action_space) in text
+        assert str(wide) in text
+        assert "acts=Acts(scale=...)" in text
+    with pytest.warns(UserWarning, match="clipped"):
+        evaluate(from_torch(torch.nn.Linear(3, 1), action_space=wide), "Pendulum-v1", episodes=1)
+    recwarn.clear()
+    fit(from_sb3(model), seen, Box(-2, 2, (1,), np.float64))
+    fit(from_sb3(model), seen, Box(-np.inf, np.inf, (1,)))
+    fit(from_sb3(model, acts=Acts(scale=20)), seen, wide)
+    fit(from_sb3(model, acts=Acts()), seen, wide)
+    assert [str(w.message) for w in recwarn if "clipped" in str(w.message)] == []
+
+
+def test_spaces_that_a_mapping_could_join_name_it(zip_file):
+    parts = Dict({"place": Box(-1, 1, (3,)), "speed": Box(-1, 1, (1,))})
+    assert "let sees= give the parts" in says(from_sb3(zip_file, "ppo", trust=True), parts, ACTION)
+    assert "let acts= say" in says(from_sb3(zip_file, "ppo", trust=True), OBS, Discrete(5))
+    assert "let sees= give the parts" in says(from_torch(linear()), parts, ACTION)
+    seen = says(from_torch(linear(), sees=("place",)), parts, ACTION)
+    assert "the inputs that sees gives, 3 numbers (place 3)" in seen
+
+    class Recurrent(torch.nn.Module):
+        def forward(self, obs, state):
+            return obs, state
+
+    assert "needs state=" in says(from_torch(Recurrent()))
 
 
 def test_what_fails_or_returns_something_else_is_named():

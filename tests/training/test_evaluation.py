@@ -414,9 +414,9 @@ def test_a_wrong_number_is_told(wrong, says):
 @pytest.mark.parametrize(
     ("observation", "action", "says"),
     [
-        (Box(-1, 1, (3,)), Discrete(2), r"observation space Box.*\(3,\).*CartPole-v1 has Box"),
-        (None, Discrete(3), r"action space Discrete\(3\).*CartPole-v1 has Discrete\(2\)"),
-        (None, Box(-1, 1, (2,)), r"action space Box.*CartPole-v1 has Discrete\(2\)"),
+        (Box(-1, 1, (3,)), Discrete(2), r"observation_space Box.*\(3,\).*CartPole-v1 has Box"),
+        (None, Discrete(3), r"action_space Discrete\(3\).*CartPole-v1 has Discrete\(2\)"),
+        (None, Box(-1, 1, (2,)), r"action_space Box.*CartPole-v1 has Discrete\(2\)"),
     ],
 )
 def test_a_policy_made_for_other_spaces_is_told_both(observation, action, says):
