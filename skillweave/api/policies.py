@@ -10,7 +10,7 @@ from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.export.read import read_policy
-from skillweave.export.write import Export, write_export
+from skillweave.export.write import MANIFEST, Export, write_export
 from skillweave.messages import as_path, short
 from skillweave.runs import hub
 from skillweave.skills.foreign_policy import Foreign, fitted
@@ -104,7 +104,22 @@ def load_policy(
         name = str(path)
         if folder.is_absolute() or name.count("/") != 1 or name.startswith("."):
             raise RunError(f"{folder} does not exist")
-        folder = hub.download_policy(hub.check_name(name), revision)
+        try:
+            folder = hub.download_policy(hub.check_name(name), revision)
+        except RunError as error:
+            raise RunError(
+                f"there is no folder {name}, so it was sought on the hub: {error}"
+            ) from error
+    elif folder.is_file() and folder.name != MANIFEST:
+        raise RunError(
+            f"{folder} is a file; give a folder with {MANIFEST}. Models are opened by from_onnx, "
+            "from_torch and from_sb3"
+        )
     elif folder.is_file():
-        folder = folder.parent if folder.name == "policy.json" else folder
+        folder = folder.parent
+    elif not (folder / MANIFEST).exists() and (folder / "run.json").exists():
+        raise RunError(
+            f"{folder} is a run, not an exported policy: sw.load({str(folder)!r}, "
+            "hierarchy).policy acts as it does"
+        )
     return read_policy(folder, code, goal)

@@ -164,9 +164,9 @@ def check_spaces(
     if other_bounds(policy.action_space, action_space):
         notice(
             f"{whose} has actions of {short(policy.action_space, 200)}, but the environment {env} "
-            f"takes {short(action_space, 200)}: its numbers are used as they are, and clipped. To "
-            "scale those of a policy from elsewhere, give it acts=Acts(scale=...); those of others "
-            "gymnasium.wrappers.RescaleAction scales. Acts() says that they are right"
+            f"takes {short(action_space, 200)}: its numbers are used as they are, and clipped. "
+            "Scale them: acts=Acts(scale=...) of a policy from elsewhere, or the wrapper "
+            "gymnasium.wrappers.RescaleAction. If they are right, write acts=Acts()"
         )
 
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
+from skillweave.arguments import checked_names, meant
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
+from skillweave.messages import short, shortened
 from skillweave.named import named
 
 # Parts of an input
@@ -289,7 +289,7 @@ class PolicyMapping:
         """Return the mapping that ``to_json`` wrote.
 
         Args:
-            data: its JSON; further fields are ignored.
+            data: its JSON; further fields are ignored, unless one is like a field's name.
             code: the user's functions, by name.
 
         Raises:
@@ -297,6 +297,7 @@ class PolicyMapping:
         """
         if not isinstance(data, Mapping):
             raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
+        _check_names(cls, data, "")
         code = code or {}
         sees = data.get("sees")
         goal = data.get("goal")
@@ -620,13 +621,30 @@ def _source_from_json(data: Any, code: Mapping[str, Any], where: str) -> Source:
 
 
 def _from_json(kind: type[Any], data: Any, where: str) -> Any:
-    """Return settings of a kind; further fields are ignored."""
+    """Return settings of a kind; see ``_check_names`` for further fields."""
     if not isinstance(data, Mapping):
         raise DeclarationError(f"{where} is {short(data)}; it must be an object")
+    _check_names(kind, data, where)
     try:
         return kind(**{f.name: data[f.name] for f in fields(kind) if f.name in data})
     except DeclarationError as error:
         raise DeclarationError(f"{where}: {error}") from None
+
+
+FURTHER = (
+    *("source", "function", "fields", "choices", "whole"),
+    *("kind", "file", "code", "output", "outputs", "shapes", "logits", "sampled", "with_goal"),
+)
+"""Fields that a file has beside those of a mapping and its parts."""
+
+
+def _check_names(kind: type[Any], data: Mapping[str, Any], where: str) -> None:
+    """Raise a DeclarationError where an unknown field looks like a misspelt one."""
+    known = [f.name for f in fields(kind)]
+    for name in data:
+        if name not in (*known, *FURTHER) and (hint := meant(str(name), known, "")):
+            place = f"{where}." if where else ""
+            raise DeclarationError(f"{place}{shortened(str(name), 80)} is unknown{hint}")
 
 
 def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any], Any]:

@@ -253,6 +253,15 @@ def changed(folder: Path, change: Callable[[Any], Any]) -> None:
         (lambda x: x["policy"]["state"].clear(), "policy: .*does not set the input 'h'"),
         (lambda x: x["observation_space"].update(type="Ball"), "observation_space: .*Ball"),
         (lambda x: x["action_space"].update(shape=[4], low=-2.0, high=2.0), r"\(2, 5\)|5 numbers"),
+        (lambda x: x["policy"].update(evry=3), "policy.evry is unknown: is 'every' meant"),
+        (
+            lambda x: x["policy"]["acts"].update(scal=3),
+            "policy.acts.scal is unknown: is 'scale' meant",
+        ),
+        (
+            lambda x: x["policy"]["sees"]["obs"][0].update(ofset=1),
+            r"policy.sees\['obs'\]\[0\].ofset is unknown: is 'offset' meant",
+        ),
         (lambda x: x["code"].update(f="a function"), "needs Python code.*'f': a function"),
     ],
 )
@@ -277,6 +286,26 @@ def test_files_that_are_missing_or_damaged_are_named(saved: Path) -> None:
         sw.load_policy(saved)
     with pytest.raises(RunError, match=r"nothing/at/all does not exist"):
         sw.load_policy("nothing/at/all")
+
+
+def test_further_fields_that_are_like_no_other_are_comments(saved: Path) -> None:
+    changed(saved, lambda x: x["policy"].update(comment="of Monday", robot="A"))
+    assert sw.load_policy(saved)
+
+
+def test_what_is_no_folder_of_a_policy_says_what_it_is(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(RunError, match=r"net.onnx is a file; .*from_onnx"):
+        sw.load_policy(saved.parent / "net.onnx")
+    assert sw.load_policy(saved / "policy.json")
+    run = sw.train_agent("CartPole-v1", sw.PPO(num_envs=2, n_steps=8), 16, saved / "run")
+    with pytest.raises(RunError, match=r"run is a run, not an exported policy: sw.load\('.*run'"):
+        sw.load_policy(run.path)
+    pytest.importorskip("huggingface_hub")
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(RunError, match=r"no folder policies/reach, so it was sought on the hub: "):
+        sw.load_policy("policies/reach")
 
 
 def test_other_spaces_than_the_environments_are_both_named(saved: Path) -> None:
