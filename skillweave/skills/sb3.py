@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import io
+import zipfile
 from pathlib import Path
 from typing import Any, Literal, Self, overload
 
@@ -244,7 +245,8 @@ def from_sb3(
     except Exception as error:
         raise PolicyError(
             f"{file} could not be opened as Stable-Baselines3's {kind.__name__}: "
-            f"{type(error).__name__}: {shortened(str(error))}"
+            f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}. "
+            + _other_version(content)
         ) from error
     if learn:
         return _learnable(loaded, file, normalize, trust, options)
@@ -410,6 +412,24 @@ def _statistics(
         )
         for name, one in by_name.items()
     }
+
+
+def _other_version(content: bytes) -> str:
+    """Return what a file that could not be opened may be, for messages."""
+    import stable_baselines3
+
+    here = stable_baselines3.__version__
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            saved = archive.read("_stable_baselines3_version").decode("ascii", "replace").strip()
+    except (zipfile.BadZipFile, KeyError):
+        return "It is no zip of Stable-Baselines3"
+    if saved != here:
+        return (
+            f"It was saved by Stable-Baselines3 {shortened(saved, 40)}, and {here} is installed: "
+            "install that version, or save it again by this one"
+        )
+    return "Did another algorithm save it?"
 
 
 def _algorithm(algorithm: str | type | None, file: Path) -> Any:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -268,6 +269,22 @@ def test_wrong_files_are_named(tmp_path):
     ]:
         with pytest.raises(SkillweaveError, match=match):
             make()
+
+
+def test_a_zip_that_cannot_be_opened_says_what_it_may_be(zip_file, tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    with pytest.raises(PolicyError, match="Did another algorithm save it"):
+        from_sb3(zip_file, "sac", trust=True)
+    with zipfile.ZipFile(zip_file) as old, zipfile.ZipFile(tmp_path / "new.zip", "w") as new:
+        for name in old.namelist():
+            content = b"9.1.0" if name == "_stable_baselines3_version" else old.read(name)
+            new.writestr(name, b"{" if name == "data" else content)
+    newer = rf"saved by Stable-Baselines3 9.1.0, and {sb3.__version__} is installed: install"
+    with pytest.raises(PolicyError, match=newer):
+        from_sb3(tmp_path / "new.zip", "ppo", trust=True)
+    (tmp_path / "text.zip").write_text("no zip")
+    with pytest.raises(PolicyError, match="It is no zip of Stable-Baselines3"):
+        from_sb3(tmp_path / "text.zip", "ppo", trust=True)
 
 
 @pytest.mark.parametrize(
