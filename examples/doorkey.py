@@ -150,7 +150,7 @@ hierarchy = declare()
 
 def main() -> None:
     """Train it, and say how many episodes it solves."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--room", default=ROOM)
     parser.add_argument("--steps", type=int, default=500_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -63,7 +63,7 @@ def holds(run, goal, seed):
 
 def main():
     """Train the skill, and fly to a grid of goals."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--steps", type=int, default=1_500_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--grid", type=int, default=len(GRID), help="goals to fly to")

@@ -128,7 +128,7 @@ hierarchy = declare()
 
 def main() -> None:
     """Train it, and say how many episodes it solves."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--steps", type=int, default=150_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", default="runs/nested")

@@ -146,7 +146,7 @@ register_algorithm(A2C, A2CAlgorithm)
 
 def main() -> None:
     """Train it on CartPole, and say how well it does."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--out", default="runs/own_algorithm")
     asked = parser.parse_args()

@@ -159,7 +159,7 @@ def score(run, env, episodes):
 
 def main():
     """Train the selector, and walk missions that it never saw."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("path", help="the walking policy, an ONNX file")
     parser.add_argument("--steps", type=int, default=300_000, help="of the environment")
     parser.add_argument("--seed", type=int, default=0)

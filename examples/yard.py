@@ -133,7 +133,7 @@ hierarchy = declare()
 
 def main() -> None:
     """Train it, and say how many episodes it solves."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--steps", type=int, default=300_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=100, help="how many episodes score it")

@@ -216,6 +216,19 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: with_skill(reward=lambda step: step.next_obs[:, 0]),
         "a method of a skill takes (self, step)",
     ),
+    "initiation takes a goal": (
+        lambda: with_skill(initiation=lambda _, obs, goal: obs[:, 0] > 0),
+        "initiation() is called with (obs), but takes (obs, goal): a method of a skill takes "
+        "(self, obs); it is called before the goal is chosen",
+    ),
+    "reward takes a goal": (
+        lambda: with_skill(reward=lambda _, step, goal: step.reward),
+        "a method of a skill takes (self, step); the goal is step.goal",
+    ),
+    "goals without rng": (
+        lambda: with_skill(goal_space=gym.spaces.Discrete(2), goals=lambda _, obs: obs),
+        "goals() is called with (obs, rng), but takes (obs): ",
+    ),
     "index out of range": (
         lambda: with_skill(reward=lambda _, step: step.next_obs[:, 9]),
         "step.next_obs has the shape (4, 4)",

@@ -1022,6 +1022,9 @@ class PlannedRun(Run):
 
     _mark = "-plan"
 
+    def __repr__(self) -> str:
+        return super().__repr__().replace("<Run", "<PlannedRun of", 1)
+
     @checked_names
     def with_selector(
         self,

@@ -160,7 +160,9 @@ class Player:
         try:
             put_observation(self._space, batch, 0, obs)
         except (TypeError, ValueError, KeyError, IndexError) as error:
+            several = isinstance(obs, np.ndarray) and obs.shape[1:] == self._shape
             raise DeclarationError(
-                f"act() was given an observation that is none of {self._space}: {error}"
+                f"act() was given an observation that does not fit {self._space}: {error}"
+                + ("; give one observation, without an axis of environments" if several else "")
             ) from error
         return batch

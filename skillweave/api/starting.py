@@ -115,8 +115,9 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
     wrong = [k for k, v in weights.items() if k not in fresh or fresh[k].shape != v.shape]
     if wrong:
         raise PolicyError(
-            f"{origin.name} does not fit {name!r}: its network takes or returns another number of "
-            "values than the spaces have"
+            f"{origin.name} does not fit {name!r}: its networks ({origin.sizes}) take or return "
+            f"another number of values than {short(role.observation_space, 200)} and "
+            f"{short(role.action_space, 200)} have"
         )
     policy = AgentPolicy(algorithm, fresh | weights)
     return Learnt(policy, origin.sha256(), origin.steps, None, ((), ()))

@@ -220,7 +220,7 @@ class States:
         if sampled and isinstance(policy, SB3Policy):
             raise PolicyError(
                 f"{where} samples by Stable-Baselines3's own code, which the runner does not have: "
-                "let skills act greedily, greedy_skills=True"
+                "train with selection=Selection(greedy_skills=True)"
             )
 
         def name_of(function: Any, what: str) -> str:
@@ -284,8 +284,8 @@ class States:
                 if sampled:
                     raise PolicyError(
                         f"{name} is an automaton that draws among the skills of a state, which the "
-                        "runner does not: set greedy_selector=True for it, and greedy_skills=True "
-                        "for the skills around it"
+                        "runner does not: train with Selection(greedy_selector=True) for it, and "
+                        "greedy_skills=True for the skills around it"
                     )
                 return self._automaton(selector, name)
             case FunctionSelector():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +34,14 @@ DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 
 
 _OF_TRAINING = ("steps", "task_weight", "target_return", "target_success")
+
+_PARAMETERS = {
+    **dict.fromkeys(("reward", "termination", "success"), ("step",)),
+    "initiation": ("obs",),
+    "goals": ("obs", "rng"),
+    "clip_goal": ("obs", "goal"),
+}
+"""The arguments of a skill's methods."""
 
 
 class Skill:
@@ -236,6 +245,25 @@ class Skill:
                 raise DeclarationError(
                     f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
                 )
+            self._check_parameters(method, where)
+
+    def _check_parameters(self, method: str, where: str) -> None:
+        """Raise a DeclarationError where a method cannot be called with its arguments."""
+        names = _PARAMETERS[method]
+        try:
+            signature = inspect.signature(getattr(self, method))
+        except (TypeError, ValueError):  # of some functions written in C
+            return
+        try:
+            signature.bind(*names)
+        except TypeError:
+            goal = "goal" in signature.parameters and "goal" not in names
+            advice = "; it is called before the goal is chosen" if names == ("obs",) else ""
+            advice = "; the goal is step.goal" if names == ("step",) else advice
+            raise DeclarationError(
+                f"{where}: {method}() is called with ({', '.join(names)}), but takes {signature}: "
+                f"a method of a skill takes (self, {', '.join(names)}){advice if goal else ''}"
+            ) from None
 
     def _check_goals(self, where: str) -> None:
         """Raise a DeclarationError where its goals are declared in a way that has no meaning."""

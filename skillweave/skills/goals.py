@@ -152,6 +152,11 @@ class Goals:
         Raises:
             SkillError: it is none of the space; the message names ``who``.
         """
+        if parts_of(self.space) is None and (shape := _shape_of(goal)) not in (None, self.shape):
+            raise SkillError(
+                f"{who} gave a goal of shape {shape} for {self._who}, but {self.shape} was "
+                f"expected: one of {short(self.space)}"
+            )
         goals = as_goals(repeated(self.space, goal, 1), 1, self.space, who, self._who).copy()
         return goals if self.skill.defines("clip_goal") else self._inside(goals, who, SkillError)
 
@@ -282,6 +287,15 @@ def as_goals(
             raise kind(_is_out(goals[wrong.argmax()], space, who, skill) + "; give one in it")
     with np.errstate(over="ignore"):  # an infinity is out of every space
         return goals.astype(dtype)
+
+
+def _shape_of(value: Any) -> tuple[int, ...] | None:
+    """Return the shape of a goal; None: it is no array."""
+    try:
+        shape: tuple[int, ...] = np.shape(value)
+        return shape
+    except ValueError:
+        return None
 
 
 def _parts_given(values: Any, space: Space[Any]) -> list[Any] | None:

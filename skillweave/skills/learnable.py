@@ -133,6 +133,12 @@ class Learnable:
                     f"{who}: {self.name} has {what} {mine}, but the environment has {theirs}"
                 )
 
+    @property
+    def sizes(self) -> str:
+        """Return the numbers of inputs and outputs of each network, for messages."""
+        each = ((name, net.weights) for name, net in self.networks.items())
+        return ", ".join(f"{k} {w[0].shape[-2]} to {w[-1].shape[-1]}" for k, w in each)
+
     def weights(self, action_space: Space[Any]) -> dict[str, Array]:
         """Return the arrays by the names of the algorithm's weights, float32."""
         from skillweave.spaces import action_codec

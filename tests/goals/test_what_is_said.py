@@ -68,6 +68,11 @@ def test_a_player_takes_a_goal(tmp_path):
     assert np.allclose(player.act(np.zeros(2, np.float32)), (0.25, 0.0))
     with pytest.raises(SkillError, match=r"the player gave the goal .* out of goal_space"):
         run.player(skill="go_to", goal=(5, 5))
+    shape = r"gave a goal of shape \(1,\) for skill 'go_to', but \(2,\) was expected: one of Box"
+    with pytest.raises(SkillError, match=shape):
+        run.player(skill="go_to", goal=(0.5,))
+    with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
+        player.act(np.zeros((1, 2), np.float32))
     with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
         run.player(goal=(0, 0))
 

@@ -90,6 +90,7 @@ def test_a_reward_alone_has_no_success(run: Run, log: CallLog) -> None:
         return step.next_obs[:, PLACE] / 100
 
     planned = run.plan(far, log)
+    assert repr(planned) == repr(run).replace("<Run", "<PlannedRun of")
     score = planned.evaluate(4, quiet=True)
     assert score.success_rate is None
     assert score.mean > 1.2 * run.plan(at_four, log).evaluate(1, quiet=True).mean

@@ -160,6 +160,14 @@ def test_a_sequential_module():
     np.testing.assert_allclose(agent.act({}, obs)[0], wanted, atol=1e-5)
 
 
+def test_a_network_of_other_sizes_is_named_with_them(tmp_path):
+    policy = sw.from_torch(torch.nn.Sequential(torch.nn.Linear(5, 2)), learn=True)
+    with pytest.raises(
+        sw.PolicyError, match=r"networks \(actor 5 to 2\) .* values than Box.* and Box"
+    ):
+        hierarchy(skill(policy)).train(tmp_path / "run", quiet=True)
+
+
 def skill(policy, **fields):
     return type("Walk", (sw.Skill,), {"policy": policy, **fields})()
 
