@@ -353,7 +353,7 @@ def mapping_of(
     try:
         states, single = _checked_state(state)
         mapping = PolicyMapping(
-            sees=None if sees is None else _checked_sees(sees),
+            sees=None if sees is None else checked_sees(sees),
             goal=checked_goal(goal),
             acts=_checked_acts(acts),
             every=checked_count(every, "every"),
@@ -376,27 +376,50 @@ def function_name(function: Any) -> str:
         return str(getattr(function, "__qualname__", type(function).__qualname__))
 
 
-def as_source(value: Any, where: str) -> Source:
+def as_source(value: Any, where: str, of_skill: bool = False) -> Source:
     """Return one entry of ``sees`` as a source.
 
+    Args:
+        value: the entry.
+        where: begins messages.
+        of_skill: it is of a skill's ``sees``, which has neither ``Goal`` nor ``LastAction``.
+
     Raises:
-        DeclarationError: it is none; the message begins with ``where``.
+        DeclarationError: it is none.
     """
+    kind = value if isinstance(value, type) else type(value)
+    if of_skill and (why := _NOT_OF_SKILLS.get(kind)):
+        raise DeclarationError(f"{where} has {kind.__name__}(), {why}: leave it out")
     if isinstance(value, Part | Goal | LastAction | Computed):
         return value
     if isinstance(value, type) and value in (Goal, LastAction, Part):
         raise DeclarationError(f"{where} is the class {value.__name__}; write {value.__name__}()")
     if isinstance(value, str):
         return Part(value)
-    if isinstance(value, slice):
+    if is_places(value):
         return Part(places=value)
-    if isinstance(value, int | np.integer) and not isinstance(value, bool):
-        return Part(places=(int(value),))
     if callable(value):
         return Computed(function=value)
+    others = "" if of_skill else "Goal(), LastAction(), "
     raise DeclarationError(
         f"{where} is {short(value)}; it must be the key of a part of the observation, a place in "
-        "it, a slice, Part(...), Goal(), LastAction(), or a function of observations"
+        f"it, a slice, Part(...), {others}or a function of observations"
+    )
+
+
+_NOT_OF_SKILLS: dict[type[Any], str] = {
+    Goal: "but the policy of a skill with a goal_space sees the goal of its call already",
+    LastAction: "which only a policy from elsewhere takes, in its own sees",
+}
+"""Sources that a skill's ``sees`` cannot have, and why."""
+
+
+def is_places(value: Any) -> bool:
+    """Return whether a value is one place, or several: a slice, a range, a list or an array."""
+    if isinstance(value, slice | range | np.ndarray):
+        return True
+    return _is_whole(value) or (
+        isinstance(value, list | tuple) and bool(value) and all(map(_is_whole, value))
     )
 
 
@@ -439,29 +462,34 @@ def _check_in_range(goal: tuple[float, ...], places: Sequence[Goal]) -> None:
                 )
 
 
-def _checked_sees(sees: Any) -> dict[str, tuple[Source, ...]]:
-    """Return ``sees`` by the names of inputs."""
+def checked_sees(sees: Any, of_skill: bool = False) -> dict[str, tuple[Source, ...]]:
+    """Return ``sees`` by the names of inputs; ``of_skill``: it is a skill's.
+
+    Raises:
+        DeclarationError: an entry is wrong; the message names it.
+    """
     if not isinstance(sees, Mapping):
-        return {"": _checked_parts(sees, "sees")}
+        return {"": _checked_parts(sees, "sees", of_skill)}
     if not sees or not all(isinstance(name, str) and name for name in sees):
         raise DeclarationError("sees is a dict; its keys must be the names of the policy's inputs")
-    return {name: _checked_parts(parts, f"sees[{name!r}]") for name, parts in sees.items()}
+    return {
+        name: _checked_parts(parts, f"sees[{name!r}]", of_skill) for name, parts in sees.items()
+    }
 
 
-def _checked_parts(parts: Any, where: str) -> tuple[Source, ...]:
-    if not isinstance(parts, list | tuple):
-        return (as_source(parts, where),)
-    if not parts:
+def _checked_parts(parts: Any, where: str, of_skill: bool) -> tuple[Source, ...]:
+    size = parts.size if isinstance(parts, np.ndarray) else None
+    if size == 0 or (isinstance(parts, list | tuple | range) and not parts):
         raise DeclarationError(f"{where} is empty; name at least one part of the observation")
-    if all(isinstance(p, int | np.integer) and not isinstance(p, bool) for p in parts):
-        return (Part(places=parts),)  # as a network's ``sees``
-    return tuple(as_source(part, f"{where}[{i}]") for i, part in enumerate(parts))
+    if is_places(parts) or not isinstance(parts, list | tuple):
+        return (as_source(parts, where, of_skill),)
+    return tuple(as_source(part, f"{where}[{i}]", of_skill) for i, part in enumerate(parts))
 
 
 def _checked_acts(acts: Any) -> Acts | None:
     if acts is None or isinstance(acts, Acts):
         return acts
-    if isinstance(acts, slice | list | tuple):
+    if is_places(acts) or isinstance(acts, list | tuple):
         return Acts(to=acts)
     raise DeclarationError(
         f"acts is {short(acts)}; it must be Acts(...), or the places of the outputs in the action"
@@ -548,15 +576,21 @@ def _places(settings: Any, name: str) -> slice | tuple[int, ...] | None:
         bounds = (value.start, value.stop, value.step)
         if all(x is None or isinstance(x, int | np.integer) for x in bounds) and value.step != 0:
             return value
-    elif isinstance(value, range | list | tuple | np.ndarray):
+    elif _is_place(value):
+        return (int(value),)
+    elif isinstance(value, range | list | tuple | np.ndarray) and np.ndim(value) == 1:
         places = list(value)
         if places and all(_is_place(x) for x in places):
             return tuple(int(x) for x in places)
     raise DeclarationError(f"{where}; it must be a slice, or a list of places, counted from 0")
 
 
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
 def _is_place(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 0
+    return _is_whole(value) and int(value) >= 0
 
 
 # Files

@@ -24,10 +24,9 @@ from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import example_of, leaf_paths, outside, part_at, parts_of
 from skillweave.skills.mapping import (
     Acts,
-    Goal,
-    LastAction,
     PolicyMapping,
-    mapping_of,
+    checked_sees,
+    is_places,
     places_to_json,
 )
 from skillweave.skills.outputs import required_arguments
@@ -50,19 +49,10 @@ def declared_sees(sees: Any, who: str) -> PolicyMapping:
     """
     if isinstance(sees, MethodType) and required_arguments(sees.__func__) == 1:
         sees = sees.__func__  # a function in a class's body becomes a method when it is looked up
-    mapping = mapping_of(who, sees=sees)
-    for source in mapping.sources():
-        if isinstance(source, Goal):
-            raise DeclarationError(
-                f"{who}: sees has Goal(), but the policy of a skill with a goal_space sees the "
-                "goal of its call already: leave it out"
-            )
-        if isinstance(source, LastAction):
-            raise DeclarationError(
-                f"{who}: sees has LastAction(), which only a policy from elsewhere takes, in its "
-                "own sees: leave it out"
-            )
-    return mapping
+    try:
+        return PolicyMapping(sees=checked_sees(sees, of_skill=True))
+    except DeclarationError as error:
+        raise DeclarationError(f"{who}: {error}") from None
 
 
 def computed(sees: Any, who: str) -> bool:
@@ -81,14 +71,12 @@ def declared_acts(acts: Any, who: str) -> Any:
         if len(set(names)) != len(names):
             raise DeclarationError(f"{who}: acts names a part of the action twice: {short(acts)}")
         return tuple(names)
-    if isinstance(acts, int | np.integer) and not isinstance(acts, bool):
-        acts = (acts,)
     if callable(acts) and not isinstance(acts, Acts):
         raise DeclarationError(
             f"{who}: acts is a function, but it names the part of the action that the skill "
             "writes, acts = (0, 1, 2): what computes actions is policy(self, obs)"
         )
-    if isinstance(acts, slice | range | list | tuple | np.ndarray):
+    if is_places(acts) or isinstance(acts, list | tuple):
         try:
             acts = Acts(to=acts)
         except DeclarationError as error:

@@ -69,7 +69,30 @@ def test_parts_are_joined_in_their_order():
     assert np.allclose(scaled, 2 * (obs["arm"] - 1))
 
 
-@pytest.mark.parametrize("acts", [(2, 0), [2, 0], np.array([2, 0]), sw.Acts(to=(2, 0))])
+PLACES = (2, 0), [2, 0], np.array([2, 0]), range(2, -1, -2)
+
+
+@pytest.mark.parametrize("places", PLACES)
+def test_places_are_given_in_the_same_kinds_everywhere(places):
+    flat = part(slice(0, 3)).see(observations())
+    assert part(places).see(observations()).tolist() == flat[:, [2, 0]].tolist()
+    joined = part(("hook", places)).see(observations())
+    assert joined[:, 1:].tolist() == flat[:, [2, 0]].tolist()
+    assert part(sw.Part(places=places)).inputs[""].sources == part(places).inputs[""].sources
+    assert mine(sees=places, acts=places).validate() is None
+    outside = sw.from_function(lambda x: x, sees=places, acts=places).mapping
+    assert outside == sw.from_function(lambda x: x, sees=(2, 0), acts=(2, 0)).mapping
+
+
+@pytest.mark.parametrize("place", [2, np.int64(2)])
+def test_a_place_alone_is_given_everywhere(place):
+    assert part(place).see(observations()).shape == (4, 1)
+    assert part(acts=place).action_space == Box(BOX.low[[2]], BOX.high[[2]], dtype=np.float32)
+    assert sw.from_function(lambda x: x, acts=place).mapping.acts == sw.Acts(to=(2,))
+    assert sw.Part(places=place) == sw.Part(places=(2,))
+
+
+@pytest.mark.parametrize("acts", [*PLACES, sw.Acts(to=(2, 0)), sw.Acts(to=np.array([2, 0]))])
 def test_its_numbers_of_a_box(acts):
     own = part(acts=acts, rest=(0.0, 1.5, 0.0))
     assert own.action_space == Box(BOX.low[[2, 0]], BOX.high[[2, 0]], dtype=np.float32)
@@ -173,10 +196,16 @@ def mine(**attributes: Any) -> sw.Skill:
         ({"acts": sw.Acts(to=(0,), rest=0.0)}, r"acts has rest.*Hierarchy\(..., rest=...\)"),
         ({"acts": sw.Acts()}, "it must be the places"),
         ({"acts": lambda self, obs: obs}, r"acts is a function.*policy\(self, obs\)"),
-        ({"sees": 1.5}, r"sees is 1.5; it must be the key"),
+        ({"sees": 1.5}, r"sees is 1.5; it must be the key.*, Part\(...\), or a function"),
+        ({"sees": ("arm", None)}, r"sees\[1\] is None; .*, Part\(...\), or a function"),
         ({"sees": ()}, "sees is empty"),
+        ({"sees": range(0)}, "sees is empty"),
+        ({"sees": (0, -1)}, r"Part.places is \(0, -1\); it must be a slice"),
+        ({"sees": np.array(1.5)}, "Part.places is .*; it must be a slice"),
+        ({"sees": sw.Goal}, r"sees has Goal\(\).*already: leave it out"),
         ({"sees": sw.Goal()}, r"sees has Goal\(\).*already: leave it out"),
-        ({"sees": ("arm", sw.LastAction())}, r"sees has LastAction\(\).*leave it out"),
+        ({"sees": ("arm", sw.LastAction())}, r"sees\[1\] has LastAction\(\).*leave it out"),
+        ({"acts": range(0)}, "it must be a slice, or a list of places"),
     ],
 )
 def test_what_a_skill_cannot_declare(attributes, says):

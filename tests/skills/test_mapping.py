@@ -251,7 +251,7 @@ def zeros(x: Array) -> Array:
         ({"chunk": True}, "chunk is True"),
         ({"state": (1, 64)}, "state is .*None as the axis of the environments"),
         ({"state": {"h": 3}}, "state is "),
-        ({"acts": 3}, r"acts is 3; it must be Acts\(\.\.\.\)"),
+        ({"acts": 1.5}, r"acts is 1.5; it must be Acts\(\.\.\.\)"),
         ({"acts": (0, 0)}, "each place of an action can be written once"),
     ],
 )
