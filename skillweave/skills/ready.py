@@ -18,7 +18,7 @@ from skillweave.skills.goals import goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.residual import Correction, Residual, check_corrected
+from skillweave.skills.residual import Correction, Residual, check_corrected, refuse_skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -45,6 +45,7 @@ def base_policy(skill: Skill) -> Policy | None:
 
 def _as_policy(value: Any, skill: Skill) -> Policy:
     where = f"skill {skill.name!r}: policy is"
+    refuse_skill(value, where.removesuffix(" is"))
     if isinstance(value, type):
         raise DeclarationError(f"{where} the class {value.__name__}, not a policy")
     if hasattr(value, "act") and hasattr(value, "start"):

@@ -62,6 +62,7 @@ class Residual:
     action's own unit."""
 
     def __post_init__(self) -> None:
+        refuse_skill(self.policy, "Residual.policy")
         if self.policy is None or isinstance(self.policy, type | Residual):
             raise DeclarationError(f"Residual.policy is {short(self.policy)}; it must be {TAKES}")
         if isinstance(self.policy, Learnable):
@@ -85,6 +86,27 @@ class Residual:
 
     def __repr__(self) -> str:
         return f"Residual({short(self.policy, 60)}, scale={self.scale})"
+
+
+def refuse_skill(value: Any, where: str) -> None:
+    """Raise a DeclarationError where a skill, or its class, is given as a policy.
+
+    ``where`` begins the message.
+    """
+    methods = getattr(value, "methods", None)  # of ``Skill``, whose module imports this one
+    if not (isinstance(methods, tuple) and "initiation" in methods):
+        return
+    kind = value if isinstance(value, type) else type(value)
+    what = f"the class {kind.__name__}" if value is kind else f"the skill {value.name!r}"
+    if value.policy is None or isinstance(value.policy, Learnable | Residual):
+        raise DeclarationError(
+            f"{where} is {what}, a skill that learns, and no policy: train a hierarchy of it "
+            "first, and give the policy of that run, run.policy"
+        )
+    instance = f"{kind.__name__}()" if value is kind else "skill"
+    raise DeclarationError(
+        f"{where} is {what}, and no policy: give what acts in that skill, {instance}.policy"
+    )
 
 
 class Correction:

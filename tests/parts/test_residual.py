@@ -232,6 +232,38 @@ def test_what_is_no_correction(policy, scale, says):
         sw.Residual(policy, scale)
 
 
+class Ready(sw.Skill):
+    def policy(self, obs):
+        return middle(obs)
+
+
+class Corrected(sw.Skill):
+    policy = sw.Residual(middle)
+
+
+READY = r"and no policy: give what acts in that skill, {}\.policy"
+LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
+
+
+@pytest.mark.parametrize(
+    ("skill", "says"),
+    [
+        (Ready, "is the class Ready, " + READY.format(r"Ready\(\)")),
+        (Ready(), "is the skill 'ready', " + READY.format("skill")),
+        (Arm, "is the class Arm, " + LEARNS),
+        (Arm(), "is the skill 'arm', " + LEARNS),
+        (Corrected, "is the class Corrected, " + LEARNS),
+        (Corrected(), "is the skill 'corrected', " + LEARNS),
+    ],
+)
+def test_a_skill_is_no_policy(skill, says):
+    with pytest.raises(sw.DeclarationError, match=rf"^Residual\.policy {says}$"):
+        sw.Residual(skill)
+    as_policy = type("Better", (sw.Skill,), {"policy": skill})
+    with pytest.raises(sw.DeclarationError, match=rf"skill 'better': policy {says}$"):
+        crane([as_policy()]).train(quiet=True)
+
+
 def test_what_learns_on_is_not_corrected():
     module = sw.from_torch(nn.Sequential(nn.Linear(3, 3)), learn=True)
     with pytest.raises(sw.DeclarationError, match=r"with learn=True.*leave out learn"):
@@ -254,9 +286,10 @@ def test_what_does_not_fit_is_refused_before_training(skill, env, says):
 
 def test_what_has_a_policy_is_not_one():
     ready = crane([Arm()], steps=130).train(quiet=True)
-    for value in (ready, ready.as_skill("ready")):
-        with pytest.raises(sw.DeclarationError, match=r"has a policy, but is none.*\.policy"):
-            crane([declared(value)]).train(quiet=True)
+    with pytest.raises(sw.DeclarationError, match=r"has a policy, but is none.*\.policy"):
+        crane([declared(ready)]).train(quiet=True)
+    with pytest.raises(sw.DeclarationError, match=r"the skill 'ready', and no policy.*\.policy"):
+        declared(ready.as_skill("ready"))
 
 
 def test_a_ready_policy_of_another_shape_is_refused():
