@@ -198,7 +198,7 @@ class Level:
             spec,
             self.selector if isinstance(self.selector, AlgorithmConfig) else None,
             choices=self.choices,
-            goal_spaces=self.goal_spaces,
+            chosen_goals=self.goal_spaces,
             own_goals=own,
             skills=self.names,
             row_steps=self._usual_steps,
@@ -211,7 +211,7 @@ class Level:
             "critic",
             spec,
             choices=len(self.skills),
-            goal_spaces=self.goal_spaces,
+            observed_goals=self.goal_spaces,
             own_goals=own,
             margin=margin,
         )

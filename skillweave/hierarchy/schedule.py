@@ -235,7 +235,7 @@ def _critic(selector: Any, role: Role, deciding: bool) -> SkillCritic:
         shared["network"] = replace(shared["network"], rnn=None)
     elif isinstance(network := getattr(selector, "network", None), Network):
         shared["network"] = Network(planes=network.planes)
-    sees_goals = bool(role.goal_spaces)
+    sees_goals = bool(role.observed_goals)
     if sees_goals and (network := shared.get("network")) is not None and network.sees is not None:
         whole = obs_codec(role.observation_space).size
         goals = range(whole - obs_codec(goal_part(role.observation_space)).size, whole)

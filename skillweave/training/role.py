@@ -34,9 +34,10 @@ class Role:
     choices: int | None = None
     """The number of a selector's choices, or of a critic's values; None: it acts in the
     environment."""
-    goal_spaces: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
-    """Of a selector, the spaces of goals that it chooses, by the names of their skills; a critic
-    observes them."""
+    chosen_goals: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
+    """Of a selector, the spaces of the goals that it chooses, by the names of their skills."""
+    observed_goals: Mapping[str, gym.Space[Any]] = field(default_factory=dict)
+    """Of a critic, the spaces of the goals of calls, which it observes, by the names of skills."""
     own_goals: gym.Space[Any] | None = None
     """Of a selector and a critic, the space of the goals of their hierarchy, as a skill, which they
     observe, too; None: it has none."""
@@ -68,8 +69,8 @@ class Role:
         space = self.spec.spaces.observation if self.part is None else self.part.observation_space
         if self.own_goals is not None:
             space = with_goal(space, self.own_goals)
-        if self.kind == "critic" and self.goal_spaces:
-            return with_goal(space, goals_space(self.goal_spaces))
+        if self.observed_goals:
+            return with_goal(space, goals_space(self.observed_goals))
         if self.skill is None or self.skill.goal_space is None:
             return space
         return with_goal(space, self.skill.goal_space)
@@ -78,8 +79,7 @@ class Role:
     def action_space(self) -> gym.Space[Any]:
         """The space of its actions, or of its choices."""
         if self.choices is not None:
-            chosen = self.goal_spaces if self.kind == "selector" else {}
-            return choice_space(self.choices, chosen, self.skills)
+            return choice_space(self.choices, self.chosen_goals, self.skills)
         return self.spec.spaces.action if self.part is None else self.part.action_space
 
     @cached_property

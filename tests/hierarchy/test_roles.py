@@ -101,6 +101,18 @@ def test_each_role_has_spaces_of_its_own_and_one_environment_is_made_to_read_the
     assert spaces["middle/deep/skill_critic"] == gym.spaces.Discrete(2)
 
 
+def test_a_selector_chooses_the_goals_that_its_critic_observes():
+    reach = gym.spaces.Box(-1, 1, (2,), np.float32)
+    goes = type("Go", (Skill,), {"goal_space": reach, "reward": lambda self, step: step.goal[:, 0]})
+    roles = roles_of(Hierarchy("CartPole-v1", [goes(), Near()]))
+    selector, critic = roles["selector"], roles["skill_critic"]
+    assert (selector.chosen_goals, selector.observed_goals) == ({"go": reach}, {})
+    assert (critic.chosen_goals, critic.observed_goals) == ({}, {"go": reach})
+    assert selector.action_space.goal_spaces == {"go": reach}
+    assert critic.observation_space["goal"] == gym.spaces.Dict(go=reach)
+    assert selector.observation_space == roles.spec.spaces.observation
+
+
 def test_a_table_keeps_the_settings_that_were_declared_when_it_was_made():
     declared = three()
     roles = roles_of(declared)
