@@ -95,7 +95,8 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
         raise DeclarationError(
             f"start_from: {origin.name} acts in an environment, and {name!r} does not learn that"
         )
-    origin.check(role.observation_space, role.action_space, f"start_from: {name!r}")
+    goals = None if role.skill is None else role.skill.goal_space
+    origin.check(role.observation_space, role.action_space, goals, f"start_from: {name!r}")
     first = next(stage for stage in content["stages"] if name in stage["learns"])
     config = _config_in(first, name)
     fits = origin.learning_on(config, repr(name))

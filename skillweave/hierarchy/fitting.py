@@ -61,7 +61,8 @@ def _check_learner(role: Role, where: str) -> None:
             _check_sees_goal(role, where)
     if role.skill is not None and isinstance(role.skill.policy, Learnable):
         who = f"skill {role.path!r}"
-        role.skill.policy.check(role.observation_space, role.action_space, who)
+        goals = role.skill.goal_space
+        role.skill.policy.check(role.observation_space, role.action_space, goals, who)
 
 
 def _check_sees_goal(role: Role, where: str) -> None:

@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
+from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.types import Array
 
 if TYPE_CHECKING:
@@ -120,8 +121,21 @@ class Learnable:
             changes["critic"] = shapes[-1]
         return replace(config, **changes, **self.settings)
 
-    def check(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> None:
-        """Raise a PolicyError where these are not the spaces that the policy was made for."""
+    def check(
+        self,
+        observation_space: Space[Any],
+        action_space: Space[Any],
+        goal_space: Space[Any] | None,
+        who: str,
+    ) -> None:
+        """Raise a PolicyError where these are not the spaces that the policy was made for.
+
+        Args:
+            observation_space: with the goal, where the skill has goals.
+            action_space: of actions.
+            goal_space: of the skill; None: it has no goals.
+            who: begins messages.
+        """
         from skillweave.spaces import same_space
 
         for what, mine, theirs in (
@@ -132,6 +146,10 @@ class Learnable:
                 raise PolicyError(
                     f"{who}: {self.name} has {what} {mine}, but the environment has {theirs}"
                 )
+        if self.observation_space is None or goal_space is None:
+            return
+        if says := other_goals(goal_part(self.observation_space), goal_space):
+            raise PolicyError(f"{who}: {self.name} {says}")
 
     @property
     def sizes(self) -> str:

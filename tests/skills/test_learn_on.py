@@ -254,6 +254,34 @@ class TestRefused:
         with pytest.raises(sw.PolicyError, match=r"'walk'.*observation_space"):
             hierarchy(walk).train(tmp_path / "run", quiet=True)
 
+    def test_other_goals(self, tmp_path):
+        reach, place = gym.spaces.Box(-1, 1, (1,), np.float32), World().observation_space
+        seen = gym.spaces.Dict([("observation", place), ("goal", reach)])
+        model = sb3.PPO("MultiInputPolicy", World(seen), device="cpu")
+        module = torch.nn.Sequential(torch.nn.Linear(4, 2))
+        for policy in (
+            sw.from_sb3(model, learn=True),
+            sw.from_torch(module, observation_space=seen, learn=True),
+        ):
+
+            def goes(high, policy=policy):
+                wide = gym.spaces.Box(-high, high, (1,), np.float32)
+
+                def reward(self, step):
+                    return step.goal[:, 0]
+
+                return skill(policy, goal_space=wide, reward=reward, steps=16)
+
+            says = r"was trained for goals of Box\(-1.*but now its goal_space is Box\(-3"
+            with pytest.raises(sw.PolicyError, match=f"skill 'walk': .*{says}"):
+                hierarchy(goes(3.0)).train(tmp_path / "run", quiet=True)
+            with pytest.raises(sw.PolicyError, match=f"start_from: 'walk': .*{says}"):
+                hierarchy(goes(3.0, None)).train(
+                    tmp_path / "run", quiet=True, start_from={"walk": policy}
+                )
+        run = hierarchy(goes(1.0), learn="apart", steps=32).train(tmp_path / "run", quiet=True)
+        assert "walk" in run.info()["stages"][0]["starts"]
+
     def test_a_module_of_another_size(self, tmp_path):
         walk = skill(sw.from_torch(torch.nn.Linear(5, 2), learn=True))
         with pytest.raises(sw.PolicyError, match="does not fit 'walk'"):
