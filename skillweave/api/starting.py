@@ -16,11 +16,13 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.paths import AGENT, decides
+from skillweave.reading import shown
 from skillweave.runs.initial_policies import (
     Chooses,
     Learnt,
     learners_of_run,
     options_of,
+    part_of,
     record_initial_policies,
     same_shapes,
 )
@@ -79,6 +81,7 @@ def starts(
             chooses = options_of(content, name)
             goal_space = None if role.skill is None else role.skill.goal_space
             _check_start(name, algorithm, chooses, learnt[name], places[name], goal_space)
+            _check_part(name, part_of(content, name), learnt[name].part, places[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 
@@ -260,6 +263,25 @@ def _check_start(
         what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
     if what:
         raise RunError(f"start_from: {name!r} cannot start with what it learnt in {where}: {what}")
+
+
+def _check_part(
+    name: str,
+    now: Mapping[str, Any] | None,
+    then: Mapping[str, Any] | None,
+    where: Path | str,
+) -> None:
+    """Raise a RunError where a skill had another part of observations or actions."""
+    if now is None or then is None:
+        return
+    for field in now:
+        if now[field] != then[field]:
+            raise RunError(
+                f"start_from: {name!r} cannot start with what it learnt in {where}: there its "
+                f"{field} was {shown(then[field])}, and here it is {shown(now[field])}. Declare it "
+                "as it was, or name the other learners alone, start_from={name: run}, and "
+                f"{name!r} begins new"
+            )
 
 
 def _choices(chooses: Chooses) -> str:

@@ -40,6 +40,8 @@ class Learnt:
     """The other run's ``id``."""
     chooses: Chooses
     """The options that it chooses among, if it is a selector or a critic of skills."""
+    part: Mapping[str, Any] | None = None
+    """Of a skill of a run: its ``part_of``; else None."""
 
 
 Chooses = tuple[tuple[str, ...], tuple[int, ...]]
@@ -67,9 +69,17 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry["name"]).items():
             sha256 = sums[name]
             steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
-            chooses = options_of(run.manifest, name)
-            learnt[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses)
+            chooses, part = options_of(run.manifest, name), part_of(run.manifest, name)
+            learnt[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses, part)
     return learnt
+
+
+def part_of(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+    """Return what a skill sees, what it acts on and its correction; None: of no skill."""
+    for skill in manifest.get("skills", ()):
+        if skill["name"] == name:
+            return {key: skill.get(key) for key in ("sees", "acts", "residual")}
+    return None
 
 
 def options_of(manifest: Mapping[str, Any], name: str) -> Chooses:

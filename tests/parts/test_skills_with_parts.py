@@ -164,6 +164,39 @@ def test_other_parts_are_not_loaded(skills, rest, says, tmp_path):
         other.load_weights(file)
 
 
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory):
+    path = tmp_path_factory.mktemp("run")
+    return crane([Arm(), Hook()], learn="apart", steps=200).train(path, quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"acts": (0, 2)}, r"acts was '0:2', and here it is \[0, 2\]"),
+        ({"sees": (1, 2)}, r"sees was .*'arm'.*, and here it is .*\[1, 2\]"),
+        ({"sees": sw.Part("arm", scale=2.0)}, r"sees was .*, and here it is .*'scale': 2"),
+        ({"policy": sw.Residual(lambda obs: np.zeros((len(obs), 2)))}, "residual was None.* 0.2"),
+    ],
+)
+def test_a_skill_does_not_start_with_what_it_learnt_on_another_part(changes, says, learnt):
+    moved = crane([type("Arm", (Arm,), changes)(), Hook()], learn="apart", steps=200)
+    where = r"start_from: 'arm' cannot start with what it learnt in .*"
+    with pytest.raises(sw.RunError, match=rf"{where}its {says}.*'arm' begins new"):
+        moved.train(start_from=learnt, quiet=True)
+    started = moved.train(start_from={"hook": learnt}, quiet=True)
+    assert [set(stage.get("starts", {})) for stage in started.info()["stages"]][:2] == [
+        set(),
+        {"hook"},
+    ]
+
+
+def test_a_skill_starts_with_what_it_learnt_on_its_part(learnt):
+    again = crane([Arm(), Hook()], learn="apart", steps=200, rest=0.5)
+    run = again.train(start_from=learnt, quiet=True)
+    assert "arm" in run.info()["stages"][0]["starts"]
+
+
 def test_several_skills_own_the_same_part():
     other = type("Other", (Arm,), {})()
     run = crane([Arm(), other, Hook()]).train(quiet=True)
