@@ -329,6 +329,7 @@ def checked_settings(kind: C) -> C:
 
     Names are checked as by ``checked_names``. NumPy's numbers become Python's, and a field that
     holds other settings also takes a dict of them. The fields of subclasses are checked, too.
+    A method ``_convert`` may bring other forms of a field into that of its annotation first.
     Conditions on several fields belong into ``__post_init__``, which finds every field checked.
 
     Raises:
@@ -341,6 +342,8 @@ def checked_settings(kind: C) -> C:
     def checked(self: Any) -> None:
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))
         if first is kind:  # else the subclass that called this has checked already
+            if hasattr(self, "_convert"):
+                self._convert()
             check_fields(self)
         if own is not None:
             own(self)

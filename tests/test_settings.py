@@ -96,6 +96,26 @@ LIMITS = Kind(
     (5, "x", None, (1,), (1, 2, 3), (0, 2), (True, 2), (1, 2.5), (3, 2)),
     ((1, 2), [1, 2], (np.int64(1), np.int64(2))),
 )
+SEES = Kind(
+    (
+        1.5,
+        -1,
+        True,
+        "",
+        (),
+        (1, 1),
+        (0, -1),
+        (0, True),
+        (0, None),
+        slice(0, None),
+        slice(-2, 3),
+        slice(0, 0),
+        range(0),
+        np.array([0.5]),
+        {"x": 1},
+    ),
+    ((0, 1, 4), [0, 1, 4], ("x", 1, "y.z")),
+)
 ALGORITHM = settings(sw.PPO(), sw.DQN())
 
 ON_POLICY = {
@@ -167,7 +187,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "layer_norm": FLAG, "cnn": or_none(settings(sw.CNN(), {"kind": "impala"})),
         "rnn": or_none(settings(sw.RNN(), {"size": 4})),
         "encoder": or_none(Kind((5, True, None, [], NAN), ("cells",))),
-        "sees": or_none(listed(COUNT, (), (1, 1), some=(0, 1, 4))),
+        "sees": or_none(SEES),
         "planes": or_none(word("first", "last")),
     },
     sw.Apart: {

@@ -16,6 +16,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.skill_set import skills_below
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
+from skillweave.networks.net import seen_places
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
@@ -67,14 +68,16 @@ def _check_learner(role: Role, where: str) -> None:
 
 def _check_sees_goal(role: Role, where: str) -> None:
     """Raise a DeclarationError where the networks of a skill with goals do not see the goal."""
-    whole = obs_codec(role.observation_space).size
-    first = whole - obs_codec(goal_part(role.observation_space)).size
+    codec = obs_codec(role.observation_space)
+    first = codec.size - obs_codec(goal_part(role.observation_space)).size
     for name in ("network", "critic"):
-        sees = getattr(getattr(role.config, name, None), "sees", None)
-        if sees is not None and first < whole and max(sees) < first:
+        network = getattr(role.config, name, None)
+        if network is None or first == codec.size:
+            continue
+        if max(seen_places(network, codec)) < first:
             raise DeclarationError(
-                f"{where}{name}.sees leaves out the goal, whose places are {first} to {whole - 1}, "
-                "after those of the observation: add them"
+                f"{where}{name}.sees leaves out the goal, whose places are {first} to "
+                f"{codec.size - 1}, after those of the observation: add them, or the key 'goal'"
             )
 
 

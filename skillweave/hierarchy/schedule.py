@@ -18,7 +18,7 @@ from skillweave.hierarchy.fitting import active_guide
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
 from skillweave.paths import SELECTOR, decides, join
-from skillweave.skills.goal_spaces import goal_part
+from skillweave.skills.goal_spaces import OBSERVATION, goal_part
 from skillweave.spaces import obs_codec
 from skillweave.training.learning_task import (
     JointTask,
@@ -239,7 +239,8 @@ def _critic(selector: Any, role: Role, deciding: bool) -> SkillCritic:
     if sees_goals and (network := shared.get("network")) is not None and network.sees is not None:
         whole = obs_codec(role.observation_space).size
         goals = range(whole - obs_codec(goal_part(role.observation_space)).size, whole)
-        shared["network"] = replace(network, sees=(*network.sees, *goals))
+        seen = (f"{OBSERVATION}.{x}" if isinstance(x, str) else x for x in network.sees)
+        shared["network"] = replace(network, sees=(*seen, *goals))
     how: Any = {"normalize_obs": selector.normalize_obs, "deciding": deciding}
     return SkillCritic(**shared, **how, sees_goals=sees_goals)
 

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
+
 from skillweave.errors import DeclarationError
 from skillweave.named import named
 from skillweave.settings import Check, Count, check, checked_settings
@@ -16,14 +18,16 @@ WIDEST = 65_536
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 Width = Annotated[int, Check(f"at least 1 and at most {WIDEST:,}", lambda x: 1 <= x <= WIDEST)]
 """Units of a layer, channels, or pixels of a kernel."""
-Places = Annotated[
-    tuple[Count, ...],
+Key = Annotated[str, Check("the key of a part of the observation", lambda x: x != "")]
+Seen = Annotated[
+    tuple[Count | Key, ...],
     Check(
-        "a tuple of places in an observation, from 0, each once: sees=(0, 1, 4)",
+        "places in an observation, from 0, and keys of its parts, each once: sees=(0, 1, 4), "
+        "slice(0, 8) or ('joints', 'arm.speed')",
         lambda x: 0 < len(x) == len(set(x)),
     ),
 ]
-"""Places of numbers in an observation."""
+"""Places of numbers in an observation, and keys of its parts."""
 EncoderValue = Annotated[
     str | Callable[[Any], Any],
     Check(
@@ -144,10 +148,12 @@ class Network:
     images as (C, H, W) from 0 to 1, choices one-hot, a Dict or Tuple as a dict or tuple. Its
     parameters are learnt and saved with the policy; a run records its name, and needs its code to
     be loaded. Or the name of a registered encoder; see ``register_encoder``."""
-    sees: Places | None = None
-    """The places of the numbers that the network sees in the observation; None: all. Places count
-    in the flat vector: parts of a Dict or Tuple one after another, a Discrete one-hot, without
-    images, which are always seen. For a skill that must not depend on the task around it."""
+    sees: Seen | None = None
+    """The numbers that the network sees in the observation: places, a slice, or keys of a Dict or
+    Tuple, ``("joints", "arm.speed")``; None: all. Places count in the flat vector: parts of a Dict
+    or Tuple one after another, a Discrete one-hot, without images, which are always seen. A skill
+    with goals observes a Dict of ``observation`` and ``goal``: ``("observation.joints", "goal")``.
+    For a skill that must not depend on the task around it."""
     planes: Literal["first", "last"] | None = None
     """The axis of an image that holds its channels, or a board's planes; None: derived from the
     shape, as of (8, 8, 111) and (3, 210, 160). Applies to images of ambiguous shape, such as
@@ -158,6 +164,18 @@ class Network:
             object.__setattr__(self, "encoder", _encoder(self.encoder))
         if self.sees is not None and self.encoder is not None:
             raise DeclarationError("Network: give sees or encoder, not both")
+
+    def _convert(self) -> None:
+        """Write ``sees`` as a tuple, before it is checked."""
+        sees: Any = self.sees
+        if isinstance(sees, slice):
+            bounds = (sees.start or 0, sees.stop, sees.step or 1)
+            sees = range(*bounds) if all(isinstance(x, int) for x in bounds) else sees
+        if isinstance(sees, range | np.ndarray):
+            sees = tuple(np.ravel(sees))
+        elif isinstance(sees, str | int | np.integer) and not isinstance(sees, bool):
+            sees = (sees,)
+        object.__setattr__(self, "sees", sees)
 
 
 def check_critic(config: Any) -> None:

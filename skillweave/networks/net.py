@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from skillweave.arguments import meant
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
@@ -49,9 +50,9 @@ class Net:
             for i in range(len(obs.images)):
                 image = ImageEncoder(obs, i, network.cnn, network.activation)
                 self.encoders[f"{name}.cnn{i}"] = image
-        self._sees = None if network.sees is None else Constant(_places(network.sees, obs.size))
-        seen = obs.size if network.sees is None else len(network.sees)
-        self.features = seen if self._vector else 0
+        places = seen_places(network, obs)
+        self._sees = None if network.sees is None else Constant(torch.tensor(places, **INT))
+        self.features = len(places) if self._vector else 0
         """The first column of the encoders' features in the input of the first layer."""
         width = self.features + extra
         width += sum(e.size for e in self.encoders.values())
@@ -153,15 +154,45 @@ class Net:
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
 
-def _places(sees: tuple[int, ...], size: int) -> Tensor:
-    """Return the places that a network sees in an observation of ``size`` numbers.
+def seen_places(network: Network, obs: ObsCodec) -> tuple[int, ...]:
+    """Return the places that a network sees in the flat vector of observations, in its order.
 
     Raises:
-        DeclarationError: the observation has fewer numbers.
+        DeclarationError: the observation has no such number or part, or one is named twice.
     """
-    if max(sees) >= size:
-        numbers = "has no number beside its images" if not size else f"has {size} (0 to {size - 1})"
+    if network.sees is None:
+        return tuple(range(obs.size))
+    places = [i for x in network.sees for i in ([x] if isinstance(x, int) else _part(x, obs))]
+    if max(places) >= obs.size:
+        numbers = f"has {obs.size} (0 to {obs.size - 1})"
         raise DeclarationError(
-            f"Network.sees names the number {max(sees)} of an observation, but it {numbers}"
+            f"Network.sees names the number {max(places)} of an observation, but it "
+            + (numbers if obs.size else "has no number beside its images")
         )
-    return torch.tensor(sees, **INT)
+    if len(set(places)) < len(places):
+        raise DeclarationError(f"Network.sees is {network.sees}, which names a number twice")
+    return tuple(places)
+
+
+def _part(key: str, obs: ObsCodec) -> list[int]:
+    """Return the places of the numbers of a part."""
+    places: list[int] = []
+    images = start = 0
+    for leaf in obs.leaves:
+        inside = leaf.name == key or leaf.name.startswith(f"{key}.")
+        if leaf.image is not None:
+            images += inside
+            continue
+        places += range(start, start + leaf.size) if inside else ()
+        start += leaf.size
+    if images and not places:
+        raise DeclarationError(
+            f"Network.sees names {key!r}, an image, and images are always seen: leave it out"
+        )
+    if not places:
+        known = [leaf.name for leaf in obs.leaves if leaf.name]
+        hint = meant(key, known, "its parts are") if known else "; it has no parts"
+        raise DeclarationError(
+            f"Network.sees names {key!r}, a part of the observation that does not exist{hint}"
+        )
+    return places

@@ -73,6 +73,10 @@ CASES: dict[str, tuple[AlgorithmConfig, gym.Space[Any], gym.Space[Any]]] = {
     "ppo, sees a part": (
         PPO(network=Network((8,), sees=(1,))), SHOWS["vector"], ASKS["Discrete"][0]
     ),
+    "ppo, sees keys": (
+        PPO(network=Network((8,), sees=("inner.1", 0))), NESTED,
+        ASKS["Discrete"][0],
+    ),
     "ppo, nested": (PPO(network=SMALL), NESTED, ASKS["Discrete"][0]),
     "ppo, cells": (
         PPO(network=Network((8,), encoder="cells")), SHOWS["image, channels last"],

@@ -123,3 +123,20 @@ def test_a_network_that_sees_a_part_has_a_critic_that_sees_goals_too(tmp_path):
     how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
     run = declared([Rest(), go_to()], steps=300, **how).train(tmp_path / "run", quiet=True)
     assert run.policy.skills.interruption.critic.algorithm.config.network.sees == (1, 2, 3)
+
+
+def test_keys_lead_to_the_same_parts_beside_goals(tmp_path):
+    selector = sw.PPO(num_envs=4, n_steps=64, network=sw.Network(hidden=(8,), sees="place"))
+    skill = sw.PPO(
+        num_envs=4, n_steps=64, network=sw.Network((8,), sees=("observation.place", "goal"))
+    )
+    how = TOGETHER | {"selector": selector, "together": sw.Together(interrupt=True)}
+
+    def made():
+        env = sw.EnvSpec(lambda: Point(as_dict=True), workers=1)
+        return declared([Rest(), go_to(algorithm=skill)], env=env, steps=300, **how)
+
+    run = made().train(tmp_path / "run", quiet=True)
+    critic = run.policy.skills.interruption.critic.algorithm.config.network
+    assert critic.sees == ("observation.place", 2, 3)
+    assert made().load(run.path).evaluate(3).returns == run.evaluate(3).returns

@@ -293,9 +293,11 @@ def test_a_selector_of_other_goals_is_refused(tmp_path):
 
 
 def test_a_network_that_leaves_out_the_goal_is_refused():
-    blind = sw.PPO(network=sw.Network((8,), sees=(0, 1)))
-    with pytest.raises(DeclarationError, match=r"network.sees leaves out the goal, whose places"):
-        declared(algorithm=blind).check_spaces()
+    for sees in ((0, 1), "observation"):
+        blind = sw.PPO(network=sw.Network((8,), sees=sees))
+        with pytest.raises(DeclarationError, match=r"network.sees leaves out the goal.*'goal'"):
+            declared(algorithm=blind).check_spaces()
+    declared(algorithm=sw.PPO(network=sw.Network((8,), sees=(0, "goal")))).check_spaces()
 
 
 def test_goals_are_the_same_for_the_same_seed(tmp_path):

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from torch.nn import functional as F
 
 from skillweave.algorithms.config import (
@@ -22,7 +22,7 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import CNN, RNN, Network
-from skillweave.networks.net import Net
+from skillweave.networks.net import Net, seen_places
 from skillweave.networks.qnet import QNet
 from skillweave.networks.stacked import Layout
 from skillweave.seeding import Seeds
@@ -186,6 +186,68 @@ def test_what_is_not_seen_changes_no_action(kind):
     np.testing.assert_array_equal(before, after)
     other[:, 3] = -obs[:, 3]
     assert (policy.act(policy.start(64), other)[0] != before).any()
+
+
+ROBOT = Dict(
+    {
+        "arm": Dict({"grip": Discrete(3), "joints": Box(-1, 1, (2, 2))}),
+        "camera": Box(0, 255, (12, 12, 3), np.uint8),
+        "speed": Box(-1, 1, (2,)),
+    }
+)
+"""Grip 0 to 2, joints 3 to 6, speed 7 and 8 of the flat vector."""
+
+
+@pytest.mark.parametrize(
+    ("sees", "places"),
+    [
+        ("speed", (7, 8)),
+        (("speed", "arm.grip"), (7, 8, 0, 1, 2)),
+        (("arm", 8), (0, 1, 2, 3, 4, 5, 6, 8)),
+        (slice(1, 4), (1, 2, 3)),
+        (range(8, 2, -3), (8, 5)),
+        (np.array([4, 1]), (4, 1)),
+        ([2, "speed"], (2, 7, 8)),
+        (5, (5,)),
+    ],
+)
+def test_a_network_sees_places_slices_and_keys(sees, places):
+    network = Network((8,), sees=sees)
+    assert seen_places(network, obs_codec(ROBOT)) == places
+    assert network == Network((8,), sees=network.sees)
+    config = PPO(network=network)
+    assert config_from_json(json.loads(json.dumps(config_to_json(config)))) == config
+    net = Net("pi", obs_codec(ROBOT), network, A)
+    by_place = Net("pi", obs_codec(ROBOT), Network((8,), sees=places), A)
+    layout, flat = made(net, 1.0)
+    x = {"vector": torch.randn(P, 7, 9), "image.0": torch.zeros(P, 7, 3, 12, 12, dtype=torch.uint8)}
+    assert torch.equal(net(layout.views(flat), x), by_place(layout.views(flat), x))
+
+
+def test_parts_of_a_tuple_have_their_places_as_keys():
+    space = Tuple((Box(-1, 1, (2,)), Discrete(3)))
+    assert seen_places(Network(sees=("1", 0)), obs_codec(space)) == (2, 3, 4, 0)
+
+
+@pytest.mark.parametrize(
+    ("sees", "says"),
+    [
+        ("leg", r"names 'leg', a part of the observation that does not exist.*arm\.joints.*speed"),
+        ("arm.joint", r"names 'arm.joint', a part .*does not exist.*'?arm\.joints"),
+        ("ar", "names 'ar', a part of the observation that does not exist"),
+        ("camera", "names 'camera', an image, and images are always seen: leave it out"),
+        (("arm", 3), "names a number twice"),
+        ((9,), r"names the number 9 of an observation, but it has 9 \(0 to 8\)"),
+    ],
+)
+def test_parts_that_are_not_there_are_named(sees, says):
+    with pytest.raises(DeclarationError, match=says):
+        make_algorithm(PPO(network=Network(sees=sees)), ROBOT, Discrete(2))
+
+
+def test_an_observation_without_parts_has_no_keys():
+    with pytest.raises(DeclarationError, match=r"names 'speed'.*does not exist; it has no parts"):
+        make_algorithm(PPO(network=Network(sees="speed")), Box(-1, 1, (3,)), Discrete(2))
 
 
 def test_images_are_seen_beside_the_numbers():
