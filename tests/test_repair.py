@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from small_runs import assert_same
 
 import skillweave as sw
 from skillweave.algorithms import ppo
-from skillweave.api import Run
+from skillweave.api import Run, repairing
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
@@ -123,7 +124,7 @@ def declare(*skills: sw.Skill, algorithm: Any = ON, steps: int = STEPS, **how: A
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(repair, "CHUNK", 1_500)
-    monkeypatch.setattr(repair, "NEVER", 3_000)
+    monkeypatch.setattr(repair, "ENOUGH_STEPS", 3_000)
 
 
 @pytest.fixture(scope="module")
@@ -263,6 +264,35 @@ def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:
     assert all(np.array_equal(old[k], now[k]) for k in old)
     again = sw.load(new.path, declare(Wrong(), Flip()))
     assert all(np.array_equal(v, old[k]) for k, v in weights(again).items())
+
+
+def test_measuring_stops_and_says_what_was_not_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(repair, "MOST_STEPS", 4_000)
+    first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
+    (result,) = repaired(first, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
+    stopped = (
+        r"Measuring stopped after 4,\d+ steps: press was called \d+ times of 100,000 after flip, "
+        r"which was done in [\d,]+ of [\d,]+ calls\.$"
+    )
+    assert re.search(stopped, result.blame)
+    assert re.search(r"so the earlier weights are kept\. " + stopped, result.sentence)
+
+
+def test_a_pair_that_is_seldom_called_is_given_up(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(repair, "LARGEST_CHUNK", 1_500)
+    monkeypatch.setattr(repair, "FEWEST", 50_000)
+    monkeypatch.setattr(repairing, "FEWEST", 50_000)
+    says = (
+        r"'press' was called only \d+ times after a call of 'flip' that was done, too few.*: let "
+        r"'flip' be done more often first\. Measuring stopped after [3-4],\d+ steps"
+    )
+    with pytest.raises(DeclarationError, match=says):
+        repaired(run, tmp_path / "new", calls=100_000)
+    assert not (tmp_path / "new").exists()
 
 
 def matrix(*rows: tuple[float, float]) -> HandOver:
@@ -451,7 +481,7 @@ def test_runs_that_cannot_be_repaired(run: Run, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="holds no repair of 'press' after 'flip'"):
         repaired(run, run.path, resume=True)
     never = declare(Press(), Never()).train(tmp_path / "never", quiet=True)
-    with pytest.raises(DeclarationError, match="'press' was never called after 'never'"):
+    with pytest.raises(DeclarationError, match=r"never called after 'never'.*Measuring stopped"):
         repaired(never, tmp_path / "a", after="never")
 
 

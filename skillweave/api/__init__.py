@@ -938,7 +938,8 @@ class Run:
             run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
             done: by skill, the event that a call is for, in place of the skill's ``success``; as
                 for ``planning.hand_over``.
-            calls: calls of the pair to measure at least, before and after.
+            calls: calls of the pair to measure at least, before and after; fewer where 500,000
+                steps do not hold them.
             seed: the root of every random stream.
             quiet: no progress.
             callback: as in ``Hierarchy.train``.
@@ -949,7 +950,7 @@ class Run:
 
         Raises:
             DeclarationError: no such skill, one that does not learn, one that may not start after
-                the other or needs no repair; or too few steps.
+                the other, seldom does, or needs no repair; or too few steps.
             RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
                 something else.
         """

@@ -21,6 +21,7 @@ from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.repair import (
+    FEWEST,
     Measured,
     matrix_to_json,
     measure,
@@ -106,6 +107,7 @@ def repair(
         found = _measured(roles, policy, skill, after, done, calls, config.num_envs, progress)
     entry["repair"]["before"] = matrix_to_json(found.matrix)
     reason = str(found.log.blame(name_of(skill), name_of(after), done))
+    reason += f" {found.shortage}" if found.shortage else ""
     entry["repair"]["blame"] = reason
     entry["repair"]["bonus"] = found.gain
     content |= {"stages": [entry], "seed": seed}
@@ -230,7 +232,13 @@ def _measured(
             why = f"the initiation() of {skill!r} was False wherever {after!r} ended"
         raise DeclarationError(
             f"{skill!r} was never called after {after!r}: {why}, so there is nothing to repair it "
-            "from"
+            f"from. {found.shortage}"
+        )
+    if count < min(calls, FEWEST):
+        raise DeclarationError(
+            f"{skill!r} was called only {count} times after a call of {after!r} that was done, too "
+            f"few to see whether a repair is better: let {after!r} be done more often first. "
+            f"{found.shortage}"
         )
     if rate >= GOOD:
         raise DeclarationError(

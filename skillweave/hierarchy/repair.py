@@ -30,14 +30,16 @@ from skillweave.types import Array, Memory, Step
 
 START_CALLS = 1
 """The most calls at random before the other episodes of a repair, if the hierarchy has any."""
-MOST_STEPS = 2_000_000
+MOST_STEPS = 500_000
 """The most steps of one measurement."""
 CHUNK = 10_000
 """The fewest steps that are recorded at once."""
 LARGEST_CHUNK = 200_000
 """The most steps that are recorded at once, as they are kept in memory."""
-NEVER = 200_000
-"""Steps after which a pair of skills without a call is given up."""
+FEWEST = 10
+"""Calls of a pair below which two measurements of it cannot differ clearly."""
+ENOUGH_STEPS = 200_000
+"""Steps after which a pair is given up that would not have ``FEWEST`` calls in ``MOST_STEPS``."""
 REHEARSED_SHARE = 0.75
 """Share of the calls that begin after the other skill, where the skill rehearses the rest."""
 LONG_CALL = 1_000
@@ -211,6 +213,8 @@ class Measured:
     gain: float
     """The skill's own reward per step in calls that were done, less that in those that failed; 0
     where it is not more, or one of these kinds is missing."""
+    shortage: str
+    """A sentence on calls that are missing; empty: there were as many as were to be measured."""
 
 
 def measure(
@@ -227,7 +231,8 @@ def measure(
 
     Args:
         skills: of one level; ``skill`` and ``after`` are names there.
-        calls: calls of the pair; fewer where ``MOST_STEPS`` do not suffice.
+        calls: calls of the pair; fewer where ``MOST_STEPS`` do not suffice, or where after
+            ``ENOUGH_STEPS`` not even ``FEWEST`` are to be expected.
         done: as for ``hand_over``.
         tell: receives a sentence about what is done now.
     """
@@ -235,6 +240,7 @@ def measure(
     number, first = names.index(skill), names.index(after)
     matrix, parts, steps, may_start = None, list[CallLog](), 0, False
     rates: dict[bool, list[float]] = {True: [], False: []}
+    tried = succeeded = 0  # calls of the other skill
     size = CHUNK
     tell(f"measuring: calls of {skill} after {after}, at least {calls}")
     while True:
@@ -248,6 +254,8 @@ def measure(
         may_start |= bool(may.any())
         of_skill = log.skill == number
         won = calls_done(log, done)
+        whole = (log.skill == first) & ~log.was_cut
+        tried, succeeded = tried + int(whole.sum()), succeeded + int((whole & won).sum())
         for was_done, each in rates.items():
             some = of_skill & (won == was_done) & ~log.was_cut
             each.extend((returns[some] / log.tau[some]).tolist())
@@ -256,9 +264,18 @@ def measure(
         first_calls = first_calls[of_skill[following[first_calls]]]
         parts.append(log.take(np.union1d(np.flatnonzero(of_skill), first_calls)))
         seen = int(matrix.of(skill, after)[1])
-        if seen >= calls or steps >= MOST_STEPS or (not seen and steps >= NEVER):
+        few = seen * MOST_STEPS < min(calls, FEWEST) * steps
+        if seen >= calls or steps >= MOST_STEPS or (few and steps >= ENOUGH_STEPS):
+            shortage = ""
+            if seen < calls:
+                shortage = (
+                    f"Measuring stopped after {steps:,} steps: {skill} was called {seen:,} times "
+                    f"of {calls:,} after {after}, which was done in {succeeded:,} of {tried:,} "
+                    "calls."
+                )
+                tell(shortage)
             gain = np.mean(rates[True]) - np.mean(rates[False]) if all(rates.values()) else 0.0
-            return Measured(matrix, join(parts), may_start, max(0.0, float(gain)))
+            return Measured(matrix, join(parts), may_start, max(0.0, float(gain)), shortage)
         needed = steps * (calls / max(seen, 1) - 1) * 1.1
         size = int(np.clip(needed, CHUNK, min(MOST_STEPS - steps, LARGEST_CHUNK)))
 
@@ -331,11 +348,10 @@ def judge_repair(
                 listener.message(f"{entry['name']}: {sentence}")
 
         num_envs = int(entry["algorithm"]["num_envs"])
-        found = measure(
-            roles.spec, level.skills, *names, done, repair["calls"], num_envs, tell
-        ).matrix
-        is_kept, sentence = verdict(matrix_from_json(repair["before"]), found, *names)
-        repair["later"] = matrix_to_json(found)
+        found = measure(roles.spec, level.skills, *names, done, repair["calls"], num_envs, tell)
+        is_kept, sentence = verdict(matrix_from_json(repair["before"]), found.matrix, *names)
+        repair["later"] = matrix_to_json(found.matrix)
+        sentence += f". {found.shortage}" if found.shortage else ""
         entry["kept"] = {"kept": "repaired" if is_kept else "before", "sentence": sentence}
         run.save()
         tell(sentence)
