@@ -1060,7 +1060,7 @@ class PlannedRun(Run):
         assert isinstance(planner, Planner)
         config: Any = PPO() if algorithm is None else algorithm
         declared = Hierarchy(
-            **to_train(spec, self.policy, planner, config, target_kl),
+            **to_train(spec, self.policy, planner, self.hierarchy.rest, config, target_kl),
             steps=whole_number(steps, "with_selector(): steps", 1),
         )
         declared._starts = partial(start_of, planner, self.policy, declared.spec, config)

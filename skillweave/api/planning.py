@@ -67,6 +67,7 @@ def to_train(
     spec: EnvSpec,
     policy: HierarchyPolicy,
     planner: Planner,
+    rest: Any,
     algorithm: Any,
     target_kl: float | None,
 ) -> dict[str, Any]:
@@ -76,6 +77,7 @@ def to_train(
         spec: the environment without the task.
         policy: with the skills.
         planner: guides the selector.
+        rest: the hierarchy's, of the actions that skills write a part of.
         algorithm: settings of PPO, by which the selector learns.
         target_kl: the KL within which it stays of the plan; None: without limit.
     """
@@ -96,6 +98,7 @@ def to_train(
         "skills": list(skills.skills),
         "call_steps": skills.call_steps,
         "selector": algorithm,
+        "rest": rest,
         "reflexes": skills.reflexes,
         "selection": Selection(call_cost=skills.call_cost, greedy_skills=skills.greedy),
         "guide": guide,

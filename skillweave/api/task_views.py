@@ -23,6 +23,7 @@ from skillweave.skills import Reflex, Skill
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal
 from skillweave.skills.goals import Goals, goals_of
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -34,6 +35,8 @@ class OwnPolicy:
         view: returns these.
         space: of the observations that hold the task's state.
         goals: of the skill whose policy it is, which then also observes a goal; None: it has none.
+        part: of the environment's own observations and actions, where the skill has one. The policy
+            then returns the actions of this part, corrected where the skill corrects others.
     """
 
     not_exported = (
@@ -42,13 +45,26 @@ class OwnPolicy:
     )
 
     def __init__(
-        self, policy: Policy, view: OwnView, space: gym.Space[Any], goals: Goals | None = None
+        self,
+        policy: Policy,
+        view: OwnView,
+        space: gym.Space[Any],
+        goals: Goals | None = None,
+        part: OwnPart | None = None,
     ) -> None:
-        self.policy, self._view, self._goals = policy, view, goals
+        self.policy, self._view, self._goals, self._part = policy, view, goals, part
+        self._base = None if part is None else part.base
         self.observation_space = space if goals is None else with_goal(space, goals.space)
-        self.action_space = policy.action_space
+        self.action_space = policy.action_space if part is None else part.written_space
         self.labels = policy.labels
-        self.start, self.acting = policy.start, policy.acting
+        self.acting = policy.acting
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of n environments, with that of the policy that it corrects."""
+        memory = self.policy.start(n)
+        if self._base is None:
+            return memory
+        return _joined(memory, self._base.start(n))
 
     def act(
         self,
@@ -61,18 +77,49 @@ class OwnPolicy:
     ) -> tuple[Array, Memory]:
         """Return the policy's actions (n, …)."""
         how: Any = {"deterministic": deterministic, "rng": rng}
-        if self._goals is None:
-            return self.policy.act(memory, self._view.obs(obs), mask, **how)
-        own = self._goals.join(self._view.obs(obs[OBSERVATION]), obs[GOAL])
-        return self.policy.act(memory, own, mask, **how)
+        own = self._seen(obs if self._goals is None else obs[OBSERVATION])
+        if self._goals is not None:
+            own = self._goals.join(own, obs[GOAL])
+        if self._base is None:
+            return self.policy.act(memory, own, mask, **how)
+        assert self._part is not None
+        assert self._part.correction is not None
+        memory, of_base = _split(memory)
+        base, of_base = self._base.act(of_base, own, None, deterministic=True, rng=rng)
+        learnt, memory = self.policy.act(memory, own, mask, **how)
+        return self._part.correction.apply(base, learnt), _joined(memory, of_base)
 
     def observe(self, memory: Memory, step: Step) -> Memory:
-        """Let the policy notice a step."""
-        return self.policy.observe(memory, self._view.step(step))
+        """Let the policy notice a step, of which the action is the skill's own part."""
+        step = replace(step, obs=self._seen(step.obs), next_obs=self._seen(step.next_obs))
+        if self._base is None:
+            return self.policy.observe(memory, step)
+        memory, of_base = _split(memory)
+        of_base = self._base.observe(of_base, step)
+        return _joined(self.policy.observe(memory, step), of_base)
+
+    def _seen(self, obs: Array) -> Array:
+        """Return what the policy sees of observations that hold the task's state."""
+        own = self._view.obs(obs)
+        return own if self._part is None else self._part.see(own)
 
     def source(self) -> dict[str, Any]:
         """Return the policy's source."""
         return source_of(self.policy)
+
+
+BASE = "base."
+"""Begins the names in a memory of what a policy that is corrected remembers."""
+
+
+def _split(memory: Memory) -> tuple[Memory, Memory]:
+    """Return the memory of the correction, and of the policy that it corrects."""
+    base = {k.removeprefix(BASE): v for k, v in memory.items() if k.startswith(BASE)}
+    return {k: v for k, v in memory.items() if not k.startswith(BASE)}, base
+
+
+def _joined(memory: Memory, base: Memory) -> Memory:
+    return memory | {f"{BASE}{k}": v for k, v in base.items()}
 
 
 class OwnSelector(ReadySelector):
@@ -149,24 +196,27 @@ class OwnSelector(ReadySelector):
 def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:
     """Return skills, of all levels, that see the environment's own observations.
 
+    The ``policy`` of each is for a hierarchy with the same ``rest`` in which it is declared.
+
     Args:
         skills: with policies for the environment's own observations.
         view: returns these.
         space: of the observations that hold the task's state.
     """
-    policies = tuple(
-        _own_policy(policy, view, space, goals_of(skill)) if skills.part(i) is None else policy
-        for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True))
-    )
+    whole, policies = [], []
+    for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
+        part = skills.part(i)
+        whole.append(_own_policy(policy, view, space, goals_of(skill), part))
+        policies.append(whole[i] if part is None else policy)
     parts = tuple(part and part.within(view.obs, space) for part in skills.parts)
     cuts = skills.interruption
     return replace(
         skills,
         skills=tuple(
             _own_skill(skill, policy, view)
-            for skill, policy in zip(skills.skills, policies, strict=True)
+            for skill, policy in zip(skills.skills, whole, strict=True)
         ),
-        policies=policies,
+        policies=tuple(policies),
         parts=parts,
         reflexes=tuple(_own_reflex(reflex, view) for reflex in skills.reflexes),
         interruption=cuts and replace(cuts, worth=_of_own(cuts.worth, view)),
@@ -174,10 +224,14 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
 
 
 def _own_policy(
-    policy: Policy, view: OwnView, space: gym.Space[Any], goals: Goals | None
+    policy: Policy,
+    view: OwnView,
+    space: gym.Space[Any],
+    goals: Goals | None,
+    part: OwnPart | None,
 ) -> Policy:
     if not isinstance(policy, HierarchyPolicy):
-        return OwnPolicy(policy, view, space, goals)
+        return OwnPolicy(policy, view, space, goals, part)
     selector: Any = policy.selector
     spaces = space, selector.action_space
     if isinstance(selector, ReadySelector):
@@ -207,6 +261,8 @@ def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
         for method in ("reward", "termination", "success")
         if skill.defines(method)
     }
+    if skill.acts is not None:  # sees is left out: the policy sees all, and cuts it to its part
+        attributes["acts"] = skill.acts
     if skill.goal_space is not None:
         attributes["goal_space"] = skill.goal_space
         attributes["goals"] = lambda self, obs, rng: skill.goals(view.obs(obs), rng)

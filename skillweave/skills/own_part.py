@@ -487,6 +487,11 @@ class OwnPart:
         """The ready policy that it corrects; None: there is none."""
         return None if self.correction is None else self.correction.base
 
+    @property
+    def written_space(self) -> Space[Any]:
+        """The space of what it writes, after its correction."""
+        return self.whole_action_space if self.written is None else self.written.space
+
     def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:
         """Return the part of larger observations, of which ``view`` returns the environment's."""
         part = copy.copy(self)
