@@ -211,7 +211,7 @@ class MappedPolicy(Foreign):
 
             before = {k: some(v) for k, v in memory.items()}
             chosen, remembered = self._infer(before, some(obs), some(mask), goal=some(goal), **how)
-            remembered["held"] = held = np.stack(chosen, axis=1)
+            remembered["held"] = held = plan.held(chosen)
             for k, v in remembered.items():
                 if every:
                     after[k] = v
@@ -220,7 +220,7 @@ class MappedPolicy(Foreign):
                     after[k][due] = v
             held = after["held"]
         after["phase"] = (phase + 1) % period
-        return held[np.arange(len(obs)), phase // plan.mapping.every], after
+        return plan.of_held(held, phase // plan.mapping.every), after
 
     def _infer(
         self,

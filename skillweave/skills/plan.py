@@ -348,10 +348,30 @@ class Plan:
         if self.mapping.period > 1:
             from skillweave.spaces.packing import obs_dtype, obs_shape  # needs torch
 
-            action = self.spaces[1]
-            held = (n, self.mapping.chunk or 1, *obs_shape(action))
-            memory |= {"phase": np.zeros(n, np.int64), "held": np.zeros(held, obs_dtype(action))}
+            space = self.spaces[1]
+            action = np.zeros((n, *obs_shape(space)), obs_dtype(space))
+            held = self.held([action] * (self.mapping.chunk or 1))
+            memory |= {"phase": np.zeros(n, np.int64), "held": held}
         return memory
+
+    def held(self, actions: Sequence[Array]) -> Array:
+        """Return actions of K inferences, (n, …) each, as a memory stores them: (n, K, …).
+
+        Those of a Dict or Tuple are stored as bytes.
+        """
+        held = np.stack(actions, axis=1)
+        if held.dtype.fields is None:
+            return held
+        return held.view(np.uint8).reshape(*held.shape, held.dtype.itemsize)
+
+    def of_held(self, held: Array, at: Array) -> Array:
+        """Return of ``held`` actions (n, K, …) those at places ``at`` (n,)."""
+        action: Array = held[np.arange(len(held)), at]
+        if not isinstance(self.spaces[1], Dict | Tuple):
+            return action
+        from skillweave.spaces.packing import obs_dtype  # needs torch
+
+        return np.ascontiguousarray(action).view(obs_dtype(self.spaces[1])).reshape(len(held))
 
     def read(self, obs: Array, last: Array | None, goal: Array | None) -> dict[str, Array]:
         """Return the inputs of n observations, by name."""

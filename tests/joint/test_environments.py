@@ -149,6 +149,27 @@ def test_scripts_and_reflexes_return_dicts():
             assert env.actions[-1]["grip"] == 3
 
 
+@pytest.mark.parametrize("kind", ["dict", "tuple"])
+def test_a_script_holds_actions_of_several_parts(kind, tmp_path):
+    def act(obs: Any) -> Any:
+        return by_hand(obs) if kind == "dict" else tuple(by_hand(obs).values())
+
+    class Slow(sw.Skill):
+        policy = sw.from_function(act, every=3)
+
+    def declared() -> sw.Hierarchy:
+        return reach([Slow(), Whole()], env=on(kind), call_steps=6, train_defaults=OFTEN)
+
+    whole = declared().train(tmp_path / "whole", seed=3, quiet=True)
+    stopped_run(declared(), tmp_path / "cut", 3)
+    declared().resume(tmp_path / "cut", quiet=True)
+    assert_same(tmp_path / "cut", whole.path)
+    alone = reach([Slow()], env=on(kind), call_steps=6).train(quiet=True)
+    grips = [a["grip"] if kind == "dict" else a[1] for a in played(alone.policy, kind)]
+    assert grips[:6] == [g for g in grips[:6:3] for _ in range(3)]
+    assert set(grips) == {3, 4}
+
+
 def test_a_tuple_is_written_by_its_places():
     class Second(sw.Skill):
         acts = "1"
