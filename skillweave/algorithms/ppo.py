@@ -27,7 +27,6 @@ from skillweave.networks.heads import head_of
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
-from skillweave.ops.distributions import mask_logits, with_epsilon
 from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_loss, value_loss
 from skillweave.ops.moments import explained_variance, masked_mean, normalise
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
@@ -129,17 +128,7 @@ class PPOAlgorithm(Algorithm):
             dist_params, actor = self.actor_net.step(views, inputs, actor)
             _, critic = self.critic_net.step(views, inputs, critic)
             memory = torch.cat([actor, critic], dim=-1)
-        if choices := self.head.choices:
-            epsilon = params.extra.get("epsilon")
-            logits = dist_params if self.head.discrete else dist_params[..., :choices]
-            if epsilon is None:
-                logits = mask_logits(logits, mask)
-            else:
-                logits = with_epsilon(logits, mask, epsilon)
-            if self.head.discrete:
-                dist_params = logits
-            else:  # goals of skills follow
-                dist_params = torch.cat([logits, dist_params[..., choices:]], dim=-1)
+        dist_params = self.head.masked(dist_params, mask, params.extra.get("epsilon"))
         action = self.head.act(dist_params, views.get("actor.log_std"), noise)
         return action, dist_params, memory
 

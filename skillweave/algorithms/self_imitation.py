@@ -69,7 +69,6 @@ class SelfImitationAlgorithm(PPOAlgorithm):
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Create the state of fresh members, which have no kept row yet."""
         lead = (len(seeds), self.config.imitation_rows)
-        width = self.codec.size
         action = self.codec.zeros(1)
         space: gym.Space[Any] = self.observation_space
         obs = to_tensor(np.zeros((1, *obs_shape(space)), obs_dtype(space)))[0]
@@ -78,9 +77,14 @@ class SelfImitationAlgorithm(PPOAlgorithm):
             kept=torch.zeros(lead, **BOOL),
             kept_obs=obs.new_zeros(*lead, *obs.shape),
             kept_action=to_tensor(action).new_zeros(*lead, *action.shape[1:]),
-            kept_mask=torch.ones(*lead, width, **BOOL),
+            kept_mask=torch.ones(*lead, self._mask_size, **BOOL),
             kept_return=torch.zeros(lead, **FLOAT),
         )
+
+    @property
+    def _mask_size(self) -> int:
+        """The numbers of a mask; one where actions have no choices."""
+        return sum(self.codec.counts) or 1
 
     def check_state(self, state: Any) -> None:
         """Raise a RunError where a kept row is not of these spaces."""
@@ -111,7 +115,7 @@ class SelfImitationAlgorithm(PPOAlgorithm):
         mask = cells.flat_or_none(rollout.mask)
         value = self.value(state, obs)
         if mask is None:
-            mask = state.kept_mask.new_ones(*value.shape, self.codec.size)
+            mask = state.kept_mask.new_ones(*value.shape, self._mask_size)
         returns, known = (cells.flat(x) for x in returns_of(rollout))
         good = known & (returns > value)
         if rollout.overridden is not None:

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
+from skillweave.envs.infos import MASK, batched_infos, checked_mask, observes_mask
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
 from skillweave.messages import short
-from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
-from skillweave.spaces.packing import parts
+from skillweave.spaces import choice_counts, env_form, obs_dtype, obs_shape, put_observation
 from skillweave.types import Array, Memory, Policy, Step
 
 
@@ -58,6 +57,7 @@ class Player:
         self.policy, self._deterministic = policy, deterministic
         self._space = policy.observation_space
         self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
+        self._choices = choice_counts(policy.action_space)
         self._seed = seed
         self._rng = np.random.default_rng(seed)
         self.reset(goal=goal)
@@ -98,20 +98,28 @@ class Player:
             obs: what the environment's ``reset`` or ``step`` returned.
             reward: the reward of the step; needed only where a skill's ``termination`` reads it.
             info: the step's info; an ``action_mask`` in it is used where ``mask`` is left out.
-            mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example.
-                None: the mask in ``info``, or the observation's part ``action_mask``; else all.
+            mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example;
+                of a Dict or Tuple also a dict or tuple of masks. None: the mask in ``info``, or the
+                observation's part ``action_mask``; else all.
 
         Raises:
             DeclarationError: the observation or the mask does not fit the policy; the message
                 names what does.
         """
-        seen = self._seen(obs)
+        seen, given = self._seen(obs), dict(info or {})
+        if self._choices and given.get(MASK) is not None:
+            given[MASK] = self._allowed(given[MASK])[0]
         if self._before is not None:
             self._elapsed += 1
-            step = self._step(seen, reward, info or {})
+            step = self._step(seen, reward, given)
             self.memory = self.policy.observe(self.memory, step)
-        if mask is None:
-            mask = (info or {}).get(MASK)
+        if mask is not None and not self._choices:
+            raise DeclarationError(
+                f"act(): mask is {short(mask)}, but actions of {short(self.policy.action_space)} "
+                "are real numbers alone, none of which can be forbidden: leave it out"
+            )
+        if mask is None and self._choices:
+            mask = given.get(MASK)
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
@@ -122,18 +130,16 @@ class Player:
             self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
         )
         self._before = seen, action
-        joint = parts(self.policy.action_space) is not None
-        return env_form(self.policy.action_space, action[0]) if joint else action[0]
+        return env_form(self.policy.action_space, action[0])
 
     def _allowed(self, mask: Any) -> Array:
         """Return a mask as a batch of one."""
-        if not isinstance(self.policy.action_space, DISCRETE):  # masks are ignored, as in training
-            return np.ones((1, 1), bool)
         try:
             allowed = checked_mask(mask, self.policy.action_space)
         except ValueError as error:
             raise DeclarationError(f"act(): {error}") from error
-        if not allowed.any():
+        starts = np.cumsum((0, *self._choices[:-1]))
+        if not np.logical_or.reduceat(allowed, starts).all():
             raise DeclarationError("act(): its action_mask allows no action")
         return allowed[None]
 
@@ -151,7 +157,7 @@ class Player:
             truncated=no,
             timed_out=no,
             elapsed=np.array([self._elapsed]),
-            info={k: np.asarray([v]) for k, v in info.items()},
+            info=batched_infos([dict(info)]),
         )
 
     def _seen(self, obs: Any) -> Array:

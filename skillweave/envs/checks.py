@@ -14,11 +14,11 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.image_bounds import ImageBounds
-from skillweave.envs.infos import DISCRETE, MASK, checked_mask, observes_mask
+from skillweave.envs.infos import MASK, checked_mask, observes_mask
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
-from skillweave.spaces import obs_shape
+from skillweave.spaces import choice_counts, obs_shape
 from skillweave.spaces.packing import parts
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
 
@@ -104,7 +104,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         for wrapper in _wrappers(env):
             _refuse_changing(wrapper, name)
         self._looked = number != 0  # only the first of several is checked
-        self._chooses = isinstance(env.action_space, DISCRETE)
+        self._chooses = bool(choice_counts(env.action_space))
         masks = _attribute(env, "action_masks") if self._chooses else None
         self._masks = masks if _takes_nothing(masks) else None
         """The method of masks that sb3-contrib's MaskablePPO also calls."""
@@ -171,8 +171,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             ):
                 notice(
                     f"{self._name}: its action mask is not used, as actions of {short(actions)} "
-                    "have none: every action counts as allowed. If that is wrong, let a wrapper "
-                    "(gymnasium.wrappers.TransformAction) make a MultiDiscrete of it"
+                    "are real numbers alone, none of which can be forbidden"
                 )
             return
         if self._masks is not None or MASK in info or observes_mask(space, actions):

@@ -12,7 +12,14 @@ import numpy as np
 from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
-from skillweave.spaces import action_codec, obs_dtype, obs_shape, put_observation
+from skillweave.spaces import (
+    action_codec,
+    choice_counts,
+    obs_dtype,
+    obs_shape,
+    put_observation,
+)
+from skillweave.spaces.packing import parts
 from skillweave.types import Array, Step
 
 
@@ -148,8 +155,6 @@ def _rows(value: Any, rows: Array, n: int) -> Any:
     return value[rows] if batched else value
 
 
-DISCRETE = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary
-"""Action spaces that can have masks."""
 MASK = "action_mask"
 """The key of masks in infos and observations."""
 
@@ -158,30 +163,48 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
     """Return whether observations have a part that is the action mask."""
     if not isinstance(observation_space, gym.spaces.Dict) or MASK not in observation_space.spaces:
         return False
-    if not isinstance(space, DISCRETE):
-        return False
-    shape = observation_space.spaces[MASK].shape or ()
-    return int(np.prod(shape)) == sum(action_codec(space).parts)
+    size = sum(choice_counts(space))
+    return bool(size) and int(np.prod(observation_space.spaces[MASK].shape or ())) == size
 
 
 def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
     """Return a mask of an environment or a user for the choices of a space as (A,) bool.
 
-    Several choices may have a list each.
+    Several choices may have a list each. The mask of a Dict or Tuple is a dict or tuple of masks,
+    as in Gymnasium's ``sample``; where a part has none, all is allowed. It may also be one array.
 
     Raises:
         ValueError: the value does not have a number for each choice; the message shows it.
     """
-    size = sum(action_codec(space).parts)
+    return _checked_mask(value, space, "its action_mask")
+
+
+def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
+    """Return a mask as (A,) bool; ``what`` begins messages."""
+    named = parts(space)
+    is_tuple = isinstance(space, gym.spaces.Tuple) and isinstance(value, tuple | list)
+    if named is not None and (is_tuple or isinstance(value, Mapping)):
+        given = value if isinstance(value, Mapping) else dict(zip(named, value, strict=False))
+        if not set(given) <= set(named) or (is_tuple and len(value) != len(named)):
+            raise ValueError(
+                f"{what} has the parts {short(list(given))}, but actions of {short(space)} have "
+                f"{', '.join(map(repr, named))}"
+            )
+        masks = [
+            _checked_mask(given[name], part, f"{what}[{name!r}]")
+            if given.get(name) is not None and choice_counts(part)
+            else np.ones(sum(choice_counts(part)), bool)
+            for name, part in named.items()
+        ]
+        return np.concatenate(masks)
+    size = sum(choice_counts(space))
     try:
-        mask = np.asarray(value)
-        if mask.dtype == object:
-            mask = np.concatenate([np.ravel(part) for part in value])
+        mask = np.concatenate([np.ravel(part) for part in value])  # of unequal lengths, perhaps
     except (TypeError, ValueError):
         mask = np.array(None)
     if mask.size != size or mask.dtype.kind not in "iubf":
         raise ValueError(
-            f"its action_mask is {short(value)}; it must be a number for each choice of {space}, "
+            f"{what} is {short(value)}; it must be a number for each choice of {space}, "
             f"{size} in all, 0 where it is forbidden"
         )
     allowed: Array = mask.reshape(-1) != 0
@@ -195,7 +218,7 @@ class ActionMasks:
     choice, 0 where it is forbidden. For several choices at once (MultiDiscrete, MultiBinary) the
     numbers follow choice by choice. ``CheckedEnv`` has added the mask of ``action_masks()``. Else a
     Dict's part ``action_mask`` is the mask, as in PettingZoo and RLlib. Without any, all actions
-    are allowed. A Box has no choices, so its masks are ignored.
+    are allowed. Real numbers are no choices, so masks leave them out.
 
     Args:
         space: the action space.
@@ -212,7 +235,7 @@ class ActionMasks:
         self._space = space
         self._num_envs = num_envs
         self._observed = observation_space is not None and observes_mask(observation_space, space)
-        self._parts = action_codec(space).parts if isinstance(space, DISCRETE) else ()
+        self._parts = choice_counts(space)
         self.now = now
         """(N, A) bool; None: no environment has returned a mask so far. Never changed in place."""
 
@@ -362,8 +385,4 @@ def random_actions(
         put_observation(space, drawn, row, space.sample())
     if mask is None:
         return drawn
-    codec = action_codec(space)
-    scores = np.where(mask, rng.random(mask.shape), -1.0)
-    parts = np.split(scores, np.cumsum(codec.parts)[:-1], axis=1)
-    units = np.stack([part.argmax(axis=1) for part in parts], axis=1)
-    return codec.to_env(units if codec.multi else units[:, 0])
+    return action_codec(space).allowed_at_random(drawn, mask, rng)

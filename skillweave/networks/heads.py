@@ -20,6 +20,7 @@ from skillweave.ops.distributions import (
     normal_kl,
     normal_stats,
     tanh_log_det,
+    with_epsilon,
 )
 from skillweave.spaces import ActionCodec, ChoiceCodec, JointCodec
 from skillweave.spaces.choices import chosen
@@ -81,10 +82,20 @@ class ActionHead:
         """Return the kinds and widths of the noise of ``act``, in its order."""
         return (("gumbel" if self.discrete else "standard_normal", self.codec.size),)
 
-    @property
-    def choices(self) -> int:
-        """Return the number of logits of choices at the front, which a mask is for; 0: none."""
-        return self.codec.size if self.discrete else 0
+    def masked(
+        self, dist_params: Tensor, mask: Tensor | None, epsilon: Tensor | None = None
+    ) -> Tensor:
+        """Return dist_params (..., width) without the choices that are not allowed.
+
+        Args:
+            mask: (..., A) bool, allowed choices; None: all.
+            epsilon: the least share of choices at random; None: 0.
+        """
+        if not self.discrete:
+            return dist_params
+        if epsilon is None:
+            return mask_logits(dist_params, mask)
+        return with_epsilon(dist_params, mask, epsilon)
 
     @property
     def log_std_size(self) -> int:
@@ -276,7 +287,6 @@ class JointHead:
 
     discrete = False
     std_in_head = False
-    choices = 0
 
     def __init__(
         self,
@@ -307,6 +317,25 @@ class JointHead:
         """Draw noise for calls of ``act``; see ``ActionHead``."""
         return torch.cat([head.noise(generators, steps, batch) for head in self.heads], dim=-1)
 
+    def masked(
+        self, dist_params: Tensor, mask: Tensor | None, epsilon: Tensor | None = None
+    ) -> Tensor:
+        """Return dist_params (..., width) without the choices that are not allowed."""
+        if mask is None:
+            return dist_params
+        widths = [head.width for head in self.heads]
+        found = zip(self.heads, dist_params.split(widths, dim=-1), self._masks(mask), strict=True)
+        return torch.cat([head.masked(params, allowed) for head, params, allowed in found], dim=-1)
+
+    def _masks(self, mask: Tensor | None) -> list[Tensor | None]:
+        """Return the part of a mask (..., A) that each part of an action has."""
+        if mask is None:
+            return [None] * len(self.heads)
+        return [
+            mask[..., columns] if head.codec.counts else None
+            for head, columns in zip(self.heads, self.codec.mask_columns, strict=True)
+        ]
+
     def act(self, dist_params: Tensor, log_std: Tensor | None, noise: Tensor | None) -> Tensor:
         """Return greedy or sampled actions, (..., W)."""
         drawn: Sequence[Tensor | None] = [None] * len(self.heads)
@@ -323,10 +352,11 @@ class JointHead:
     def stats(
         self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Compute log-probabilities of actions and the entropy; there is no ``mask``."""
+        """Compute log-probabilities of actions and the entropy; see ``ActionHead``."""
         log_prob = entropy = torch.zeros_like(dist_params[..., 0])
+        masks = self._masks(mask)
         for i, (head, params, std) in enumerate(self._split(dist_params, log_std)):
-            one, spread = head.stats(params, std, None, self.codec.units(action, i))
+            one, spread = head.stats(params, std, masks[i], self.codec.units(action, i))
             log_prob, entropy = log_prob + one, entropy + spread
         return log_prob, entropy
 
@@ -346,13 +376,16 @@ class JointHead:
         other_log_std: Tensor | None,
         mask: Tensor | None,
     ) -> Tensor:
-        """Compute KL(p ‖ q), the sum over the parts; there is no ``mask``."""
+        """Compute KL(p ‖ q), the sum over the parts; see ``ActionHead``."""
         pairs = zip(
-            self._split(dist_params, log_std), self._split(other, other_log_std), strict=True
+            self._split(dist_params, log_std),
+            self._split(other, other_log_std),
+            self._masks(mask),
+            strict=True,
         )
         total = torch.zeros_like(dist_params[..., 0])
-        for (head, params, std), (_, theirs, their_std) in pairs:
-            total = total + head.kl(params, std, theirs, their_std, None)
+        for (head, params, std), (_, theirs, their_std), allowed in pairs:
+            total = total + head.kl(params, std, theirs, their_std, allowed)
         return total
 
     def to_env(self, action: Array) -> Array:
@@ -410,6 +443,13 @@ class ChoiceHead(JointHead):
         super().__init__(codec, std, squash)
         self.choices = codec.choices
         self.goals = self.heads[1:]
+
+    def masked(
+        self, dist_params: Tensor, mask: Tensor | None, epsilon: Tensor | None = None
+    ) -> Tensor:
+        """Return dist_params (..., width) without the skills that may not start."""
+        logits, goals = dist_params[..., : self.choices], dist_params[..., self.choices :]
+        return torch.cat([self.heads[0].masked(logits, mask, epsilon), goals], dim=-1)
 
     def stats(
         self, dist_params: Tensor, log_std: Tensor | None, mask: Tensor | None, action: Tensor

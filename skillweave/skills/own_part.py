@@ -290,8 +290,10 @@ class _Written:
     """Of its numbers in the flat action; of a Discrete action its choices, from 0."""
     paths: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = ()
     """Of a Dict action: the names that lead to a leaf in it, and in the skill's own action."""
+    choices: Array | None = None
+    """The places of its choices among all choices of an action; None: it has none."""
     columns: Array | None = None
-    """Of its choices among those that a mask lists."""
+    """The numbers of a mask that are for them."""
 
 
 def _written(acts: Any, space: Space[Any], who: str) -> _Written:
@@ -301,7 +303,7 @@ def _written(acts: Any, space: Space[Any], who: str) -> _Written:
             names = ", ".join(map(repr, parts_of(space) or ()))
             raise DeclarationError(
                 f"{who}: acts is {short(acts)}, but the action has parts with names ({names}): "
-                "name them, acts = ('arm',)"
+                f"name them, acts = ({next(iter(parts_of(space) or ()))!r},)"
             )
         return _named(acts, space, who)
     if named:
@@ -319,19 +321,27 @@ def _written(acts: Any, space: Space[Any], who: str) -> _Written:
         ) from None
     if isinstance(space, Discrete):
         return _Written(Discrete(len(places)), places, columns=places)
+    columns = _columns(space, places)
     if isinstance(space, MultiBinary):
-        columns = (2 * places[:, None] + np.arange(2)).reshape(-1)
-        return _Written(MultiBinary(len(places)), places, columns=columns)
+        return _Written(MultiBinary(len(places)), places, choices=places, columns=columns)
     if isinstance(space, MultiDiscrete):
-        counts = space.nvec.reshape(-1)
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        columns = np.concatenate([np.arange(starts[i], starts[i + 1]) for i in places])
         first = np.broadcast_to(space.start, space.shape).reshape(-1)[places]
-        own = MultiDiscrete(counts[places], dtype=space.dtype, start=first)
-        return _Written(own, places, columns=columns)
+        own = MultiDiscrete(space.nvec.reshape(-1)[places], dtype=space.dtype, start=first)
+        return _Written(own, places, choices=places, columns=columns)
     assert isinstance(space, Box)
     low, high = space.low.reshape(-1)[places], space.high.reshape(-1)[places]
-    return _Written(Box(low, high, dtype=space.dtype), places)
+    choices = None if columns is None else places
+    return _Written(Box(low, high, dtype=space.dtype), places, choices=choices, columns=columns)
+
+
+def _columns(space: Space[Any], choices: Array) -> Array | None:
+    """Return the numbers of a mask that are for these choices of an action; None: it has none."""
+    from skillweave.spaces import choice_counts  # needs torch
+
+    starts = np.cumsum([0, *choice_counts(space)])
+    if len(starts) == 1 or not len(choices):
+        return None
+    return np.concatenate([np.arange(starts[i], starts[i + 1]) for i in choices])
 
 
 def _named(names: tuple[str, ...], space: Space[Any], who: str) -> _Written:
@@ -351,13 +361,29 @@ def _named(names: tuple[str, ...], space: Space[Any], who: str) -> _Written:
     if any(a != b and b[: len(a)] == a for a in paths for b in paths):
         raise DeclarationError(f"{who}: acts names a part of the action twice: {short(names)}")
     if len(found) == 1:
-        path, part = next(iter(found.values()))
-        return _Written(part, paths=tuple(((*path, *x), x) for x in leaf_paths(part)))
-    inside = [
-        ((*path, *x), (name, *x)) for name, (path, part) in found.items() for x in leaf_paths(part)
-    ]
-    own = Dict([(name, part) for name, (_, part) in found.items()])
-    return _Written(own, paths=tuple(inside))
+        path, own = next(iter(found.values()))
+        inside = [((*path, *x), x) for x in leaf_paths(own)]
+    else:
+        inside = [((*p, *x), (n, *x)) for n, (p, part) in found.items() for x in leaf_paths(part)]
+        own = Dict([(name, part) for name, (_, part) in found.items()])
+    choices = _choices_at([path for path, _ in inside], space)
+    columns = _columns(space, choices)
+    return _Written(own, paths=tuple(inside), choices=choices, columns=columns)
+
+
+def _choices_at(paths: Sequence[tuple[str, ...]], space: Space[Any]) -> Array:
+    """Return the places of the choices of some leaves among all choices of a Dict action."""
+    from skillweave.spaces import choice_counts  # needs torch
+
+    places: dict[tuple[str, ...], list[int]] = {}
+    start = 0
+    for path in leaf_paths(space):
+        leaf = space
+        for name in path:
+            leaf = (parts_of(leaf) or {})[name]
+        places[path] = list(range(start, start + len(choice_counts(leaf))))
+        start += len(places[path])
+    return np.array([place for path in paths for place in places[path]], np.int64)
 
 
 def _joined(space: Space[Any], paths: Any, action: Array) -> Array:
@@ -534,20 +560,20 @@ class OwnPart:
 
     def mask(self, mask: Array | None) -> Array | None:
         """Return which of its own choices a mask (…, A) allows; all where it allows none."""
-        if mask is None or self.written is None or self.written.columns is None:
+        if mask is None or self.written is None:
             return mask
+        if self.written.columns is None:  # real numbers alone, which a mask is not for
+            return None
         own = mask[..., self.written.columns]
         free = self._free(own)
         return own if free.all() else own | ~free[..., None]
 
     def _free(self, own: Array) -> Array:
         """Return where each of its own parts has an allowed choice, (…) bool."""
-        counts: Any = self.action_space.n if isinstance(self.action_space, Discrete) else None
-        if isinstance(self.action_space, MultiBinary):
-            counts = np.full(self.action_space.n, 2)
-        elif isinstance(self.action_space, MultiDiscrete):
-            counts = self.action_space.nvec
-        starts = np.concatenate([[0], np.cumsum(np.ravel(counts))[:-1]]).astype(np.int64)
+        from skillweave.spaces import choice_counts  # needs torch
+
+        assert self.written is not None
+        starts = np.cumsum([0, *choice_counts(self.written.space)[:-1]])
         free = np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1)
         return np.asarray(free)
 
@@ -557,31 +583,31 @@ class OwnPart:
         Args:
             action: (n, …), the whole actions.
         """
-        if mask is None or self.written is None or self.written.columns is None:
+        from skillweave.spaces import action_codec  # needs torch
+
+        if mask is None or self.written is None:
             return
-        if not self._free(mask[:, self.written.columns]).all():
+        own, space = self.written, self.whole_action_space
+        if own.columns is not None and not self._free(mask[:, own.columns]).all():
             raise SkillError(
                 f"{self.who}: the environment's action mask allows none of the choices that it "
                 "owns (acts): let it start only where one is allowed, or let it own more"
             )
-        space = self.whole_action_space
         if isinstance(space, Discrete):
             return
-        if isinstance(space, MultiDiscrete):
-            counts, start = space.nvec.reshape(-1), np.broadcast_to(space.start, space.shape)
-            choice = (action - start).reshape(len(action), -1)
-        else:
-            choice = action.reshape(len(action), -1)
-            counts = np.full(choice.shape[1], 2)
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        allowed = np.take_along_axis(mask, (first + choice).astype(np.int64), axis=1)
-        allowed[:, self.written.places] = True
+        codec = action_codec(space)
+        choice = codec.choices_in(action)
+        first = np.cumsum([0, *codec.counts[:-1]])
+        allowed = np.take_along_axis(mask, first + choice, axis=1)
+        if own.choices is not None:
+            allowed[:, own.choices] = True
         if not allowed.all():
             row, place = np.argwhere(~allowed)[0].tolist()
+            where = "place" if isinstance(space, MultiDiscrete | MultiBinary | Box) else "choice"
             raise SkillError(
                 f"{self.who}: the environment's action mask forbids the value "
-                f"{int(choice[row, place])} at place {place} of the action, which rest leaves it "
-                "at: give the hierarchy another rest, or let the skill own this place (acts)"
+                f"{int(choice[row, place])} at {where} {place} of the action, which rest leaves it "
+                f"at: give the hierarchy another rest, or let the skill own this {where} (acts)"
             )
 
     @property

@@ -4,7 +4,7 @@
 networks; ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
-from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
+from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec, choice_counts
 from skillweave.spaces.choices import (
     ChoiceCodec,
     ChoiceSpace,
@@ -25,6 +25,7 @@ __all__ = [
     "ObsCodec",
     "action_codec",
     "choice_codec",
+    "choice_counts",
     "env_form",
     "numbered_choice_codec",
     "obs_codec",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -44,6 +45,11 @@ class ActionCodec:
         return bool(self.parts) and isinstance(self.space, several)
 
     @cached_property
+    def counts(self) -> tuple[int, ...]:
+        """Return the number of values of each choice, in order; a mask has a number for each."""
+        return self.parts
+
+    @cached_property
     def size(self) -> int:
         """Return the number of logits or of means."""
         return sum(self.parts) or int(np.prod(self.space.shape or ()))
@@ -73,6 +79,24 @@ class ActionCodec:
         width = np.where(span[bounded] == 0.0, 1.0, span[bounded])  # low == high: any unit
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
         return units.astype(np.float32)
+
+    def choices_in(self, action: Array) -> Array:
+        """Return the value of each choice in actions (n, …), counted from 0: (n, K) int64."""
+        if not self.parts:
+            return np.zeros((len(action), 0), np.int64)
+        return self.from_env(action).reshape(len(action), -1)
+
+    def allowed_at_random(self, action: Array, mask: Array, rng: np.random.Generator) -> Array:
+        """Return actions (n, …) with choices at random among those that ``mask`` (n, A) allows.
+
+        Real numbers keep their values.
+        """
+        if not self.parts:
+            return action
+        scores = np.where(mask, rng.random(mask.shape), -1.0)
+        parts = np.split(scores, np.cumsum(self.parts)[:-1], axis=1)
+        units = np.stack([part.argmax(axis=1) for part in parts], axis=1)
+        return self.to_env(units if self.multi else units[:, 0])
 
     def zeros(self, *lead: int) -> Array:
         """Return actions (*lead, …) in policy units whose numbers are 0."""
@@ -123,6 +147,17 @@ class JointCodec(ActionCodec):
         return tuple(found)
 
     @cached_property
+    def counts(self) -> tuple[int, ...]:
+        """Return the number of values of each choice of all parts; see ``ActionCodec``."""
+        return tuple(n for _, codec in self.members for n in codec.counts)
+
+    @cached_property
+    def mask_columns(self) -> tuple[slice, ...]:
+        """Return the columns of each part in a mask."""
+        ends = np.cumsum([0, *(sum(codec.counts) for _, codec in self.members)]).tolist()
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @cached_property
     def size(self) -> int:
         """Return the numbers of an action in policy units."""
         last: int = self.columns[-1].stop
@@ -155,6 +190,18 @@ class JointCodec(ActionCodec):
             units = codec.from_env(np.asarray(action[name]))
             found[:, self.columns[at]] = units.reshape(len(units), -1)
         return found
+
+    def choices_in(self, action: Array) -> Array:
+        """Return the value of each choice in actions (n,), counted from 0: (n, K) int64."""
+        found = [codec.choices_in(action[name]) for name, codec in self.members]
+        return np.concatenate(found, axis=1)
+
+    def allowed_at_random(self, action: Array, mask: Array, rng: np.random.Generator) -> Array:
+        """Return actions (n,) with choices that ``mask`` (n, A) allows; see ``ActionCodec``."""
+        drawn = action.copy()
+        for (name, codec), columns in zip(self.members, self.mask_columns, strict=True):
+            drawn[name] = codec.allowed_at_random(action[name], mask[:, columns], rng)
+        return drawn
 
     def check(self, action: Tensor) -> None:
         """Raise a ValueError where actions in policy units (…, size) are not in this space."""
@@ -193,6 +240,14 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
             raise unsupported_action(space)
         return ActionCodec(space, tuple(counts.tolist()), _first(space.low.reshape(-1)))
     return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
+
+
+def choice_counts(space: gym.Space[Any]) -> tuple[int, ...]:
+    """Return the number of values of each choice of an action; (): it has none, or no codec."""
+    try:
+        return action_codec(space).counts
+    except EnvError:
+        return ()
 
 
 def _joint(space: gym.Space[Any]) -> JointCodec:

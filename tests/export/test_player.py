@@ -92,3 +92,32 @@ print([int(runner.act(x)) for x in {obs.tolist()}])
     done = subprocess.run(command, cwd=out, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == wanted
     assert len(set(wanted)) > 1
+
+
+def test_a_player_batches_infos_as_training_does() -> None:
+    """A dict within a dict stays one, and lists of unequal lengths are no error."""
+    seen: list[object] = []
+
+    class Right(Left):
+        policy = from_function(lambda obs: np.full(len(obs), 2))
+
+        def termination(self, step):
+            if "game" not in step.info:
+                return np.zeros(len(step.obs), bool)
+            seen.append(step.info["game"]["score"][0])
+            return step.info["game"]["score"] > 1
+
+    run = Hierarchy(EnvSpec(Walk, engine="sync"), [Right()], learn="apart").train(quiet=True)
+    player = run.player()
+    for score in range(3):
+        player.act(np.zeros(4, np.float32), info={"game": {"score": score}, "of": [[1, 2], [3]]})
+    assert seen == [1, 2]
+
+
+@pytest.mark.filterwarnings("error")
+def test_actions_are_as_the_environment_takes_them() -> None:
+    """Gymnasium warns where an action of a Box without axes is no array."""
+    seen = gym.spaces.Box(-1, 1, (3,))
+    for space in (gym.spaces.Box(1, 3, (), np.int64), gym.spaces.Box(-1, 1, (), np.float32)):
+        action = Player(agent(PPO(network=Network((8,))), seen, space)).act(np.zeros(3))
+        assert space.contains(action)
