@@ -14,11 +14,12 @@ import numpy as np
 
 from skillweave.errors import PolicyError
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.graph import FURTHER
+from skillweave.planning.graph import FURTHER, CallGraph
 from skillweave.planning.neighbours import AHEAD, SOFT
 from skillweave.planning.planner import Planner
 from skillweave.planning.tried import LATEST, SLACK, TRUST
 from skillweave.selectors.base import function_name
+from skillweave.skills.goal_spaces import from_numbers
 from skillweave.spaces import obs_codec
 from skillweave.types import Array
 
@@ -30,16 +31,9 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
     """Return the entry of a planner in ``policy.json``, without its file, and the file's bytes.
 
     Raises:
-        PolicyError: each episode has a goal of its own, for which the runner cannot plan; or the
-            plan chooses goals of skills, which the runner cannot.
+        PolicyError: each episode has a goal of its own, for which the runner cannot plan.
     """
     task, graph, machine = planner.task, planner.graph, planner.machine
-    if planner.goal_spaces:
-        raise PolicyError(
-            f"{name} is a plan that chooses goals ({', '.join(planner.goal_spaces)}), which the "
-            "runner does not: export a selector that starts from the plan, "
-            "planned.with_selector(...).train(...), or act with run.player()"
-        )
     if isinstance(task, GoalTask) and task.columns is not None:
         raise PolicyError(
             f"{name} plans again for each goal that it observes, which the runner does not: export "
@@ -52,7 +46,6 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
         "worth": planner.plan.worth,
         "call": graph.pieces.call,
         "skill_of": graph.skill_of,
-        "usual": graph.usual,
         "lengths": np.array(graph.log.lengths, np.int64),
         **{f"machine.{k}": v for k, v in machine.arrays.items()},
         **{f"states.{k}": v for k, v in planner.states.arrays.items()},
@@ -66,8 +59,11 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
             continue
         what = "observations (1, ...) to features (1, F)"
         features.append(asks(f"{name}.features.{graph.log.skills[i]}", each.raw, what))
-    for c, (rows, starts) in enumerate(graph.pieces_by_choice):
-        arrays |= {f"rows.{c}": rows, f"starts.{c}": starts}
+    groups = graph.groups
+    arrays["usual"] = np.array([group.usual for _, group in groups], np.float32)
+    for g, (choice, group) in enumerate(groups):
+        arrays |= {f"rows.{g}": group.rows, f"starts.{g}": group.starts}
+        arrays |= _goals_of(planner, graph.skill_of[choice], group.goal, g)
     events = []
     for event in machine.events:
         what = "observations (1, ...)" if event.reads == "obs" else "a Step"
@@ -80,6 +76,9 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     settings = {
+        "groups": [[choice, group.options] for choice, group in groups],
+        "goals": bool(planner.goal_spaces),
+        "aims": _width(graph),
         "neighbours": graph.neighbours,
         "gamma": planner.gamma,
         "caution": planner.caution,
@@ -89,3 +88,27 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
     constants["further"] = FURTHER
     entry = {"kind": "Plan", "features": features, "events": events, "rewards": rewards}
     return entry | settings | constants, buffer.getvalue()
+
+
+def _goals_of(planner: Planner, skill: int, call: Array, group: int) -> dict[str, Array]:
+    """Return the arrays of the goals of a group's options; {}: they have none.
+
+    Args:
+        call: (m,) the calls that have the goals.
+    """
+    graph = planner.graph
+    name, standard = graph.log.skills[skill], graph.goals[skill]
+    if standard is None or (call < 0).any():
+        return {}
+    aims = np.zeros((len(call), _width(graph)), np.float32)
+    aims[:, : standard.shape[1]] = standard[call]
+    found = {f"aims.{group}": aims}
+    if name in planner.goal_spaces:  # a guide gives no goals
+        numbers = graph.log.goals[name][call]
+        found[f"goals.{group}"] = from_numbers(planner.goal_spaces[name], numbers)
+    return found
+
+
+def _width(graph: CallGraph) -> int:
+    """Return the numbers of the largest goal; 0: no skill has goals."""
+    return max((goals.shape[1] for goals in graph.goals if goals is not None), default=0)

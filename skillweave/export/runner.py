@@ -466,7 +466,8 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
 
     def decided(self, may: Any, lengths: int) -> Any:
         """Return the number of the next choice, and goals by the places of skills."""
-        may = self.guide.allowed(may[None], self).repeat(lengths)
+        may = self.guide.allowed(may[None], self)
+        may = may.repeat(lengths * len(self.skills) // len(may))  # a plan has chosen the length
         if not may.any():
             raise ValueError(f"no skill may start in observation {self.runner.obs[0]}")
         return self.parted(self.selector.act(may[None], self))
@@ -581,12 +582,15 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
                 return
 
 
-class _Plan(_Code):  # a selector: the choice whose nearest logged calls are worth most for a task
+class _Plan(_Function):  # a selector: the option whose nearest logged calls are worth most
     def __init__(self, runner: Runner, entry: Any) -> None:
         super().__init__(runner, entry)
         with np.load(runner.path / entry["file"]) as data:
             self.data = dict(data)
         self.skill_of, self.lengths = self.data["skill_of"], self.data["lengths"]
+        choices, options = np.transpose(entry["groups"])
+        self.choice_of = choices.repeat(options)
+        self.group_of = np.arange(len(options)).repeat(options)
         self.reset()
 
     def reset(self) -> None:
@@ -595,31 +599,35 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
 
     def act(self, mask: Any, last: Any = None) -> Any:
         entry, features = self.entry, self.features()
-        (pieces, weights, far, total), (places, share) = self.near(features), self.corners()
-        q = ((self.data["worth"][pieces][..., places] * share).sum(2) * weights).sum(1)
-        known = np.isfinite(far)
-        q = np.where(q > 0, q / (1 + entry["caution"] * np.where(known, far, 0.0)), q)
-        q = np.where(known, q, -np.inf).astype("f4")
-        may = np.ones(len(q), bool) if mask is None else mask[0]
-        here = SimpleNamespace(
-            end=features, to=places[share.argmax()], q=q, total=total, far=far, may=may
-        )
+        here, (places, share) = self.near(features), self.corners()
+        q = ((self.data["worth"][here.pieces][..., places] * share).sum(2) * here.weights).sum(1)
+        known = np.isfinite(here.far)
+        q = np.where(q > 0, q / (1 + entry["caution"] * np.where(known, here.far, 0.0)), q)
+        here.q = np.where(known, q, -np.inf).astype("f4")
+        here.may = np.ones(len(q), bool) if mask is None else mask[0][self.choice_of]
+        here.to = places[share.argmax()]
         if self.calls:
             self.calls[-1] = SimpleNamespace(**{**vars(self.calls[-1]), **vars(here)})
         q = self.corrected(here)
-        score = np.where(may, np.maximum(q, -1e30), -np.inf)
+        score = np.where(here.may, np.maximum(q, -1e30), -np.inf)
         if entry["temperature"]:
-            largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max()
+            largest = np.abs(np.where(here.may & np.isfinite(q), q, 0.0)).max()
             score = score / (entry["temperature"] * max(largest, 1e-12))
             score = score + self.runner.rng.gumbel(size=len(q))
-        choice = int(score.argmax())
+        option = score.argmax()
+        choice, place = self.choice_of[option], here.places[option]
         call = SimpleNamespace(choice=choice, start=features, origin=here.to)
+        call.aim, goals = here.aims[option], {}
+        if place >= 0 and entry["goals"]:
+            goals[self.skill_of[choice]] = self.data[f"goals.{self.group_of[option]}"][place]
+        elif place >= 0:
+            call.aim = call.aim + np.nan  # a guide does not say which goal: unknown
         call.steps, call.reward, call.discount = 0, 0.0, 1.0
         self.calls = [*self.calls, call][-entry["latest"] :]
-        return choice
+        return choice, goals
 
     def allowed(self, mask: Any, last: Any) -> Any:
-        return mask[0] & (np.arange(mask.shape[1]) == self.act(mask, last))
+        return super().allowed(mask.repeat(max(1, len(self.lengths)), axis=1), last)
 
     def watch(self, last: Any, *when: Any) -> None:
         step, asks = self.runner.step(*when), self.runner.asks
@@ -671,29 +679,44 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
         return each
 
     def near(self, features: list[Any]) -> Any:
-        """Return the nearest pieces of each choice (C, K), weights, distances, and sums (C,)."""
-        entry, data, k = self.entry, self.data, self.entry["neighbours"]
-        pieces, far = (
-            np.zeros((len(self.skill_of), k), int),
-            np.full((len(self.skill_of), k), np.inf),
-        )
-        for c, skill in enumerate(self.skill_of):
-            rows = data[f"rows.{c}"]
-            if not len(rows):
-                continue
-            distance = np.sqrt(((data[f"starts.{c}"] - features[skill]) ** 2).sum(1))
-            group = data["call"][rows]
-            tries = k * entry["ahead"] if len(np.unique(group)) < len(group) else k
-            order = np.argsort(distance, kind="stable")[:tries]
-            _, first = np.unique(group[order], return_index=True)  # the nearest of each call
-            found = order[np.sort(first)[:k]]
-            pieces[c, : len(found)], far[c, : len(found)] = rows[found], distance[found]
-        far = far.astype("f4")
-        limit = np.float32(entry["further"]) * np.maximum(far[:, :1], data["usual"][:, None])
-        far = np.where(far <= limit, far, np.float32(np.inf))
-        weights = 1.0 / (np.where(np.isfinite(far), far, 1e9) + entry["soft"])
+        """Return what the log says of each option where the skills' calls start at features."""
+        skills = self.skill_of[[choice for choice, _ in self.entry["groups"]]]
+        found = [self.option(g, features[skill]) for g, skill in enumerate(skills)]
+        pieces, far, aims, places = (np.concatenate(part) for part in zip(*found, strict=True))
+        weights = 1.0 / (np.where(np.isfinite(far), far, 1e9) + self.entry["soft"])
         total = weights.sum(1)
-        return pieces, weights / total[:, None], far[:, 0], total
+        return SimpleNamespace(
+            pieces=pieces, weights=weights / total[:, None], far=far[:, 0], total=total,
+            aims=aims, places=places, end=features,
+        )  # fmt: skip
+
+    def option(self, group: int, to: Any) -> tuple[Any, ...]:
+        """Return the nearest pieces of a group's options (O, K) to features, distances, and goals.
+
+        Goals are standardised (O, G), and places (O,) in the group's goals; -1: there is none.
+        """
+        entry, data, k = self.entry, self.data, self.entry["neighbours"]
+        rows, starts = data[f"rows.{group}"], data[f"starts.{group}"]
+        options = entry["groups"][group][1]
+        many = k if options == 1 else options
+        distance = np.sqrt(((starts - to) ** 2).sum(1))
+        call = data["call"][rows]
+        order = np.argsort(distance, kind="stable")[: many * entry["ahead"]]
+        _, first = np.unique(call[order], return_index=True)  # the nearest of each call
+        found = order[np.sort(first)[:many]]
+        # Of an option count the calls that are nearest by start and goal.
+        aims = data.get(f"aims.{group}", np.zeros((len(rows), entry["aims"]), "f4"))[found]
+        off = np.square(aims[:options, None] - aims).sum(2)
+        both = np.sqrt(distance[found] ** 2 + off)
+        least = np.argsort(both, axis=1, kind="stable")[:, :k]
+        n, m = least.shape
+        pieces, far = np.zeros((options, k), int), np.full((options, k), np.inf, "f4")
+        pieces[:n, :m], far[:n, :m] = rows[found[least]], np.take_along_axis(both, least, 1)
+        limit = np.float32(entry["further"]) * np.maximum(far[:, :1], data["usual"][group])
+        own, places = np.zeros((options, entry["aims"]), "f4"), np.full(options, -1)
+        own[:n] = aims[:options]
+        places[:n] = found[:options] if f"aims.{group}" in data else -1
+        return pieces, np.where(far <= limit, far, np.float32(np.inf)), own, places
 
     def corners(self) -> Any:
         """Return the planning states around the task's state, and their shares."""
@@ -713,20 +736,22 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
         return np.array(places), np.array(shares, "f4")
 
     def corrected(self, here: Any) -> Any:
-        """Return the values of the choices where the calls of the episode count as logged ones."""
+        """Return the values of the options where the calls of the episode count as logged ones."""
         entry, calls = self.entry, self.calls
+        if not calls:
+            return here.q
         ends = [*calls, here]
-        choice = np.array([call.choice for call in calls], int)
-        skill = self.skill_of[choice] if calls else choice
-        far = np.array([[np.sqrt(np.square(e.end[s] - c.start[s]).sum())
-                         for c, s in zip(calls, skill, strict=True)] for e in ends])  # fmt: skip
-        same = np.array([[e.to == c.origin for c in calls] for e in ends], bool)
-        same &= far <= np.array([e.far[choice] for e in ends]) + entry["slack"]
+        choice = np.array([call.choice for call in calls])
+        skill = self.skill_of[choice]
+        far = np.sqrt([[np.square(e.end[s] - c.start[s]).sum() + np.square(e.aims - c.aim).sum(1)
+                        for c, s in zip(calls, skill, strict=True)] for e in ends])  # fmt: skip
+        same = np.array([[e.to == c.origin for c in calls] for e in ends])[..., None]
+        same = same & (choice[:, None] == self.choice_of)
+        same &= far <= np.array([e.far for e in ends])[:, None] + entry["slack"]
         if not same[-1].any():
             return here.q
         weight = np.where(same, entry["trust"] / (far + entry["soft"]), 0.0)
-        one_hot = choice[:, None] == np.arange(len(here.q))
-        own, logged = weight @ one_hot, np.array([e.q for e in ends])
+        own, logged = weight.sum(1), np.array([e.q for e in ends])
         known, may = np.isfinite(logged), np.array([e.may for e in ends])
         total = np.where(known, np.array([e.total for e in ends]), 0.0)
         base = np.where(known, logged, 0.0) * total
@@ -740,7 +765,7 @@ class _Plan(_Code):  # a selector: the choice whose nearest logged calls are wor
         value, q = best(logged), logged
         for _ in range(entry["latest"]):
             y = paid[:, 0] + paid[:, 1] * value
-            q = (base + (weight * y) @ one_hot) / both
+            q = (base + np.einsum("eco,c->eo", weight, y)) / both
             q = np.where(~known & (own <= 0), -np.inf, q)
             value = best(q)
         return q[-1].astype("f4")

@@ -30,6 +30,7 @@ from skillweave.planning.neighbours import (
     SOFT,
     feature_maps,
     nearest,
+    tie_order,
     weights_of,
 )
 from skillweave.planning.states import PlanningStates
@@ -200,15 +201,13 @@ class CallGraph:
         self._after: Near | None = None
 
     @property
-    def pieces_by_choice(self) -> list[tuple[Array, Array]]:
-        """Of each choice, its pieces (m,) and the features of their starts (m, F)."""
-        return list(zip(self._of_choice, self._starts, strict=True))
-
-    @property
-    def usual(self) -> Array:
-        """The usual distance of each option's K-th neighbour, (O,) float32, without goals."""
-        options = (each.usual(self.neighbours) for each in self._options if isinstance(each, Apart))
-        return np.concatenate([np.array(each, np.float32) for each in options])
+    def groups(self) -> list[tuple[int, Group]]:
+        """All options in their order: the choice, and options of it that share their calls."""
+        return [
+            (choice, group)
+            for choice, options in enumerate(self._options)
+            for group in options.groups(self.neighbours)
+        ]
 
     def near(self, obs: Array) -> Near:
         """Return the nearest pieces of each choice to observations (n, …)."""
@@ -392,6 +391,22 @@ class CallGraph:
         return (self.after if same else self.near_features(features)), may
 
 
+@dataclass(frozen=True)
+class Group:
+    """Options whose calls count for one another: one, or the goals of the nearest calls."""
+
+    options: int
+    """How many."""
+    rows: Array
+    """(m,) the pieces of their calls."""
+    starts: Array
+    """(m, F) float32, the features of their starts."""
+    goal: Array
+    """(m,) the call with the goal that an option has if the piece is its nearest; −1: none."""
+    usual: float
+    """The usual distance of a start's k-th neighbour among others."""
+
+
 class Options:
     """The options of one choice: the calls of a skill, perhaps with goals.
 
@@ -418,6 +433,10 @@ class Options:
             Pieces (n, options, k), distances (n, options, k), infinite where there are fewer; and
             the calls whose goals the options have, (n, options), −1: none.
         """
+        raise NotImplementedError
+
+    def groups(self, k: int) -> list[Group]:
+        """Return the options in their order, with the pieces that count for them, by tie order."""
         raise NotImplementedError
 
     def _nearest(
@@ -471,6 +490,15 @@ class Apart(Options):
         pieces = self._rows[places] if len(self._rows) else places
         return pieces, far, np.repeat(self._goal[None], len(to), axis=0)
 
+    def groups(self, k: int) -> list[Group]:
+        """Return a group for each option; see ``Options.groups``."""
+        groups = []
+        for some, goal, usual in zip(self._mine, self._goal, self.usual(k), strict=True):
+            mine = some[tie_order(len(some))]
+            goals = np.full(len(mine), goal)
+            groups.append(Group(1, self._rows[mine], self._starts[mine], goals, usual))
+        return groups
+
     def usual(self, k: int) -> list[float]:
         """Return the usual distance of each option's k-th neighbour."""
         if k not in self._usual:
@@ -501,12 +529,21 @@ class ByGoal(Options):
 
     def near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
         """Return the pieces that are nearest by start and goal; see ``Options.near``."""
+        pieces, far, goal = self._near(to, k, without)
+        return pieces, _without_far(far, self.usual(k)), goal
+
+    def groups(self, k: int) -> list[Group]:
+        """Return one group, of all options; see ``Options.groups``."""
+        mine, usual = tie_order(len(self._rows)), self.usual(k)
+        return [Group(self.count, self._rows[mine], self._starts[mine], self._call[mine], usual)]
+
+    def usual(self, k: int) -> float:
+        """Return the usual distance of an option's k-th neighbour."""
         if k not in self._usual:
             some = _sampled(self._all)
-            usual = self._near(self._starts[some], k, self._call[some])[1][:, :, -1]
-            self._usual[k] = float(np.median(usual))
-        pieces, far, goal = self._near(to, k, without)
-        return pieces, _without_far(far, self._usual[k]), goal
+            far = self._near(self._starts[some], k, self._call[some])[1][:, :, -1]
+            self._usual[k] = float(np.median(far))
+        return self._usual[k]
 
     def _near(self, to: Array, k: int, without: Array | None) -> tuple[Array, Array, Array]:
         """Return the nearest pieces as ``near`` does, however far they are."""
@@ -519,7 +556,9 @@ class ByGoal(Options):
             skipped = None if without is None else without[some]
             near, off = self._nearest(self._all, to[some], CANDIDATES, skipped)
             goals = torch.from_numpy(self._goals[near])
-            apart = torch.cdist(goals, goals).square().numpy()
+            # Differences: those of squares are wrong by rounding where goals are near.
+            exact = "donot_use_mm_for_euclid_dist"
+            apart = torch.cdist(goals, goals, compute_mode=exact).square().numpy()
             both = np.sqrt(off[:, None] ** 2 + apart)  # (n, candidates, calls)
             least = np.argsort(both, axis=2, kind="stable")[:, :, :k]
             most = least.shape[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +20,8 @@ BLOCK = 4_000_000
 SOFT = 0.01
 """Distance that is added before weights are inverse distances: two equal calls count equally."""
 AHEAD = 8
-"""Points that are looked at for each one that is wanted, as several may be of one group."""
+"""Points that are looked at for each one that is wanted: several may be of one group, or equally
+near."""
 CONSTANT = 1e-6
 """A feature whose deviation is less, relative to its size, is constant."""
 
@@ -169,6 +171,23 @@ def feature_maps(
     return maps
 
 
+def tie_order(count: int) -> Array:
+    """Return the order in which equally near points count, (count,) int64.
+
+    It is by chance, but always the same: those of one part of a log would resemble one another.
+    """
+    order: Array = _tie_ranks(count).argsort()
+    return order
+
+
+@lru_cache(64)
+def _tie_ranks(count: int) -> Array:
+    """Return the place of each point in ``tie_order``."""
+    ranks = np.random.default_rng(0).permutation(count)
+    ranks.setflags(write=False)
+    return ranks
+
+
 def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, Array]:
     """Return the ``count`` nearest points to each row of ``to``, each of another group.
 
@@ -179,10 +198,11 @@ def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, 
         group: (m,) the group of each point; of a group only the nearest point counts.
 
     Returns:
-        Their rows (n, count) int64, the nearest first, and distances (n, count) float32. Where
-        there are fewer groups, the distance is infinite.
+        Their rows (n, count) int64, the nearest first, of equally near ones the first by
+        ``tie_order``; and distances (n, count) float32. Where there are fewer groups, the distance
+        is infinite.
     """
-    tries = min(len(points), count * AHEAD if len(np.unique(group)) < len(group) else count)
+    tries = min(len(points), count * AHEAD)
     y, x = torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(to))
     squares = (y * y).sum(1)[None]
     rows = []
@@ -191,6 +211,7 @@ def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, 
         far = torch.addmm(squares, x[first : first + step], y.T, alpha=-2.0)
         rows.append(far.topk(tries, 1, largest=False).indices)
     near = torch.cat(rows).numpy() if rows else np.zeros((0, tries), np.int64)
+    near = np.take_along_axis(near, _tie_ranks(len(points))[near].argsort(1), 1)
     # Differences again: those of squares are wrong by rounding where points are near.
     distance = np.sqrt(((points[near] - to[:, None]) ** 2).sum(2))
     groups, each = group[near], np.arange(len(to))

@@ -211,18 +211,18 @@ class Planner(ReadySelector):
             may: (n, choices) bool, what may be chosen.
 
         Returns:
-            The choices (n,), and the logged calls whose goals they have, (n,); −1: none.
+            The choices (n,), and the calls of the graph whose goals they have, (n,); −1: none.
         """
         near = self.graph.near(obs)
         option = self._choose(self._values(near, obs, state), may, None)
         return self.graph.choice_of[option], near.goal[np.arange(len(obs)), option]
 
     def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
-        """Return the goals of choices (n,) from logged calls (n,), as ``with_goals`` takes them."""
+        """Return goals of choices (n,) from calls (n,) in the graph, as of ``with_goals``."""
         found, skill = {}, self.graph.skill_of[choice]
         for name, space in self.goal_spaces.items():
             rows = np.flatnonzero((skill == self.log.number(name)) & (call >= 0))
-            found[name] = rows, from_numbers(space, self.log.goals[name][call[rows]])
+            found[name] = rows, from_numbers(space, self.graph.log.goals[name][call[rows]])
         return found
 
     @property

@@ -8,12 +8,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from goals.worlds import Rest, declared, go_to
+from goals.worlds import ON, SPACES, Point, Rest, declared
 from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait
 
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
 from skillweave.api.policies import load_policy
+from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export.runner import Runner
@@ -160,18 +161,149 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
     played(Noisy(), Runner(tmp_path, code=export.functions), 1)
 
 
-def test_a_plan_that_chooses_goals_is_refused(tmp_path: Path) -> None:
-    """With many different goals, and with a few, each of which is as another skill."""
+GOAL_SPACES: dict[str, Any] = {
+    "box": SPACES["box"],
+    "dict": SPACES["dict"],
+    "nested": gym.spaces.Dict({"to": SPACES["dict"], "how": SPACES["bits"]}),
+    "number": gym.spaces.Discrete(9, start=2),
+}
 
-    def near_corner(obs: Any) -> Any:
-        return (obs > 0.5).all(1)
 
-    for goals in (None, lambda self, obs, rng: np.sign(rng.uniform(-1, 1, (len(obs), 2)))):
-        own = {} if goals is None else {"goals": goals}
-        walk = go_to(policy=lambda self, obs, goal: np.clip(5 * (goal - obs), -1, 1), **own)
-        run = declared([walk, Rest()]).train(tmp_path / f"{goals is None}", quiet=True)
-        planned = run.plan(near_corner, run.log_calls(600))
-        with pytest.raises(
-            PolicyError, match=r"a plan that chooses goals \(go_to\).*with_selector"
-        ):
-            planned.export(tmp_path / "x")
+def way_to(obs: Any, goal: Any) -> Any:
+    if goal.dtype.fields and "to" in goal.dtype.names:
+        goal = goal["to"]
+    if goal.dtype.kind == "i":
+        goal = np.stack([(goal - 2) % 3 - 1, (goal - 2) // 3 - 1], 1)
+    return np.clip(5 * ((goal["at"] if goal.dtype.fields else goal) - obs), -1, 1)
+
+
+class Fenced(Point):
+    """The point cannot pass x = 0.2 to the right for 14 steps: calls that the log knows fail."""
+
+    def step(self, action: Any) -> Any:
+        before = self.place.copy()
+        result = super().step(action)
+        if before[0] <= 0.2 < self.place[0] and self.steps < 14:
+            self.place[0] = before[0]
+        return self._obs(), *result[1:]
+
+
+def corners(skill: Any, obs: Any, rng: Any) -> Any:
+    return np.sign(rng.uniform(-1, 1, (len(obs), 2)))
+
+
+def in_corner(obs: Any) -> Any:
+    return (obs > 0.4).all(1)
+
+
+def left_low(obs: Any) -> Any:
+    return (obs < -0.3).all(1)
+
+
+THERE_AND_BACK = Mission(in_corner, held(left_low, 3))
+GOING: dict[str, Any] = {
+    "box": ("box", {}),
+    "few goals": ("box", {"goals": corners}),
+    "dict": ("dict", {}),
+    "dict in a dict": ("nested", {}),
+    "few numbers": ("number", {}),
+    "two skills": ("box", {"more": True}),
+    "lengths": ("box", {"call_steps": Lengths(2, 5)}),
+    "more neighbours than options": ("box", {"neighbours": 40}),
+}
+
+
+def with_goals(space: str, seed: int = 0, **how: Any) -> Any:
+    """A run of ready skills with goals, and a log of it."""
+    call_steps = how.pop("call_steps", 8)
+    own = {"policy": lambda self, obs, goal: way_to(obs, goal), "goal_space": GOAL_SPACES[space]}
+    own |= {"goals": how.pop("goals")} if "goals" in how else {}
+    skills = [type("GoTo", (Skill,), own)(), Rest()]
+    if how.pop("more", False):
+        picks = {"name": "pick", "goal_space": GOAL_SPACES["number"]}
+        skills.append(type("Pick", (Skill,), own | picks)())
+    run = declared(skills, selector=ON, call_steps=call_steps).train(quiet=True)
+    return run, run.log_calls(2_000, num_envs=4, seed=seed), how
+
+
+def told(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
+    """Of each step of an episode the running skill, its goal, and the action."""
+    obs, info = env.reset(seed=seed)
+    actor.reset()
+    found, reward, over = [], None, False
+    while not over:
+        action = actor.act(obs, reward=reward, info=info)
+        if isinstance(actor, Runner):
+            skill, goal = actor.root.skill, actor.root.goal
+            goal = None if goal is None else goal[0]
+        else:
+            skill, goal = int(actor.memory["skill"][0]), policy.goal_now(actor.memory)
+        found.append((skill, str(goal), action.tolist()))
+        obs, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    return found
+
+
+@pytest.mark.fast_cases(3)
+@pytest.mark.parametrize("case", GOING)
+def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> None:
+    space, how = GOING[case]
+    run, log, settings = with_goals(space, **how)
+    policy = run.plan(THERE_AND_BACK, log, **settings).policy
+    export = write_export(tmp_path, policy, "point")
+    runner, player = Runner(tmp_path, code=export.functions), Player(policy)
+    goals, calls_fail = set(), 0
+    for seed in range(6):
+        plain, fenced = ([told(e(), policy, a, seed) for a in (player, runner)] for e in WORLDS)
+        assert plain[0] == plain[1]
+        assert fenced[0] == fenced[1]
+        goals |= {goal for _, goal, _ in plain[0] + fenced[0]}
+        calls_fail += plain[0] != fenced[0]
+    assert len(goals) > 2
+    assert calls_fail, "the fence changes what is done"
+    is_apart = [options == 1 for _, options in runner.root.selector.entry["groups"]]
+    assert all(is_apart) == (case in ("few goals", "few numbers"))
+
+
+WORLDS = (Point, Fenced)
+
+
+@pytest.mark.parametrize("how", [{"more": True}, {"call_steps": Lengths(2, 5)}])
+def test_a_plan_with_goals_that_guides_is_exported(how: Any, tmp_path: Path) -> None:
+    """A guide says which skill and length, and the selector beside it which goal."""
+    run, log, _ = with_goals("box", **how)
+    skills = run.policy.skills
+    names = tuple(skill.name for skill in skills.skills)
+    planner = Planner(log, THERE_AND_BACK, skills=skills).among(names)
+    choices = gym.spaces.Discrete(skills.choices)
+    guide = planner.bind(Point.observation_space, choices, "guide")
+    policy = HierarchyPolicy(run.policy.selector, skills, ActiveGuide(guide))
+    export = write_export(tmp_path, policy, "point")
+    runner, player, skills_of = Runner(tmp_path, code=export.functions), Player(policy), set()
+    for seed in range(6):
+        for world in WORLDS:
+            a, b = (told(world(), policy, actor, seed) for actor in (player, runner))
+            assert [(skill, action) for skill, _, action in a] == close(b)
+            skills_of |= {skill for skill, _, _ in a}
+    assert len(skills_of) > 1
+
+
+def close(steps: list[Any]) -> list[Any]:
+    """Steps of the skill and the action, which is compared to 1e-5."""
+    return [(skill, pytest.approx(action, abs=1e-5)) for skill, _, action in steps]
+
+
+def test_a_plan_that_must_call_a_skill_that_was_never_called_says_so(tmp_path: Path) -> None:
+    run, log, _ = with_goals("box")
+    rests = log.take(np.flatnonzero(log.skill == 1))
+    with pytest.warns(UserWarning, match="no call of 'go_to'"):
+        policy = run.plan(lambda obs: obs[:, 0] > -5, rests).policy
+    export = write_export(tmp_path, policy, "point")
+    runner = Runner(tmp_path, code=export.functions)
+    obs, _ = Point().reset(seed=0)
+    runner.act(obs)
+    assert runner.root.skill == 1
+    runner.root.may_start = lambda: np.array([True, False])
+    runner.reset()
+    with pytest.raises(ValueError, match=r"skill 'go_to' has goals, but .* gave none"):
+        runner.act(obs)

@@ -15,6 +15,7 @@ from planning.steps import step_to
 import skillweave as sw
 from skillweave.errors import SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
+from skillweave.planning.graph import CallGraph
 from skillweave.selectors import LastCall
 from skillweave.skills.goal_spaces import choice_space, draw_from, from_numbers, numbers_in
 from skillweave.skills.goals import goals_of
@@ -107,6 +108,27 @@ def test_fewer_calls_than_options() -> None:
     assert q[1] > q[0]
     choice, _ = planner.act(planner.start(2), obs)
     assert choice["goal"]["go"][1, 0] == 1
+
+
+def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch: Any) -> None:
+    monkeypatch.setattr("skillweave.planning.graph.MOST_CALLS", 50)
+    log = jumps((0, 10), np.repeat(np.arange(11), 20))
+    obs = np.float32([[2], [7]])
+    aims = []
+    for task in (at(9), at(1)):
+        with pytest.warns(UserWarning, match="the plan uses 50 of them"):
+            planner = bound(Planner(log, task, neighbours=1, gamma=GAMMA), LINE)
+        choice, _ = planner.act(planner.start(2), obs)
+        aims.append(choice["goal"]["go"][:, 0].tolist())
+    assert aims == [[10, 10], [0, 0]]
+
+
+def test_a_logged_goal_has_no_distance_to_itself() -> None:
+    """Not even by rounding, where its numbers are large beside their differences."""
+    log = log_of(["go"], [(0, [(0, [i], True, "end")]) for i in range(40)])
+    log.goals["go"] = np.random.default_rng(0).normal(size=(40, 2))
+    near = CallGraph(log, neighbours=1).near(np.zeros((1, 1), np.float32))
+    assert (near.distance == 0).all()
 
 
 def test_a_goal_that_failed_is_not_repeated_forever() -> None:

@@ -31,7 +31,7 @@ from skillweave.planning import (
     held,
     record_calls,
 )
-from skillweave.planning.neighbours import nearest
+from skillweave.planning.neighbours import nearest, tie_order
 from skillweave.planning.states import LEVELS, PlanningStates
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
@@ -478,6 +478,17 @@ def test_neighbours_are_of_other_calls_each() -> None:
     assert near[:, :3].tolist() == [[1, 3, 4], [5, 3, 0]] or near[1, 2] == 2
     np.testing.assert_allclose(far[0, :3], [0.02, 0.88, 4.88], atol=1e-6)
     assert np.isinf(far[:, 3]).all()
+
+
+def test_of_equally_near_calls_the_same_ones_count() -> None:
+    """However they are searched: an export's runner must find the same ones."""
+    points = np.float32([[x] for x in (2, *[1] * 12, *[0.999_999_9] * 12)])
+    order = tie_order(len(points))
+    found = order[np.isin(order, range(1, 13))][:5]
+    for to in ([[1]], [[1], [0.3], [5]]):
+        near, far = nearest(points, np.float32(to), 5, np.arange(len(points)))
+        assert near[0].tolist() == found.tolist()
+        assert (far[0] == 0).all()
 
 
 def test_a_skill_without_a_call_is_never_called(log: CallLog) -> None:
