@@ -343,9 +343,6 @@ class Hierarchy(Declaration):
         )
         declared, note = (self, "") if flat is not False else evolving(self, evolve)
         content = training.manifest(declared, seed=seed, flat=flat, how=how)
-        begins = _directories(start_from)
-        if begins is None and self._starts is not None and flat is False:
-            begins = self._starts()
         trained = begin(
             declared,
             content | {"recipe": declared.recipe},
@@ -354,10 +351,11 @@ class Hierarchy(Declaration):
             track,
             evolve,
             cluster,
-            begins,
+            _directories(start_from),
             note,
             callback,
             resume=resume,
+            own_start=self._starts if flat is False else None,
         )
         return run_of(trained)
 

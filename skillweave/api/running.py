@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -77,11 +77,13 @@ def begin(
     resume: bool = False,
     base: Base | None = None,
     done: Mapping[str, Any] | None = None,
+    own_start: Callable[[], Directories] | None = None,
 ) -> Trained[D]:
     """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
 
     With ``resume``, continue what is in ``run_dir`` instead, if there is something. With ``base``,
     the stages of the manifest come after stages that are done. ``done``: as for ``training.train``.
+    ``own_start`` makes what a new run starts from where ``start_from`` names nothing.
     """
     _may_train()
     check_callback(callback)
@@ -104,6 +106,8 @@ def begin(
             declared, sentences = prepared(declared, content, run, evolve, track)
             stack.callback(run.close)
             return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
+        if start_from is None and own_start is not None:
+            start_from = own_start()
         learnt, origin = starts(content, start_from, roles)
         first: First = partial(copy_initial_policies, learnt=learnt)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))

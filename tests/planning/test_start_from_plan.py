@@ -96,6 +96,21 @@ def test_a_selector_starts_as_the_plan(planned: Run) -> None:
     assert (q[np.arange(len(q)), chosen] >= 0.95 * q.max(1)).all()
 
 
+def test_only_a_new_run_learns_to_choose_as_the_plan(
+    planned: Run, tmp_path: Path, monkeypatch: Any
+) -> None:
+    declared = planned.with_selector(sw.PPO(**QUICK), steps=128)
+    declared.train(tmp_path / "run", quiet=True)
+
+    def again(*given: Any) -> Any:
+        raise AssertionError("it learnt the plan's choices again")
+
+    monkeypatch.setattr("skillweave.api.planning.imitate", again)
+    assert declared.train(tmp_path / "run", quiet=True, resume=True).policy is not None
+    with pytest.raises(AssertionError, match="again"):
+        declared.train(tmp_path / "other", quiet=True)
+
+
 @pytest.mark.slow
 def test_it_is_trained_and_loaded(planned: Run, tmp_path: Path) -> None:
     declared = planned.with_selector(sw.PPO(**QUICK), steps=400)
