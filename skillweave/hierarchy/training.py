@@ -24,6 +24,7 @@ from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
+from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import part_to_json, rest_to_json
 from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
@@ -231,6 +232,7 @@ def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
     if skill.call_steps is not None:
         entry["call_steps"] = skill.call_steps
     if skill.goal_space is not None:
+        goals_of(skill)  # a space that is not supported is named with its skill
         entry["goal_space"] = space_to_json(skill.goal_space)
     entry |= part_to_json(skill.sees, skill.acts, f"skill {path!r}")
     if skill.acts is not None:

@@ -61,11 +61,16 @@ class Goals:
             self.dtype, self.shape = obs_dtype(space), obs_shape(space)
         except EnvError as error:
             text = str(error).replace("observation space", "goal_space").split(". ")[0]
+            text = f"goal_{text}" if text.startswith("space ") else text
             raise DeclarationError(f"{self._who}: {text}") from error
         self._one = example_of(space)
         self._bytes = self.dtype.fields is not None
         self.size = numbers_in(space)
         """The numbers of a goal."""
+        if not self.size:
+            raise DeclarationError(
+                f"{self._who}: goal_space is {short(space)}, which holds no number: leave it out"
+            )
 
     def start(self, n: int) -> Array:
         """Return the goals of n environments without a call, as a memory stores them."""
@@ -252,7 +257,14 @@ def as_goals(
     if inner is not None and not isinstance(values, np.ndarray):
         given = _parts_given(values, space)
         if given is None:
-            raise kind(f"{who} gave {short(values)}, which are no goals of {space}")
+            what = f"a dict with {', '.join(map(repr, inner))}"
+            if isinstance(space, Tuple):
+                what = f"a tuple of {len(inner)} parts"
+            has = short(list(values)) if isinstance(values, Mapping) else short(values)
+            raise kind(
+                f"{who} gave {has} as goals of {skill}, but {what} was expected: its goals are of "
+                f"{short(space)}"
+            )
         packed = np.zeros(n if rows is None else len(rows), dtype)
         for (name, part), value in zip(inner.items(), given, strict=True):
             whose = f"the part {name!r} of {skill}"

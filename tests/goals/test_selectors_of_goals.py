@@ -375,7 +375,7 @@ def test_a_function_gives_goals_of_a_tuple(tmp_path):
 
 def test_parts_of_goals_that_are_missing_are_said(tmp_path):
     rule = lambda obs: (["go_to"] * len(obs), {"at": obs, "bite": obs})  # noqa: E731
-    with pytest.raises(SkillError, match="which are no goals of Dict"):
+    with pytest.raises(SkillError, match=r"as goals of skill .* a dict with"):
         evaluated(rule, NESTED, tmp_path)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -34,6 +36,43 @@ from skillweave.spaces import obs_dtype
 def test_goals_that_are_wrong(goals, says, tmp_path):
     with pytest.raises(SkillError, match=says):
         declared([go_to(goals=goals)]).train(tmp_path / "run", quiet=True)
+
+
+UNSUPPORTED: dict[str, Any] = {
+    "text": (gym.spaces.Text(4), r"goal_space Text.* is not supported; supported are: Box"),
+    "part": (
+        gym.spaces.Dict(at=SPACES["box"], word=gym.spaces.Text(4)),
+        r"the part word of the goal_space, Text.* is not supported",
+    ),
+    "empty": (gym.spaces.Box(-1, 1, (0,), np.float32), "which holds no number: leave it out"),
+    "no part": (gym.spaces.Dict({}), "needs at least one part"),
+    "names": (gym.spaces.Dict({1: SPACES["box"]}), "each with text as its name"),
+}
+
+
+@pytest.mark.parametrize(("space", "says"), UNSUPPORTED.values(), ids=UNSUPPORTED)
+@pytest.mark.parametrize("learns", [True, False])
+def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns, tmp_path):
+    how: dict[str, Any] = {} if learns else {"policy": lambda self, obs, goal: obs}
+    skill = type("GoTo", (GoTo,), {"goal_space": space, **how})()
+    with pytest.raises(sw.DeclarationError, match=f"skill 'go_to': .*{says}"):
+        declared([skill]).train(tmp_path / "run", quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("space", "goals", "says"),
+    [
+        ("dict", {"to": 0, "side": 1}, r"gave \['to', 'side'\] as goals of skill 'go_to', but"),
+        ("dict", {"at": 0}, "a dict with 'at', 'side' was expected: its goals are of Dict"),
+        ("tuple", (0, 1, 2), "a tuple of 2 parts was expected"),
+    ],
+)
+def test_goals_without_the_right_parts_are_named_with_their_skill(space, goals, says, tmp_path):
+    def choose(obs: Any) -> Any:
+        return np.full(len(obs), "go_to"), goals
+
+    with pytest.raises(SkillError, match=says):
+        declared([go_to(space)], selector=choose).train(tmp_path / "run", quiet=True)
 
 
 def test_a_reward_that_ignores_the_goal_is_said(tmp_path, capsys):
@@ -134,9 +173,9 @@ def test_a_player_keeps_its_own_goal(tmp_path):
     [
         ("picture", np.full((8, 8, 3), 300), "out of goal_space"),
         ("bits", (257, 0), r"gave the goal \[257, 0\], which is out of goal_space MultiBinary"),
-        ("dict", {"at": (0, 0)}, "which are no goals of Dict"),
+        ("dict", {"at": (0, 0)}, "a dict with 'at', 'side' was expected"),
         ("dict", {"at": (0, 5), "side": 1}, "out of goal_space"),
-        ("tuple", ((0, 0),), "which are no goals of Tuple"),
+        ("tuple", ((0, 0),), "a tuple of 2 parts was expected"),
         ("tuple", 3, "gave"),
     ],
 )

@@ -63,15 +63,6 @@ def test_an_export_is_refused(tmp_path):
         run.export(tmp_path / "export")
 
 
-def test_a_mask_that_is_not_used_is_said(tmp_path):
-    def masked() -> Reach:
-        return Reach("dict", info={"action_mask": np.ones(2, bool)})
-
-    spec = replace(on("dict"), env=masked, kwargs={})
-    with pytest.warns(UserWarning, match="its action mask is not used, as actions of Dict"):
-        sw.train_agent(spec, ON, 64, tmp_path / "run", quiet=True)
-
-
 def declared(name: str) -> sw.Hierarchy:
     how: dict[str, Any] = {
         "together": {"learn": "together"},

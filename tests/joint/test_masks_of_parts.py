@@ -14,9 +14,10 @@ from small_runs import assert_same, reports_every, stopped_run
 from torch.distributions import Categorical, Normal
 
 import skillweave as sw
+from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.infos import checked_mask, random_actions
 from skillweave.networks.heads import head_of
-from skillweave.spaces import action_codec, env_form
+from skillweave.spaces import action_codec, env_form, obs_dtype, obs_shape, put_observation
 
 often = reports_every(40)
 SIZES = {"dict": 2, "tuple": 2, "nested": 2 + 6 + 5 + 4, "whole": 3 + 6}
@@ -59,10 +60,6 @@ class Masked(Reach):
 def _numbers(action: Any, space: Any) -> Any:
     """Return the places in a mask of the choices that an action makes."""
     codec = action_codec(space)
-    batch = np.zeros(1, object)
-    batch[0] = action
-    from skillweave.spaces import obs_dtype, obs_shape, put_observation
-
     packed = np.zeros((1, *obs_shape(space)), obs_dtype(space))
     put_observation(space, packed, 0, action)
     return np.cumsum([0, *codec.counts[:-1]]) + codec.choices_in(packed)[0]
@@ -200,3 +197,8 @@ def test_real_numbers_have_no_mask(tmp_path):
     with pytest.raises(sw.DeclarationError, match=r"mask is \[1, 0\], but .* real numbers alone"):
         sw.Player(policy).act(seen, mask=[1, 0])
     assert set(sw.Player(policy).act(seen, info={"action_mask": [1, 0]})) == {"arm"}
+
+    env = Reach(info={"action_mask": np.ones(2, bool)})
+    env.action_space = real
+    with pytest.warns(UserWarning, match="its action mask is not used, .* real numbers alone"):
+        CheckedEnv(env, "reach", 0).reset(seed=0)
