@@ -304,3 +304,20 @@ def test_a_wrapper_starts_episodes_elsewhere(tmp_path):
     sw.evaluate(sw.from_function(note), spec, episodes=4, max_steps=1)
     assert (np.concatenate(seen) > 0.029).all()
     sw.train_agent(spec, SMALL, 16, tmp_path / "run", quiet=True)
+
+
+PARTS = {
+    "text": (
+        Dict(a=Dict(b=Tuple((Discrete(2), Text(3))))),
+        r"part a\.b\.1 of .*, Text.* is not supp",
+    ),
+    "unbounded": (Dict(a=Box(0, 9999, (1,), np.int64)), "part a of .* at most 256 values each"),
+    "nothing": (Dict(a=Discrete(2), b=Box(-1, 1, (0,))), "part b of .* nothing .*: leave it out"),
+    "wide": (Dict(a=Box(-1, 1, (1,), np.longdouble)), "part a of the action space, .* float128"),
+    "all wide": (Box(-1, 1, (1,), np.longdouble), "action space Box.* take float64 there"),
+}
+
+
+@pytest.mark.parametrize(("space", "says"), PARTS.values(), ids=PARTS)
+def test_a_part_of_an_action_that_is_not_supported_is_named(space, says, tmp_path):
+    assert re.search(says, refused(tmp_path, lambda: World(action_space=space)))

@@ -158,7 +158,10 @@ def checked_actions(
     real = np.issubdtype(space.dtype, np.floating)
     if action.dtype.kind not in ("iubf" if real else "iub"):
         wanted = "numbers" if real else "whole numbers"
-        raise kind(f"{who} returned {action.dtype}, but actions of {space} are {wanted}")
+        advice = ""
+        if isinstance(space, Box) and action.dtype.kind == "f":
+            advice = ": round them in a function, numpy.rint(actions).astype(int)"
+        raise kind(f"{who} returned {action.dtype}, but actions of {space} are {wanted}{advice}")
     if isinstance(space, Box):
         if not np.isfinite(action).all():
             raise kind(f"{who} returned a NaN or an infinity as an action of {space}")

@@ -22,9 +22,18 @@ MOST_OF_ALL = 10_000
 network."""
 
 
-def unsupported_action(space: gym.Space[Any]) -> EnvError:
-    """Return the error for an action space that is not supported; it shows a wrapper."""
+def named_action(space: gym.Space[Any], place: str) -> str:
+    """Return the name of an action space, or of its part at ``place``, for messages."""
     shown = " ".join(short(space, 200).split())
+    return f"the part {place} of the action space, {shown}," if place else f"action space {shown}"
+
+
+def unsupported_action(space: gym.Space[Any], place: str = "") -> EnvError:
+    """Return the error for an action space that is not supported; it shows a wrapper.
+
+    Args:
+        place: the names that lead to it, with dots, where it is a part of a Dict or Tuple.
+    """
     what, function = "Let a function make its actions", "gymnasium.spaces.Box(...)"
     supported = ACTIONS
     if all(isinstance(leaf, gym.spaces.Box) for leaf in _leaves(space)):
@@ -37,8 +46,9 @@ def unsupported_action(space: gym.Space[Any]) -> EnvError:
             "gymnasium.spaces.Box(-1.0, 1.0, ...)",
         )
     return EnvError(
-        f"action space {shown} is not supported; supported are: {supported}. {what}: EnvSpec(env, "
-        f"wrappers=(lambda env: gymnasium.wrappers.TransformAction(env, function, {function}),))"
+        f"{named_action(space, place)} is not supported; supported are: {supported}. {what}: "
+        "EnvSpec(env, wrappers=(lambda env: gymnasium.wrappers.TransformAction(env, function, "
+        f"{function}),))"
     )
 
 

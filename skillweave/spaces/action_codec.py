@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import EnvError
-from skillweave.spaces.action_advice import unsupported_action, values_of
+from skillweave.spaces.action_advice import named_action, unsupported_action, values_of
 from skillweave.spaces.packing import check_size, obs_dtype, parts
 from skillweave.types import Array
 
@@ -218,16 +218,23 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     """Return the codec of an action space.
 
     Raises:
-        EnvError: the space is not supported; the message names supported ones.
+        EnvError: the space is not supported; the message names its part, and supported ones.
     """
+    return _codec(space, ())
+
+
+def _codec(space: gym.Space[Any], place: tuple[str, ...]) -> ActionCodec:
+    """Return the codec of an action space, or of its part to which the names ``place`` lead."""
+    where = ".".join(place)
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        return _joint(space)
+        return _joint(space, place)
     kinds = gym.spaces.Discrete | gym.spaces.MultiDiscrete | gym.spaces.MultiBinary | gym.spaces.Box
     if not isinstance(space, kinds):
-        raise unsupported_action(space)
+        raise unsupported_action(space, where)
     check_size(space, "action", _width(space))
     if not _width(space):
-        raise EnvError(f"action space {space} holds nothing to choose")
+        advice = "leave it out" if place else "give it a number, or a choice"
+        raise EnvError(f"{named_action(space, where)} holds nothing to choose: {advice}")
     if isinstance(space, gym.spaces.Discrete):
         return ActionCodec(space, (int(space.n),), _first(space.start))
     if isinstance(space, gym.spaces.MultiDiscrete):
@@ -237,8 +244,13 @@ def action_codec(space: gym.Space[Any]) -> ActionCodec:
     if not np.issubdtype(space.dtype, np.floating):
         counts = values_of(space)
         if counts is None:
-            raise unsupported_action(space)
+            raise unsupported_action(space, where)
         return ActionCodec(space, tuple(counts.tolist()), _first(space.low.reshape(-1)))
+    if space.dtype.itemsize > 8:
+        raise EnvError(
+            f"{named_action(space, where)} is of {space.dtype}, which PyTorch does not have: let "
+            "the environment take float64 there"
+        )
     return ActionCodec(space, (), space.low.reshape(-1), space.high.reshape(-1))
 
 
@@ -250,7 +262,7 @@ def choice_counts(space: gym.Space[Any]) -> tuple[int, ...]:
         return ()
 
 
-def _joint(space: gym.Space[Any]) -> JointCodec:
+def _joint(space: gym.Space[Any], place: tuple[str, ...]) -> JointCodec:
     """Return the codec of a Dict or Tuple.
 
     Raises:
@@ -258,7 +270,7 @@ def _joint(space: gym.Space[Any]) -> JointCodec:
     """
     named = parts(space)
     assert named is not None
-    members = tuple((name, action_codec(part)) for name, part in named.items())
+    members = tuple((name, _codec(part, (*place, name))) for name, part in named.items())
     codec = JointCodec(space, (), members=members)
     check_size(space, "action", _outputs(codec))
     return codec
