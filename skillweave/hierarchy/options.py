@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.messages import short
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import GOAL, SKILL
 from skillweave.skills.goals import as_goals
-from skillweave.spaces import pack, unpack
+from skillweave.spaces import obs_dtype, pack, unpack
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.types import Array
 
@@ -103,10 +105,10 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         goals = None
         if self._player.goals:
             choice = self._choices(actions)
-            self._check(skill := choice[SKILL])
+            skill = self._checked(choice[SKILL])
             goals = self._player.goals_in(choice, self._obs, "OptionsEnv.step")
         else:
-            self._check(skill := np.asarray(actions).reshape(n))
+            skill = self._checked(actions)
         self._player.begin(self._memory, np.arange(n), skill, goals)
         turn = Turn(rng=(Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
@@ -204,17 +206,34 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
     def _choices(self, actions: Any) -> Array:
         """Return skills with goals as choices (N,); no number of a goal changes."""
         space = self.single_action_space
-        choice = pack(space, actions)
-        if not isinstance(actions, np.ndarray):
-            assert isinstance(space, ChoiceSpace)
-            for name, part in space.goal_spaces.items():
-                given, whose = actions[GOAL][name], f"skill {name!r}"
-                goals = as_goals(given, self.num_envs, part, "OptionsEnv.step", whose)
-                choice[GOAL][name] = goals
+        assert isinstance(space, ChoiceSpace)
+        if isinstance(actions, np.ndarray) and actions.dtype.fields is not None:
+            return pack(space, actions)
+        given = actions.get(GOAL) if isinstance(actions, Mapping) else None
+        lacking = set(space.goal_spaces) - set(given if isinstance(given, Mapping) else ())
+        if lacking or SKILL not in actions:
+            raise DeclarationError(
+                f"OptionsEnv.step: actions are {short(actions)}, but skills have goals: give a "
+                "dict with 'skill', a number for each environment, and 'goal', a dict with goals "
+                f"for {', '.join(map(repr, space.goal_spaces))}"
+            )
+        choice = np.zeros(self.num_envs, obs_dtype(space))
+        choice[SKILL] = self._checked(actions[SKILL])
+        for name, part in space.goal_spaces.items():
+            whose = f"skill {name!r}"
+            goals = as_goals(given[name], self.num_envs, part, "OptionsEnv.step", whose)
+            choice[GOAL][name] = goals
         return choice
 
-    def _check(self, skill: Array) -> None:
-        count = self.skills.choices
+    def _checked(self, actions: Any) -> Array:
+        """Return the numbers of skills (N,)."""
+        skill, count = np.asarray(actions), self.skills.choices
+        if skill.size != self.num_envs or skill.dtype.kind not in "iu":
+            raise DeclarationError(
+                f"OptionsEnv.step: the skills are {short(actions)}; they must be a whole number "
+                f"for each of {self.num_envs} environments, from 0 to {count - 1}"
+            )
+        skill = skill.reshape(self.num_envs)
         wrong = skill[(skill < 0) | (skill >= count)]
         if len(wrong):
             raise DeclarationError(f"action {int(wrong[0])} is no skill: there are {count}")
@@ -225,3 +244,4 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 f"skill {name!r} may not start in environment {row}: its initiation() is False "
                 "there; choose among info['action_mask']"
             )
+        return skill

@@ -229,6 +229,28 @@ def test_an_environment_of_options_takes_goals(tmp_path):
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("actions", "says"),
+    [
+        ([0, 1], "but skills have goals: give a dict with 'skill'.* goals for 'go_to'"),
+        ({"skill": [0, 1]}, "a dict with goals for 'go_to'"),
+        ({"goal": {"go_to": np.zeros((2, 2))}}, "give a dict with 'skill'"),
+        ({"skill": [0], "goal": {"go_to": np.zeros((2, 2))}}, r"the skills are \[0\]; .* 2 env"),
+        ({"skill": [0, 2], "goal": {"go_to": np.zeros((2, 2))}}, "action 2 is no skill"),
+        ({"skill": [0, 0.5], "goal": {"go_to": np.zeros((2, 2))}}, "must be a whole number"),
+        (
+            {"skill": [0, 0], "goal": {"go_to": np.zeros((2, 3))}},
+            r"shape \(2, 3\) for skill 'go_to'",
+        ),
+    ],
+)
+def test_an_environment_of_options_says_what_is_wrong(actions, says):
+    env = sw.make_options_env(declared([go_to(), Rest()]).train(quiet=True), 2, 0.9)
+    env.reset(seed=0)
+    with pytest.raises(sw.SkillweaveError, match=says):
+        env.step(actions)
+
+
 def test_an_environment_of_options_does_not_change_goals(tmp_path):
     from skillweave.envs.make import make_engine
 
