@@ -114,6 +114,8 @@ class Runner:
         if space["type"] == "Box":
             low, high = (np.array(wide(space[k]), dtype) for k in ("low", "high"))
             value = np.reshape(value, shape)
+            if np.dtype(dtype).kind in "iu" and value.dtype.kind == "f":
+                value = np.rint(value)
             value = np.clip(value, *(x.reshape(shape) if x.ndim else x for x in (low, high)))
         return np.asarray(value, dtype).reshape(shape)[()]
 

@@ -210,8 +210,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         if isinstance(actions, np.ndarray) and actions.dtype.fields is not None:
             return pack(space, actions)
         given = actions.get(GOAL) if isinstance(actions, Mapping) else None
-        lacking = set(space.goal_spaces) - set(given if isinstance(given, Mapping) else ())
-        if lacking or SKILL not in actions:
+        goals_of: Mapping[str, Any] = given if isinstance(given, Mapping) else {}
+        if set(space.goal_spaces) - set(goals_of) or SKILL not in actions:
             raise DeclarationError(
                 f"OptionsEnv.step: actions are {short(actions)}, but skills have goals: give a "
                 "dict with 'skill', a number for each environment, and 'goal', a dict with goals "
@@ -221,7 +221,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         choice[SKILL] = self._checked(actions[SKILL])
         for name, part in space.goal_spaces.items():
             whose = f"skill {name!r}"
-            goals = as_goals(given[name], self.num_envs, part, "OptionsEnv.step", whose)
+            goals = as_goals(goals_of[name], self.num_envs, part, "OptionsEnv.step", whose)
             choice[GOAL][name] = goals
         return choice
 

@@ -143,6 +143,8 @@ KINDS: dict[str, type[Any]] = {
 class Acts:
     """A policy's output as an action: clipped, then ``number * scale + offset``.
 
+    Whole numbers of a Box are the nearest to these.
+
     ```python
     import skillweave as sw
 

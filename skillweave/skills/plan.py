@@ -703,6 +703,8 @@ class Outputs:
             full = self.template.repeat(len(numbers), axis=0)
             full[:, self.to] = numbers
         full = full.reshape(len(numbers), *space.shape)
+        if np.issubdtype(space.dtype, np.integer):
+            full = np.rint(full)
         return np.minimum(np.maximum(full, space.low), space.high).astype(space.dtype)
 
     def _places(self, acts: Acts, size: int) -> Array:

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Ready, Whole, by_hand, on, reach
 from small_runs import assert_same, reports_every, stopped_run
+from torch import nn
 
 import skillweave as sw
+from skillweave.export.runner import Runner
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import CallLog
 from skillweave.runs.directory import RunDirectory
@@ -159,6 +162,25 @@ def test_a_script_holds_actions_of_several_parts(kind, tmp_path):
     grips = [a["grip"] if kind == "dict" else a[1] for a in played(alone.policy, kind)]
     assert grips[:6] == [g for g in grips[:6:3] for _ in range(3)]
     assert set(grips) == {3, 4}
+
+
+def test_whole_numbers_of_a_policy_from_elsewhere_are_rounded(tmp_path):
+    pytest.importorskip("onnxscript")
+
+    class Near(sw.Skill):
+        policy = sw.from_torch(nn.Linear(3, 2), acts=sw.Acts(scale=3.0, offset=(0.0, 2.5)))
+
+    run = reach([Near()], env=on("whole")).train(tmp_path / "run", quiet=True)
+    actions, env = played(run.policy, "whole"), Reach("whole")
+    export = run.export(tmp_path / "export")
+    runner, (obs, _) = Runner(tmp_path / "export", export.functions), env.reset(seed=0)
+    for action in actions:
+        with torch.no_grad():
+            output = Near.policy.module(torch.from_numpy(obs)).numpy().astype(np.float64)
+        nearest = np.rint(output * 3.0 + [0.0, 2.5]).clip([-1, 0], [1, 5])
+        assert (action.reshape(-1) == nearest).all()
+        assert (runner.act(obs) == action).all()
+        obs, *_ = env.step(action)
 
 
 def test_a_tuple_is_written_by_its_places():
