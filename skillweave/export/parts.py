@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NotRequired, TypedDict
+from typing import Any, Literal, NotRequired, TypedDict
 
 import gymnasium as gym
 
@@ -33,6 +33,8 @@ class PartEntry(TypedDict):
     to: NotRequired[list[Count] | None]
     """These places, each by itself."""
     rest: NotRequired[Any]
+    joined: NotRequired[dict[Literal["policy", "base"], bool]]
+    """Of a skill with goals, which of the two observe observation and goal as one."""
 
 
 def part_entry(

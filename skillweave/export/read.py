@@ -252,7 +252,7 @@ class _Reading:
             case "Model":
                 return self._model(entry, path, goals)
             case "Part":
-                return self._part(entry, path)
+                return self._part(entry, path, goals)
             case "Hierarchy":
                 return self._hierarchy(entry, path, goals)
         raise RunError(
@@ -321,20 +321,21 @@ class _Reading:
                 )
         return bound
 
-    def _part(self, entry: dict[str, Any], path: str) -> Policy:
+    def _part(self, entry: dict[str, Any], path: str, goals: Goals | None = None) -> Policy:
         """Return the policy of a skill with a part of its own, which is kept by its path."""
         fitted: PartEntry = self._fit(PartEntry, entry, path)
+        joined = {"policy": True, "base": True} | fitted.get("joined", {})
         spaces = self.spaces
         try:
             part = part_of(fitted, spaces, f"{self.file}: {path}", self.code)
             if fitted["base"] is not None:
                 self.spaces = part.observation_space, part.action_space
-                base = self._policy(fitted["base"], f"{path}.base")
+                base = self._policy(fitted["base"], f"{path}.base", goals, joined["base"])
                 part = with_base(part, base, fitted.get("residual"))
         except DeclarationError as error:
             raise RunError(str(error)) from error
         self.spaces = part.observation_space, part.action_space
-        policy = self._policy(fitted["policy"], f"{path}.policy")
+        policy = self._policy(fitted["policy"], f"{path}.policy", goals, joined["policy"])
         self.spaces, self.parts[path] = spaces, part
         return policy
 

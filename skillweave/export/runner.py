@@ -370,14 +370,22 @@ class _Part(_Model):  # a policy that sees and writes a part, perhaps as a corre
             runner.obs, runner.feeds = self.own_view()
         try:
             runner.space = entry["action_space"]
-            own = self.policy.act(mask if columns is None else allowed)
+            own = self.acted("policy", mask if columns is None else allowed)
             if self.base:
                 runner.space = entry["part_space"]
                 step = np.reshape(entry["step"], np.shape(own))
-                own = runner.action(self.base.act(None) + step * np.asarray(own, "f8"))
+                own = runner.action(self.acted("base", None) + step * np.asarray(own, "f8"))
         finally:
             runner.obs, runner.feeds, runner.space = before
         return self.whole(own)
+
+    def acted(self, which: str, mask: Any) -> Any:
+        """Return what the policy does, or its base, which see the goal of the call in two ways."""
+        policy, goal = getattr(self, which), self.runner.goal
+        if goal is None:
+            return policy.act(mask)
+        entry = {"joined": self.entry["joined"][which], "inputs": self.entry["inputs"]}
+        return self.runner.seeing(goal, entry, lambda: policy.act(mask))
 
     def own_view(self) -> Any:
         """Return the part of the observation as one array (1, ...), and as inputs of files."""

@@ -150,18 +150,14 @@ class States:
         if space is None:
             return None
         example = example_of(space)
-        # What takes the goal by an input of its own observes what the environment gives; of a
-        # hierarchy only the selector observes both.
-        mapped = isinstance(policy, MappedPolicy) and policy.has_goals
-        beside = mapped or isinstance(policy, HierarchyPolicy)
         return {
             "space": space_to_json(space),
             "dtype": dtype_to_json(obs_dtype(space)),
             "shape": list(obs_shape(space)),
             "example": [_short(part_at(example, path)) for path in leaf_paths(space)],
-            "inputs": [[f"obs.goal{name[3:]}", fields] for name, fields, _ in inputs_of(space)],
+            "inputs": _goal_inputs(space),
             "clip": method("clip_goal", "observations and goals (1, ...) to goals (1, ...)"),
-            "joined": not beside,
+            "joined": skills.part(i) is None and _is_joined(policy),
         }
 
     def _own(self, skills: SkillSet, i: int, name: str) -> dict[str, Any]:
@@ -177,18 +173,18 @@ class States:
                     "correct one of its skills instead"
                 )
             base = self.policy(part.base, f"{name}.base")
-        if skills.skills[i].goal_space is not None:
-            raise PolicyError(
-                f"skill {name!r} has goals and a part of its own (sees, acts, Residual), which no "
-                "runner follows yet: leave out one of them"
-            )
 
         def name_of(function: Any) -> str:
             plain = written_name(function).rpartition(":")[2]
             what = "observations (1, ...) to numbers (1, ...)"
             return self._asks(f"{name}.{plain}", function, what)
 
-        return part_entry(part, entry, base, name_of)
+        whole = part_entry(part, entry, base, name_of)
+        if (space := skills.skills[i].goal_space) is not None:
+            both = {"policy": skills.policies[i], "base": part.base}
+            whole["joined"] = {which: _is_joined(one) for which, one in both.items()}
+            whole["inputs"] = _goal_inputs(space)
+        return whole
 
     def _reflex(self, reflex: Reflex, prefix: str) -> list[Any]:
         name = f"{prefix}{reflex.name}"
@@ -349,6 +345,20 @@ class States:
         self.functions[free] = function
         self.code[free] = what
         return free
+
+
+def _is_joined(policy: Policy | None) -> bool:
+    """Return whether the policy of a skill with goals observes observation and goal as one.
+
+    What takes the goal by an input of its own does not; of a hierarchy only the selector does.
+    """
+    mapped = isinstance(policy, MappedPolicy) and policy.has_goals
+    return not mapped and not isinstance(policy, HierarchyPolicy)
+
+
+def _goal_inputs(space: gym.Space[Any]) -> list[list[Any]]:
+    """Return the inputs of files that a goal is: names, and fields in the goal."""
+    return [[f"obs.goal{name[3:]}", fields] for name, fields, _ in inputs_of(space)]
 
 
 def _short(numbers: Array) -> Any:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from crane import Arm, Crane, Hook, crane
+from crane import ON, Arm, Crane, Hook, crane
 from torch import nn
 
 import skillweave as sw
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.export.runner import Runner
+from skillweave.export.write import write_export
+from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.skills.mapping import Part
 
 pytest.importorskip("onnxscript")
@@ -145,18 +151,132 @@ def test_corrections(name, acts, tmp_path):
     compare(run.policy, tmp_path / "out", export.functions)
 
 
+ARM: Any = gym.spaces.Box(-1, 1, (2,), np.float32)
+AIM: Any = gym.spaces.Dict({"at": ARM, "high": gym.spaces.Discrete(2)})
+
+
+class Reach(Arm):
+    """Brings the arm to its goal."""
+
+    goal_space = ARM
+
+    def reward(self, step):
+        return -np.abs(step.next_obs["arm"] - aim_of(step.goal)).sum(axis=1)
+
+    def termination(self, step):
+        return np.abs(step.next_obs["arm"] - aim_of(step.goal)).max(axis=1) < 0.1
+
+
+def aim_of(goal: Any) -> Any:
+    return goal["at"] if goal.dtype.fields else goal
+
+
+def to_the_goal(obs: Any, goal: Any) -> Any:
+    arm = obs["arm"] if obs.dtype.fields else obs
+    return np.clip(3 * (aim_of(goal) - arm), -1, 1)
+
+
+def wide(obs: Any, goal: Any) -> Any:
+    return np.concatenate([to_the_goal(obs, goal), -0.5 * obs["hook"]], axis=1)
+
+
+def there_and_up(obs: Any, *, skill: str = "reach") -> Any:
+    """A selector: a goal that depends on the observation, now and then the hook."""
+    names = np.where(obs["camera"][:, 0, 0, 0] // 4 % 3 < 2, skill, "hook")
+    return names, {skill: np.tanh(obs["hook"] + obs["arm"][:, ::-1])}
+
+
+def in_parts(obs: Any) -> Any:
+    names, goals = there_and_up(obs)
+    high = (obs["hook"][:, 0] > 0).astype(int)
+    return names, {"reach": {"at": goals["reach"].astype(np.float32), "high": high}}
+
+
+def clipped(skill: Any, obs: Any, goal: Any) -> Any:
+    return goal.clip(-0.2, 0.2)
+
+
+def reach(**attributes: Any) -> sw.Skill:
+    return type("Reach", (Reach,), attributes)()
+
+
+def linear(inputs: int, outputs: int) -> Any:
+    torch.manual_seed(0)
+    return nn.Linear(inputs, outputs)
+
+
+def trained() -> Any:
+    """The policy of a skill with a goal that was trained before: it sees both as one."""
+    run = crane([reach(), Hook()], steps=130).train(quiet=True)
+    return run.policy.skills.policies[0]
+
+
+def far(selector: Any, rest: Any) -> sw.Skill:
+    """A hierarchy with a goal, of a skill with a goal and a part."""
+    how = {"selector": selector, "rest": rest, "call_steps": 2, "selection": GREEDY}
+    inner = crane([reach(), Hook()], name="inner", **how)
+    return reach(name="far", policy=inner, sees=None, acts=None, max_steps=5)
+
+
+def passes_on(obs: Any) -> Any:
+    goals = (obs["goal"] + np.tanh(obs["observation"]["hook"])) / 2
+    return np.full(len(obs), "reach"), goals
+
+
+TWO = {"picture": "camera", "arm": "arm"}
+OF_TWO = sw.from_torch(linear(4, 2), sees=(0, sw.Goal(), 1))
+OF_ALL = sw.from_torch(linear(4, 3), sees=(0, sw.Goal(), 1))
+FIXED = (0.0, 0.5, "hold")
+RULE, LEARNT = there_and_up, ON
+WITH_GOALS: dict[str, Any] = {
+    "learnt": (LEARNT, "hold", lambda: reach()),
+    "corrected": (LEARNT, FIXED, lambda: reach(policy=sw.Residual(to_the_goal, 0.5))),
+    "nested": (LEARNT, "hold", lambda: far(ON, "hold")),
+    "nested, by a rule": (RULE, FIXED, lambda: far(passes_on, FIXED)),
+    "two inputs": (RULE, FIXED, lambda: reach(sees=TWO, goal_space=AIM)),
+    "sees all": (LEARNT, FIXED, lambda: reach(sees=None)),
+    "writes all": (RULE, "hold", lambda: reach(acts=None, policy=OF_ALL)),
+    "function": (LEARNT, "hold", lambda: reach(policy=to_the_goal)),
+    "from elsewhere": (RULE, FIXED, lambda: reach(policy=OF_TWO)),
+    "parts": (LEARNT, FIXED, lambda: reach(policy=sw.Residual(to_the_goal, 0.5), goal_space=AIM)),
+    "a module": (LEARNT, "hold", lambda: reach(policy=sw.Residual(OF_TWO, 0.5))),
+    "a network": (RULE, "hold", lambda: reach(policy=sw.Residual(trained(), 0.5))),
+    "whole": (RULE, "zero", lambda: reach(sees=None, acts=None, policy=sw.Residual(wide, 0.5))),
+    "clipped": (RULE, FIXED, lambda: reach(clip_goal=clipped)),
+}
+
+
+def louder(policy: Any) -> Any:
+    """The policy with larger outputs: those of a network that has hardly learnt are about zero."""
+    if isinstance(policy, AgentPolicy):
+        last = "actor.1.weight"
+        return AgentPolicy(policy.algorithm, policy.weights | {last: 150 * policy.weights[last]})
+    if not isinstance(policy, HierarchyPolicy):
+        return policy
+    below = replace(policy.skills, policies=tuple(map(louder, policy.skills.policies)))
+    return HierarchyPolicy(louder(policy.selector), below, None, policy.player.own_goals)
+
+
+@pytest.mark.fast_cases(4)
+@pytest.mark.parametrize("case", WITH_GOALS)
+def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
+    selector, rest, make = WITH_GOALS[case]
+    skill = make()
+    if selector is RULE:
+        selector = in_parts if skill.goal_space is AIM else partial(there_and_up, skill=skill.name)
+    how = {"selector": selector, "rest": rest, "steps": 130, "selection": GREEDY}
+    policy = louder(crane([skill, Hook()], **how).train(seed=0, quiet=True).policy)
+    export = write_export(tmp_path / "out", policy, "crane")
+    compare(policy, tmp_path / "out", export.functions)
+    runner, env, goals = Runner(tmp_path / "out", export.functions), Crane(), set()
+    obs, _ = env.reset(seed=3)
+    for _ in range(20):
+        obs, *_ = env.step(runner.act(obs))
+        goals.add(str(runner.root.goal))
+    assert len(goals) > 2
+
+
 def test_what_the_runner_does_not_follow_says_so(tmp_path):
-    import gymnasium as gym
-
-    class Sideways(Arm):
-        goal_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-
-        def reward(self, step):
-            return -np.abs(step.next_obs["arm"] - step.goal).sum(axis=1)
-
-    run = crane([Sideways(), Hook()], steps=130).train(quiet=True)
-    with pytest.raises(sw.PolicyError, match=r"skill 'sideways' has goals"):
-        run.export(tmp_path / "goals")
     ready = crane(steps=130).train(quiet=True).policy
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(ready)})()
     run = crane([skill], steps=130).train(quiet=True)
