@@ -160,15 +160,25 @@ class Player:
             info=batched_infos([dict(info)]),
         )
 
+    def _misfit(self, obs: Any, error: Exception) -> str:
+        """Return the reason why an observation does not fit, for messages."""
+        if isinstance(error, KeyError):
+            return f"it has no part {error}"
+        if not isinstance(obs, np.ndarray):
+            return str(error)
+        if parts(self._space) is not None:
+            return f"it is an array of shape {obs.shape}"
+        several = obs.shape[1:] == self._shape
+        return f"{error}{'; give one, without an axis of environments' if several else ''}"
+
     def _seen(self, obs: Any) -> Array:
         """Return one observation as a batch of one."""
         batch = np.empty((1, *self._shape), self._dtype)
         try:
             put_observation(self._space, batch, 0, obs)
         except (TypeError, ValueError, KeyError, IndexError) as error:
-            several = isinstance(obs, np.ndarray) and obs.shape[1:] == self._shape
             raise DeclarationError(
-                f"act() was given an observation that does not fit {self._space}: {error}"
-                + ("; give one observation, without an axis of environments" if several else "")
+                f"act() was given an observation that does not fit {self._space}: "
+                + self._misfit(obs, error)
             ) from error
         return batch

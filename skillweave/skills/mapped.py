@@ -11,13 +11,15 @@ from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Dict, Tuple
+from gymnasium.spaces import Box, Dict, Tuple
 
 from skillweave.errors import DeclarationError, PolicyError, RunError
+from skillweave.messages import short
+from skillweave.notices import notice
 from skillweave.skills.foreign_policy import SEES, Foreign
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal, without_goal
 from skillweave.skills.goals import Goals
-from skillweave.skills.mapping import PolicyMapping
+from skillweave.skills.mapping import Goal, PolicyMapping
 from skillweave.skills.plan import Plan, Shapes
 from skillweave.types import Array, Memory
 
@@ -108,10 +110,30 @@ class MappedPolicy(Foreign):
         bound = super().bind(observation_space, action_space, who)
         if not self.takes_goal:
             raise PolicyError(f"{bound._who} takes no goal, but its skill has goals: {self.advice}")
+        bound._check_range(goals)
         bound._goals = goals
         bound.observation_space = with_goal(bound.observation_space, goals.space)
         bound.fit_mapping()
         return bound
+
+    def _check_range(self, goals: Goals) -> None:
+        """Give a notice where the skill has goals beyond the range of the policy's ``Goal``."""
+        if not isinstance(goals.space, Box):
+            return
+        lowest, highest = goals.space.low.reshape(-1), goals.space.high.reshape(-1)
+        for place in self.mapping.sources():
+            if not isinstance(place, Goal):
+                continue
+            low = -np.inf if place.low is None else np.array(place.low)
+            high = np.inf if place.high is None else np.array(place.high)
+            fits = {np.size(low), np.size(high)} <= {1, len(lowest)}  # else refused later
+            if fits and ((lowest < low - 1e-6).any() or (highest > high + 1e-6).any()):
+                notice(
+                    f"{self._who}: goal_space is {short(goals.space, 200)}, but Goal.low is "
+                    f"{short(place.low)} and Goal.high {short(place.high)}, the range for which "
+                    "the policy was made. It gets other goals clipped, and step.goal has them as "
+                    "they are: give goal_space that range"
+                )
 
     @property
     def has_goals(self) -> bool:

@@ -112,6 +112,14 @@ def test_a_player_takes_a_goal(tmp_path):
         run.player(skill="go_to", goal=(0.5,))
     with pytest.raises(DeclarationError, match=r"does not fit Box.*without an axis"):
         player.act(np.zeros((1, 2), np.float32))
+    room = sw.Hierarchy(lambda: Point(as_dict=True), [Rest()], selector=lambda obs: [0] * len(obs))
+    player = room.train(tmp_path / "dict", quiet=True).player()
+    with pytest.raises(DeclarationError, match=r"does not fit Dict.*: it has no part 'picture'$"):
+        player.act({"place": ZERO})
+    with pytest.raises(
+        DeclarationError, match=r"does not fit Dict.*: it is an array of shape \(2,"
+    ):
+        player.act(ZERO)
     with pytest.raises(DeclarationError, match="policy that takes none: name a skill"):
         run.player(goal=(0, 0))
 
@@ -185,6 +193,22 @@ def test_a_player_says_which_goal_is_wrong(space, goal, says, tmp_path):
     )
     with pytest.raises(SkillError, match=says):
         run.player(skill="go_to", goal=goal)
+
+
+def test_goals_beyond_the_range_of_a_policy_are_said(recwarn, tmp_path):
+    def said(**bounds):
+        class Steered(Rest):
+            name = "go_to"
+            goal_space = SPACES["box"]  # from -1 to 1
+            policy = sw.from_torch(torch.nn.Linear(4, 2), sees=(0, 1, sw.Goal(**bounds)))
+
+        recwarn.clear()
+        declared([Steered()]).train(tmp_path / str(bounds), quiet=True)
+        return [str(w.message) for w in recwarn if "Goal.low" in str(w.message)]
+
+    assert said() == said(low=-1, high=(1, 2)) == []
+    assert "skill 'go_to'" in said(low=-0.5)[0]
+    assert "Goal.high (1.0, 0.5)" in said(low=-1, high=(1, 0.5))[0]
 
 
 def test_policies_from_elsewhere_take_the_goal(tmp_path):
