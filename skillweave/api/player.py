@@ -13,6 +13,7 @@ from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
 from skillweave.messages import short
 from skillweave.spaces import choice_counts, env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces.packing import parts
 from skillweave.types import Array, Memory, Policy, Step
 
 

@@ -62,10 +62,13 @@ class ActionCodec:
         assert self.low is not None
         low, span, bounded = self.span
         # A diverged network returns NaN; it acts with 0 until training reports it.
-        action = np.nan_to_num(action)
-        scaled = action.astype(np.result_type(action, low))
-        scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
-        return self._shaped(scaled.astype(self.space.dtype).clip(self.low, self.high))
+        action = action if np.isfinite(action).all() else np.nan_to_num(action)
+        if self._is_bounded:
+            scaled = low + 0.5 * (action + 1.0) * span
+        else:
+            scaled = action.astype(np.result_type(action, low))
+            scaled[:, bounded] = low[bounded] + 0.5 * (action[:, bounded] + 1.0) * span[bounded]
+        return self._shaped(scaled.astype(self.space.dtype, copy=False).clip(self.low, self.high))
 
     def from_env(self, action: Array) -> Array:
         """Convert the environment's actions to policy units, clipped to the bounds of a Box."""
@@ -114,6 +117,10 @@ class ActionCodec:
     def _shaped(self, action: Array) -> Array:
         shaped = action.reshape(len(action), *(self.space.shape or ()))
         return shaped.astype(self.space.dtype, copy=False)
+
+    @cached_property
+    def _is_bounded(self) -> bool:
+        return bool(self.span[2].all())
 
     @cached_property
     def span(self) -> tuple[Array, Array, Array]:

@@ -171,6 +171,8 @@ class ObsCodec:
             The vector float32 (*lead, size); each image (*lead, C, H, W) in its own dtype.
         """
         if isinstance(obs, Tensor):
+            if self._is_one_vector:
+                return obs.view(torch.float32), ()
             lead = obs.shape[: obs.ndim - len(self.item)]
             raw: Sequence[Tensor] = [leaf.read(obs) for leaf in self.leaves]
         else:
@@ -187,6 +189,17 @@ class ObsCodec:
             return vectors[0], tuple(images)
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
+
+    @cached_property
+    def _is_one_vector(self) -> bool:
+        """The bytes of an observation are float32 numbers in the vector's order."""
+        at = 0
+        for leaf in self.leaves:
+            plain = leaf.image is None and not leaf.choices and leaf.dtype == torch.float32
+            if not plain or leaf.place is None or leaf.place.start != at:
+                return False
+            at = leaf.place.stop
+        return self.item == (at,)
 
     @property
     def may_be_wrong(self) -> bool:

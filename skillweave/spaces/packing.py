@@ -135,7 +135,7 @@ def pack(space: gym.Space[Any], batched: Any) -> Array:
 
     An array is returned unchanged.
     """
-    if parts(space) is None or isinstance(batched, np.ndarray):
+    if isinstance(batched, np.ndarray) or parts(space) is None:
         return np.asarray(batched)
     # Zeros, because the bytes between parts are written to files, which must be reproducible.
     packed = np.zeros(_lead(space, batched), obs_dtype(space))
