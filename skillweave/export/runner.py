@@ -112,11 +112,10 @@ class Runner:
             shape = space["n"]
             dtype = "int8"
         if space["type"] == "Box":
-            low, high = (np.array(wide(space[k]), dtype) for k in ("low", "high"))
             value = np.reshape(value, shape)
             if np.dtype(dtype).kind in "iu" and value.dtype.kind == "f":
                 value = np.rint(value)
-            value = np.clip(value, *(x.reshape(shape) if x.ndim else x for x in (low, high)))
+            value = np.clip(value, *bounds(space, dtype))
         return np.asarray(value, dtype).reshape(shape)[()]
 
 
@@ -137,8 +136,11 @@ def leaves(goal: Any) -> list[Any]:
 def filled(goal: Any, value: Any) -> Any:
     """Return a goal (1, ...) after a value, or one for each of its parts, was written into it."""
     if (names := goal.dtype.names) is not None:
-        for i, name in enumerate(names):
-            filled(goal[name], value[i if isinstance(value, tuple | list) else name])
+        parts = value
+        if isinstance(value, tuple | list):
+            parts = dict(zip(names, value, strict=True))
+        for name in names:
+            filled(goal[name], parts[name])
         return goal
     goal[...] = value = np.reshape(value, goal.shape)
     if goal.dtype.kind in "iub" and (goal != value).any():
@@ -152,8 +154,7 @@ def inside(goal: Any, space: Any) -> bool:
         parts = [x[1] if space["type"] == "Dict" else x for x in space["spaces"]]
         return all(inside(goal[name], part) for name, part in zip(names, parts, strict=True))
     if space["type"] == "Box":
-        low, high = (np.array(wide(space[k]), goal.dtype) for k in ("low", "high"))
-        low, high = (x.reshape(space["shape"]) if x.ndim else x for x in (low, high))
+        low, high = bounds(space, goal.dtype)
         finite = goal.dtype.kind != "f" or np.isfinite(goal).all()
         return bool(finite and (goal >= low).all() and (goal <= high).all())
     count = 2 if space["type"] == "MultiBinary" else np.array(space.get("nvec", space.get("n")))
@@ -161,9 +162,10 @@ def inside(goal: Any, space: Any) -> bool:
     return bool(((goal >= 0) & (goal < count)).all())
 
 
-def wide(bounds: Any) -> Any:
-    """Return bounds as numbers: infinities are texts in JSON."""
-    return [float(x) for x in bounds] if isinstance(bounds, list) else float(bounds)
+def bounds(space: Any, dtype: Any) -> list[Any]:
+    """Return the lowest and the highest numbers of a Box: infinities are texts in JSON."""
+    both = (np.array(space[k], "f8").astype(dtype) for k in ("low", "high"))
+    return [x.reshape(space["shape"]) if x.ndim else x for x in both]
 
 
 def opened(path: Path) -> Any:
@@ -480,7 +482,11 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         may = may.repeat(lengths * len(self.skills) // len(may))  # a plan has chosen the length
         if not may.any():
             raise ValueError(f"no skill may start in observation {self.runner.obs[0]}")
-        return self.parted(self.selector.act(may[None], self))
+        choice, goals = self.parted(self.selector.act(may[None], self))
+        if not any(choice == i for i in np.flatnonzero(may)):
+            names = [self.skills[i // lengths]["name"] for i in np.flatnonzero(may)]
+            raise ValueError(f"the selector chose {choice}; it may choose {', '.join(names)}")
+        return choice, goals
 
     def worth(self) -> Any:
         """Return the values of skills and of a new decision; a critic sees the call's goal."""
@@ -519,10 +525,14 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
             return None
         if value is None:
             raise ValueError(f"skill {skill['name']!r} has goals, but the selector gave none")
-        goal = filled(blank(entry), value)
-        if entry["clip"]:
-            clip = self.runner.code[entry["clip"]]
-            goal = filled(blank(entry), clip(self.runner.obs, goal))
+        try:
+            goal = filled(blank(entry), value)
+            if entry["clip"]:
+                value = self.runner.code[entry["clip"]](self.runner.obs, goal)
+                goal = filled(blank(entry), value)
+        except (KeyError, TypeError, ValueError) as error:
+            whose = f"skill {skill['name']!r} has goals of {entry['space']}, but was given"
+            raise ValueError(f"{whose} {value!r}: {error}") from error
         if not inside(goal, entry["space"]):
             raise ValueError(f"the goal {goal[0]} of skill {skill['name']!r} is out of its space")
         return goal
@@ -558,9 +568,13 @@ class _Function(_Code):  # a selector: observations, perhaps how the last call e
         chosen = self.runner.code[self.entry["code"]](self.runner.obs, *more)
         chosen, goals = chosen if isinstance(chosen, tuple) and has_goals else (chosen, {})
         names, chosen = self.entry["names"], np.asarray(chosen)[0]
-        if not isinstance(goals, dict) or (goals and not set(goals) & set(names)):
-            goals = {has_goals[0]: goals}  # of the only skill that has some
-        number = names.index(chosen) if isinstance(chosen, str) else chosen
+        by_skill = isinstance(goals, dict) and (not goals or set(goals) & set(names))
+        if len(has_goals) == 1 and not by_skill:
+            goals = {has_goals[0]: goals}
+        elif not by_skill or not set(goals) <= set(has_goals):
+            raise ValueError(f"the selector gave the goals {goals!r}: give {{skill: goals}}, "
+                             f"of skills with goals: {', '.join(has_goals)}")  # fmt: skip
+        number = names.index(chosen) if isinstance(chosen, str) and chosen in names else chosen
         return number, {names.index(name): goal for name, goal in goals.items()}
 
     def allowed(self, mask: Any, last: Any) -> Any:
@@ -572,7 +586,8 @@ class _Automaton(_Code):  # a selector: skills of each state, best first; transi
         self.state = self.entry["start"]
 
     def act(self, mask: Any, last: Any = None) -> Any:
-        chosen = next(skill for skill in self.entry["skills"][self.state] if mask[0, skill])
+        skills = self.entry["skills"][self.state]
+        chosen = next((skill for skill in skills if mask[0, skill]), None)
         code, obs = self.runner.code, self.runner.obs
         goals = {skill: fixed if name is None else code[name](obs)
                  for state, skill, fixed, name in self.entry["goals"]

@@ -300,17 +300,56 @@ def test_the_range_of_goals_is_in_the_file(tmp_path: Path) -> None:
         sw.load_policy(tmp_path, code=export.functions)
 
 
+def chosen(name: Any, *goals: Any) -> Any:
+    """A selector that always returns these."""
+    return lambda obs: (np.full(len(obs), name), *goals) if goals else np.full(len(obs), name)
+
+
+AT = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
+
+
 @pytest.mark.parametrize(
-    ("returned", "says"),
+    ("space", "returned", "says"),
     [
-        (lambda obs: np.full(len(obs), "go_to"), "has goals, but the selector gave none"),
-        (lambda obs: (np.full(len(obs), "go_to"), np.full((1, 2), 3.0)), "is out of its space"),
-        (lambda obs: (np.full(len(obs), "go_to"), np.full((1, 2), np.nan)), "is out of its space"),
+        ("box", chosen("go_to"), "'go_to' has goals, but the selector gave none"),
+        ("box", chosen("go_to", np.full((1, 2), 3.0)), "is out of its space"),
+        ("box", chosen("go_to", np.full((1, 2), np.nan)), "is out of its space"),
+        ("box", chosen("go_to", np.zeros((1, 3))), r"'go_to' has goals of .*Box.*: cannot reshape"),
+        ("box", chosen("go_to", [["a", "b"]]), r"'go_to' has goals of .* could not convert"),
+        ("box", chosen("go_to", {"go": np.zeros((1, 2))}), r"'go_to' has goals of .* given {'go'"),
+        ("box", chosen("go_to", {"rest": 1, "go_to": 2}), r"{skill: goals}, .* goals: go_to"),
+        ("box", chosen("goto", np.zeros((1, 2))), "the selector chose goto; it may .* go_to, rest"),
+        ("box", chosen(-1), "the selector chose -1; it may choose go_to, rest"),
+        ("number", chosen("go_to", np.full(1, 2.5)), "2.5 is not of int64"),
+        ("dict", chosen("go_to", {"at": AT["at"]}), r"'go_to' has goals of .* 'side'"),
+        ("dict", chosen("go_to", {**AT, "side": np.full(1, 2)}), "is out of its space"),
+        ("tuple", chosen("go_to", [AT["at"]]), r"'go_to' has goals of .*shorter"),
+        ("tuple", chosen("go_to", [*AT.values(), 1]), r"'go_to' has goals of .*longer"),
     ],
 )
-def test_wrong_goals_are_said_by_the_runner(returned: Any, says: str, tmp_path: Path) -> None:
-    env, policy = made(Walk, selector=far)
+def test_wrong_goals_are_said_by_the_runner(
+    space: str, returned: Any, says: str, tmp_path: Path
+) -> None:
+    still = np.zeros(2, np.float32)
+    walk = go_to(space, policy=lambda self, obs, goal: np.repeat(still[None], len(obs), 0))
+    env, policy = made(walk, Rest, selector=lambda obs: np.full(len(obs), "rest"))
     export = write_export(tmp_path, policy, "point")
     functions = export.functions | {"selector": returned}
     with pytest.raises(ValueError, match=says):
+        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
+
+
+def test_goals_of_two_skills_are_given_by_name(tmp_path: Path) -> None:
+    env, policy = made(go_to(), Side(), selector=each)
+    export = write_export(tmp_path, policy, "point")
+    functions = export.functions | {"selector": lambda obs, last: chosen("go_to", -obs / 2)(obs)}
+    with pytest.raises(ValueError, match=r"give {skill: goals}, of skills with goals: go_to, side"):
+        Runner(tmp_path, functions).act(env.reset(seed=0)[0])
+
+
+def test_a_clipped_goal_of_another_shape_is_said(tmp_path: Path) -> None:
+    env, policy = made(Reaching, selector=far)
+    export = write_export(tmp_path, policy, "point")
+    functions = export.functions | {"go_to.clip_goal": lambda obs, goal: goal[:, :1]}
+    with pytest.raises(ValueError, match=r"'go_to' has goals of .*Box.*: cannot reshape"):
         Runner(tmp_path, functions).act(env.reset(seed=0)[0])
