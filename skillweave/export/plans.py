@@ -58,6 +58,8 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
             features.append(None)
             continue
         what = "observations (1, ...) to features (1, F)"
+        if each.places is not None:
+            what = f"observations (1, ...) to their flat numbers at {each.places}, (1, F)"
         features.append(asks(f"{name}.features.{graph.log.skills[i]}", each.raw, what))
     groups = graph.groups
     arrays["usual"] = np.array([group.usual for _, group in groups], np.float32)

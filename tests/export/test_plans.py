@@ -157,7 +157,7 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
         exported(planner)
     planner = Planner(logs[False], at_four, features=lambda obs: np.stack([obs[:, PLACE] ** 2], 1))
     export = exported(planner)
-    assert "selector.features.wait" in export.code
+    assert export.code["selector.features.wait"] == "observations (1, ...) to features (1, F)"
     played(Noisy(), Runner(tmp_path, code=export.functions), 1)
 
 

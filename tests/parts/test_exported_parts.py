@@ -276,6 +276,29 @@ def test_skills_with_goals_and_parts(case: str, tmp_path: Any) -> None:
     assert len(goals) > 2
 
 
+def test_a_plan_of_skills_with_goals_and_parts(tmp_path: Any) -> None:
+    """Skill, goal and action are the policy's, where observations are a Dict."""
+    skill = reach(policy=sw.Residual(to_the_goal, 0.5))
+    how = {"rest": FIXED, "steps": 130, "selection": GREEDY}
+    run = crane([skill, Hook()], **how).train(seed=0, quiet=True)
+    log = run.log_calls(1_000, num_envs=4)
+    planned = run.plan(lambda obs: (obs["arm"] > 0.3).all(1), log, features=[0, 1, 2])
+    export = planned.export(tmp_path / "out")
+    what = export.code["selector.features.reach"]
+    assert what == "observations (1, ...) to their flat numbers at [0, 1, 2], (1, F)"
+    runner, player, env = Runner(tmp_path / "out", export.functions), planned.player(), Crane()
+    goals = set()
+    for seed in range(3):
+        obs, _ = env.reset(seed=seed)
+        player.reset(), runner.reset()
+        for _ in range(20):
+            action = player.act(obs)
+            np.testing.assert_allclose(runner.act(obs), action, atol=1e-5)
+            goals.add(str(runner.root.goal))
+            obs, *_ = env.step(action)
+    assert len(goals) > 5
+
+
 def test_what_the_runner_does_not_follow_says_so(tmp_path):
     ready = crane(steps=130).train(quiet=True).policy
     skill = type("Better", (sw.Skill,), {"policy": sw.Residual(ready)})()
