@@ -16,6 +16,8 @@ from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import RunError, SkillweaveError
+from skillweave.networks.config import Network
+from skillweave.networks.net import seen_places
 from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless
@@ -37,6 +39,15 @@ class AgentPolicy(Memoryless):
     def of(cls, algorithm: Algorithm, state: Any, member: int = 0) -> AgentPolicy:
         """Return the policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
+
+    @property
+    def seen_places(self) -> tuple[int, ...] | None:
+        """The places in the flat observation that its network sees; None: all."""
+        network = getattr(self.algorithm.config, "network", None)
+        if getattr(network, "sees", None) is None:
+            return None
+        assert isinstance(network, Network)
+        return seen_places(network, self.algorithm.obs)
 
     def start(self, n: int) -> Memory:
         """Return the initial recurrent state, zeros (n, M); empty if the network has none."""

@@ -21,7 +21,7 @@ from skillweave.planning.skill_code import code_of
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
-from skillweave.spaces import same_space
+from skillweave.spaces import obs_codec, same_space
 from skillweave.types import Array
 
 LEARNING = "learning"
@@ -308,13 +308,21 @@ def _alike(now: str, then: str) -> bool:
 
 
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
-    """Return the places that each skill's network sees; None: all, or the policy is no network."""
-    networks = (
-        getattr(getattr(getattr(p, "algorithm", None), "config", None), "network", None)
-        for p in skills.policies
-    )
-    places = (getattr(network, "sees", None) for network in networks)
-    return tuple(None if p is None else tuple(p) for p in places)
+    """Return the places of the environment's observation that each skill's network sees.
+
+    None: all, or the policy is no network, or the skill has a part of observations of its own.
+    """
+    found: list[tuple[int, ...] | None] = []
+    for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
+        part, places = skills.part(i), getattr(policy, "seen_places", None)
+        if places is None or (part is not None and part.inputs is not None):
+            found.append(None)
+            continue
+        if skill.goal_space is not None:  # goals come after the observation
+            size = obs_codec(without_goal(policy.observation_space)).size
+            places = tuple(place for place in places if place < size)
+        found.append(places or None)
+    return tuple(found)
 
 
 def columns_of(log: CallLog) -> Mapping[str, Array]:

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.test_calls_of_goals import ready
-from goals.worlds import SPACES, Rest, declared, go_to
+from goals.worlds import SPACES, Point, Rest, declared, go_to, place_of
 from planning.logs import log_of
 from planning.steps import step_to
 
@@ -296,3 +296,28 @@ def test_a_task_knows_no_goal(task: Any) -> None:
     if callable(task):
         with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the pred"):
             log.hand_over(done={"go_to": task})
+
+
+@pytest.mark.parametrize(
+    ("as_dict", "sees"), [(False, (1, 0, "goal")), (True, ("observation.place", "goal"))]
+)
+def test_calls_are_compared_by_the_numbers_of_the_observation_that_a_network_sees(
+    as_dict: bool, sees: Any
+) -> None:
+    algorithm = sw.PPO(num_envs=4, n_steps=16, network=sw.Network((8,), sees=sees))
+    env = sw.EnvSpec(lambda: Point(as_dict=as_dict), engine="sync", workers=1)
+    run = declared([go_to(algorithm=algorithm), Rest()], env=env, steps=64).train(quiet=True)
+    log = run.log_calls(200)
+    assert log.sees == ((0, 1) if as_dict else (1, 0), None)
+    there = Predicate(lambda obs: place_of(obs)[:, 0] > 0.4, "there", "obs")
+    planned = run.plan(there, log, features={"rest": [0, 1]} if as_dict else None)
+    assert planned.evaluate(1, quiet=True).returns
+
+
+def test_calls_of_a_skill_with_a_part_are_compared_by_all() -> None:
+    algorithm = sw.PPO(num_envs=4, n_steps=16, network=sw.Network((8,), sees=(0,)))
+    own = type("Own", (sw.Skill,), {"sees": (1, 0), "algorithm": algorithm, "max_steps": 3})
+    rule = {"selector": lambda obs: ["own"] * len(obs)}
+    env = sw.EnvSpec(Point, engine="sync", workers=1)
+    run = declared([own()], env=env, steps=64, **rule).train(quiet=True)
+    assert run.log_calls(60).sees == (None,)
