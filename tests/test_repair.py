@@ -187,14 +187,36 @@ def test_a_repaired_skill_keeps_its_other_starts_by_rehearsal(
 def test_observations_of_done_calls_are_rehearsed(run: Run) -> None:
     log = record_calls(SPEC, run.policy, 600, num_envs=4)
     skill = run.hierarchy.skill("press")
-    obs = repair.rehearsed_obs(log, skill, "flip", None)
+    obs = repair.rehearsed_obs(log, skill, None, "flip", None)
     assert obs is not None
     assert (obs[:, 0] == 1).all(), "after the flip no call is done"
     done = log.succeeded & (log.skill == 0)
     assert len(obs) == log.tau[done].sum()
-    assert repair.rehearsed_obs(log, skill, "press", None) is not None
+    assert repair.rehearsed_obs(log, skill, None, "press", None) is not None
     failed = log.take(np.flatnonzero(~log.succeeded))
-    assert repair.rehearsed_obs(failed, skill, "flip", None) is None
+    assert repair.rehearsed_obs(failed, skill, None, "flip", None) is None
+
+
+class Swapped(Press):
+    """Sees its numbers the other way round."""
+
+    name, sees = "press", (1, 0)
+
+
+def test_what_a_skill_rehearses_is_its_part(tmp_path: Path) -> None:
+    first = declare(Swapped(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
+    done = {"press": lambda obs: obs[:, 1] >= 0}
+    log = record_calls(SPEC, first.policy, 600, num_envs=4)
+    seen, swapped = (
+        repair.rehearsed_obs(log, h.skill("press"), roles_of(h)["press"].part, "flip", done)
+        for h in (declare(), declare(Swapped(), Flip()))
+    )
+    assert seen is not None
+    assert swapped is not None
+    assert len(np.unique(seen, axis=0)) > 1
+    assert np.array_equal(swapped, seen[:, ::-1])
+    new = repaired(first, tmp_path / "new", **SHORT)
+    assert new.repairs
 
 
 class Stay(sw.Skill):

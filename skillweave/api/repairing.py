@@ -112,10 +112,10 @@ def repair(
     entry["repair"]["bonus"] = found.gain
     content |= {"stages": [entry], "seed": seed}
     rehearsal = None
-    declared_skill = roles[skill].skill
-    assert declared_skill is not None
+    role = roles[skill]
+    assert role.skill is not None
     if can_rehearse(learnt.algorithm):
-        rehearsal = rehearsed_obs(found.log, declared_skill, name_of(after), done)
+        rehearsal = rehearsed_obs(found.log, role.skill, role.part, name_of(after), done)
     else:
         reason += (
             f" {skill!r} learns on without rehearsal, so it may forget what it does elsewhere: "

@@ -23,6 +23,7 @@ from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
+from skillweave.skills.own_part import OwnPart
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
@@ -286,7 +287,11 @@ def _sum(one: HandOver, other: HandOver) -> HandOver:
 
 
 def rehearsed_obs(
-    log: CallLog, skill: Skill, after: str, done: Mapping[str, Any] | None
+    log: CallLog,
+    skill: Skill,
+    part: OwnPart | None,
+    after: str,
+    done: Mapping[str, Any] | None,
 ) -> Array | None:
     """Return the observations in which a skill keeps what it does while it is repaired, (n, …).
 
@@ -295,6 +300,9 @@ def rehearsed_obs(
 
     Args:
         log: its calls, each with the call before it.
+        skill: the skill.
+        part: its own part of observations; None: it sees all.
+        after: the name of the other skill.
         done: as for ``hand_over``.
     """
     won = calls_done(log, done)
@@ -304,6 +312,7 @@ def rehearsed_obs(
     if not steps.any():
         return None
     obs: Array = log.before[steps]
+    obs = obs if part is None else part.see(obs)
     goals = goals_of(skill)
     if goals is None:
         return obs

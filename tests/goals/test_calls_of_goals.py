@@ -99,7 +99,7 @@ def test_a_report_shows_calls_of_skills_with_goals(tmp_path: Any) -> None:
 def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None:
     log = ready(space).log_calls(200, num_envs=2)
     skill = go_to(space)
-    seen = rehearsed_obs(log, skill, "rest", None)
+    seen = rehearsed_obs(log, skill, None, "rest", None)
     assert seen is not None
     goals = goals_of(skill)
     assert goals is not None
