@@ -164,7 +164,8 @@ def inside(goal: Any, space: Any) -> bool:
 
 def bounds(space: Any, dtype: Any) -> list[Any]:
     """Return the lowest and the highest numbers of a Box: infinities are texts in JSON."""
-    both = (np.array(space[k], "f8").astype(dtype) for k in ("low", "high"))
+    read = "f8" if np.dtype(dtype).kind == "f" else dtype
+    both = (np.array(space[k], read).astype(dtype) for k in ("low", "high"))
     return [x.reshape(space["shape"]) if x.ndim else x for x in both]
 
 
