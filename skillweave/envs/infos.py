@@ -171,7 +171,7 @@ def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
     """Return a mask of an environment or a user for the choices of a space as (A,) bool.
 
     Several choices may have a list each. The mask of a Dict or Tuple is a dict or tuple of masks,
-    as in Gymnasium's ``sample``; where a part has none, all is allowed. It may also be one array.
+    and where a part has none, all is allowed. It may also be one array.
 
     Raises:
         ValueError: the value does not have a number for each choice; the message shows it.

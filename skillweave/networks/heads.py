@@ -88,6 +88,7 @@ class ActionHead:
         """Return dist_params (..., width) without the choices that are not allowed.
 
         Args:
+            dist_params: (..., width), a network's outputs.
             mask: (..., A) bool, allowed choices; None: all.
             epsilon: the least share of choices at random; None: 0.
         """
