@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -198,10 +199,7 @@ def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
         ]
         return np.concatenate(masks)
     size = sum(choice_counts(space))
-    try:
-        mask = np.concatenate([np.ravel(part) for part in value])  # of unequal lengths, perhaps
-    except (TypeError, ValueError):
-        mask = np.array(None)
+    mask = _flat(value)
     if mask.size != size or mask.dtype.kind not in "iubf":
         raise ValueError(
             f"{what} is {short(value)}; it must be a number for each choice of {space}, "
@@ -209,6 +207,18 @@ def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
         )
     allowed: Array = mask.reshape(-1) != 0
     return allowed
+
+
+def _flat(value: Any) -> Array:
+    """Return a mask as an array; of lists of unequal lengths their numbers, one after another."""
+    try:
+        mask = np.asarray(value)
+    except ValueError:
+        mask = np.array(None)
+    if mask.dtype == object:
+        with suppress(TypeError, ValueError):
+            mask = np.concatenate([np.ravel(part) for part in value])
+    return mask
 
 
 class ActionMasks:
