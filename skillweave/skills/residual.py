@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Tuple
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
@@ -148,7 +148,9 @@ class Correction:
 def check_corrected(space: Space[Any], who: str) -> None:
     """Raise a DeclarationError where actions of a space cannot be corrected."""
     if not isinstance(space, Box) or space.dtype is None or space.dtype.kind != "f":
+        has_parts = isinstance(space, Dict | Tuple)
+        part = ", or let it own and correct one part of real numbers (acts)" if has_parts else ""
         raise DeclarationError(
             f"{who}: Residual adds to actions, which needs a Box of real numbers, but actions are "
-            f"of {short(space)}: let the skill learn without it, policy = None"
+            f"of {short(space)}: let the skill learn without it, policy = None{part}"
         )

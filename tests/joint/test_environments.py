@@ -224,3 +224,12 @@ def test_a_film_and_a_report_play_again(tmp_path):
     assert (tmp_path / "film.gif").stat().st_size > 1000
     run.report(tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size > 10_000
+
+
+def test_a_correction_of_several_parts_says_what_works(tmp_path):
+    class Better(sw.Skill):
+        policy = sw.Residual(by_hand)
+
+    says = r"needs a Box of real numbers, .* correct one part of real numbers \(acts\)"
+    with pytest.raises(sw.DeclarationError, match=says):
+        reach([Better()]).train(tmp_path / "run", quiet=True)
