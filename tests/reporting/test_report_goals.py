@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from goals.worlds import SPACES, GoTo, Rest, aim_of, declared
 
 from skillweave.reporting.report.single import play_episodes
@@ -76,6 +78,30 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
             assert words == ("" if skill == "rest" else goal)
             seen.add(skill)
     assert seen == {"two", "number", "rest"}
+
+
+def test_a_log_of_calls_has_pictures_of_its_own(tmp_path: Path) -> None:
+    pytest.importorskip("vl_convert")
+    inner = declared([walks("walk", SPACES["box"])], selector=passes_on)
+    far = type("Far", (GoTo,), {"policy": inner, "max_steps": 8})()
+
+    def selector(obs: Any) -> Any:
+        return ["far"] * len(obs), np.full((len(obs), 2), 0.5)
+
+    run = declared([far, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
+    log = run.log_calls(300)
+    run.report(tmp_path / "report.html", episodes=4, films=0)
+    page = (tmp_path / "report.html").read_text()
+    calls = int((log.skill == 0).sum())
+    assert re.findall(r"<h3>([a-z/]+)</h3>\s*<p class=.hint.>Success in", page) == [
+        *("far", "far/walk"),  # played
+        "far",  # logged
+    ]
+    assert re.search(rf"of {calls} calls of the run’s log", page)
+
+
+def passes_on(obs: Any) -> Any:
+    return ["walk"] * len(obs), obs["goal"]
 
 
 def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:

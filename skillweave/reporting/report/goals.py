@@ -26,12 +26,15 @@ CALLS_OF_A_PART = 4
 """The calls that a part of the map has, on average, if there are enough."""
 
 
-def goal_pictures(logs: Mapping[str, CallLog], skills: Mapping[str, Skill]) -> list[dict[str, Any]]:
+def goal_pictures(
+    logs: Mapping[str, CallLog], skills: Mapping[str, Skill], of: str
+) -> list[dict[str, Any]]:
     """Return a picture for each skill whose goals are one or two numbers, or a choice.
 
     Args:
         logs: of the levels, by path.
         skills: by path.
+        of: where the calls are from, in words.
 
     Returns:
         Of each: ``name``, ``words``, and ``spec``, its chart.
@@ -48,7 +51,7 @@ def goal_pictures(logs: Mapping[str, CallLog], skills: Mapping[str, Skill]) -> l
             if not rows:
                 continue
             draw = charts.goal_map if goals.shape[1] == 2 else charts.goal_bars
-            share = f"{int(done.sum()):,} of {len(done):,} calls ({percent(float(done.mean()))})"
+            share = f"{int(done.sum()):,} of {len(done):,} calls {of} ({percent(done.mean())})"
             found.append({"name": path, "words": share, "spec": draw(path, rows, ranges)})
     return found
 

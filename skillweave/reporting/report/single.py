@@ -12,7 +12,8 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
-from skillweave.paths import AGENT
+from skillweave.paths import AGENT, join
+from skillweave.planning import CallLog
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
@@ -49,6 +50,7 @@ from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, v
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.seeding import Seeds, global_generators
+from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import load_evaluation
@@ -83,6 +85,8 @@ class Played:
     """Names of the numbers in an observation."""
     goals: list[dict[str, Any]]
     """The pictures of skills with goals."""
+    with_goals: dict[str, Skill]
+    """The skills with goals, by path."""
 
 
 @global_generators(Seeds(0) / "report")
@@ -130,11 +134,18 @@ def play_episodes(
         missing.append(misfit)
     shown, left_out = episode_data(log, film, named)
     docs = [about(skill) for skill in log.skills]
-    skills = dict(zip(log.labels, log.skills, strict=False))
+    with_goals = {
+        join(path, skill.name): skill
+        for path, recorder in calls.recorders().items()
+        for skill in recorder.skills.skills
+        if skill.goal_space is not None
+    }
     goals: list[dict[str, Any]] = []
-    if any(skill.goal_space is not None for skill in skills.values()):
-        goals = goal_pictures(calls.logs(episode_seeds(seed, episodes)), skills)
-    return Played(score, log, film, shown, missing + left_out, colors, docs, named, goals)
+    if with_goals:
+        logs = calls.logs(episode_seeds(seed, episodes))
+        goals = goal_pictures(logs, with_goals, "in the played episodes")
+    missing += left_out
+    return Played(score, log, film, shown, missing, colors, docs, named, goals, with_goals)
 
 
 def write_report(
@@ -191,7 +202,8 @@ def write_report(
     if not all_curves and run.manifest["stages"]:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
-    section = _hand_over(run, spec, colors, filmed > 0, missing)
+    log = _log(run, missing)
+    section = None if log is None else _hand_over(log, spec, colors, filmed > 0, missing)
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
@@ -206,6 +218,9 @@ def write_report(
     if played is not None:
         context |= _skills(played)
         data |= _episodes(played)
+        if log is not None:
+            context["goals"] += goal_pictures({"": log}, played.with_goals, "of the run’s log")
+    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(context["goals"])}
     film = None if played is None else played.film
     data |= {"why": WHY, "binary": context["binary"]}
     page = write_page(path, "report.html", context, data, film, hand_film)
@@ -213,21 +228,24 @@ def write_report(
     return page | {"verdict": context["verdict"], "missing": missing}
 
 
-def _hand_over(
-    run: RunDirectory,
-    spec: EnvSpec | None,
-    colors: Mapping[str, str],
-    filmed: bool,
-    missing: list[str],
-) -> Section | None:
-    """Return the section about the run's log of calls, or None; add what is missing."""
+def _log(run: RunDirectory, missing: list[str]) -> CallLog | None:
+    """Return the run's log of calls, or None; add what is missing."""
     try:
         log = load_calls(run)
     except SkillweaveError as error:
         missing.append(f"There is no hand-over: {_sentence(error)}")
         return None
-    if log is None or not len(log):
-        return None
+    return log if log is not None and len(log) else None
+
+
+def _hand_over(
+    log: CallLog,
+    spec: EnvSpec | None,
+    colors: Mapping[str, str],
+    filmed: bool,
+    missing: list[str],
+) -> Section:
+    """Return the section about the run's log of calls; add what is missing."""
     section = hand_over_section(log, spec, colors, filmed=filmed)
     missing += section.missing
     return section
@@ -379,7 +397,7 @@ def _skills(played: Played) -> dict[str, Any]:
         "episodes": len(log.episodes),
         "filmed": 0 if played.film is None else len(played.film.first),
         "has_skills": log.labels != (AGENT,),
-        "goals": played.goals,
+        "goals": list(played.goals),
     }
 
 
@@ -402,5 +420,4 @@ def _episodes(played: Played) -> dict[str, Any]:
         names = [log.labels[i] for i in used]
         decisions["spec"] = charts.choices(names, [colors[i] for i in used])
         data["decisions"] = decisions
-    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(played.goals)}
     return data
