@@ -254,6 +254,7 @@ def episodes(env: Point, policy: HierarchyPolicy, runner: Runner, other: Any) ->
     return told
 
 
+@pytest.mark.filterwarnings("ignore:.*Goal.low")  # it clips goals
 @pytest.mark.fast_cases(3)
 @pytest.mark.parametrize("make", CASES.values(), ids=CASES)
 def test_a_hierarchy_with_goals_acts_the_same_elsewhere(make: Any, tmp_path: Path) -> None:
