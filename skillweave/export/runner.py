@@ -55,8 +55,15 @@ class Runner:
         self.obs = np.zeros((1, *self.entry["shape"]), self.dtype)
         self.feeds, self.goal = dict[str, Any](), None
         for name, fields, keys in self.entry["inputs"]:
-            self.feeds[name] = reduce(getitem, fields, self.obs)
-            self.feeds[name][0] = reduce(getitem, keys, obs)
+            part = self.feeds[name] = reduce(getitem, fields, self.obs)
+            try:
+                value = np.asarray(reduce(getitem, keys, obs))
+                if value.shape != part.shape[1:]:
+                    raise ValueError(f"it has shape {value.shape}, not {part.shape[1:]}")
+                part[0] = value
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                what = "".join(f"[{key!r}]" for key in keys)
+                raise ValueError(f"obs{what} does not fit policy.json: {error}") from error
         if self.before:
             self.elapsed += 1
             rows = {k: np.array([v]) for k, v in (info or {}).items()}

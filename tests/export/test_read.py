@@ -34,6 +34,7 @@ from skillweave import DQN, PPO, RNN, Network
 from skillweave.api.player import Player
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
+from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.selectors import ready_selector
@@ -286,6 +287,20 @@ def test_files_that_are_missing_or_damaged_are_named(saved: Path) -> None:
         sw.load_policy(saved)
     with pytest.raises(RunError, match=r"nothing/at/all does not exist"):
         sw.load_policy("nothing/at/all")
+
+
+def test_an_observation_that_does_not_fit_names_its_part_to_the_runner(saved: Path) -> None:
+    runner, obs = Runner(saved), SPACE.sample()
+    gyro = obs["gyro"]
+    for wrong, says in (
+        ({k: v for k, v in obs.items() if k != "gyro"}, r"obs\['gyro'\] does not fit .*: 'gyro'"),
+        (obs | {"gyro": gyro[None]}, r"obs\['gyro'\] .*it has shape \(1, 3\), not \(3,\)"),
+        (obs | {"gyro": 0.5}, r"it has shape \(\), not \(3,\)"),
+        (gyro, "does not fit policy.json: "),
+    ):
+        with pytest.raises(ValueError, match=says):
+            runner.act(wrong)
+    assert runner.act(obs).shape == ACTION.shape
 
 
 def test_further_fields_that_are_like_no_other_are_comments(saved: Path) -> None:
