@@ -62,6 +62,7 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
             what = f"observations (1, ...) to their flat numbers at {each.places}, (1, F)"
         features.append(asks(f"{name}.features.{graph.log.skills[i]}", each.raw, what))
     groups = graph.groups
+    arrays["units"] = graph.units
     arrays["usual"] = np.array([group.usual for _, group in groups], np.float32)
     for g, (choice, group) in enumerate(groups):
         arrays |= {f"rows.{g}": group.rows, f"starts.{g}": group.starts}

@@ -635,7 +635,8 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
         here, (places, share) = self.near(features), self.corners()
         q = ((self.data["worth"][here.pieces][..., places] * share).sum(2) * here.weights).sum(1)
         known = np.isfinite(here.far)
-        q = np.where(q > 0, q / (1 + entry["caution"] * np.where(known, here.far, 0.0)), q)
+        far = np.where(known, here.far, 0.0) / self.data["units"]
+        q = np.where(q > 0, q / (1 + entry["caution"] * far), q)
         here.q = np.where(known, q, -np.inf).astype("f4")
         here.may = np.ones(len(q), bool) if mask is None else mask[0][self.choice_of]
         here.to = places[share.argmax()]

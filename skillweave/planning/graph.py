@@ -11,6 +11,7 @@ from everywhere that it passed.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -232,6 +233,28 @@ class CallGraph:
         total = (1.0 / (finite + SOFT)).sum(2)
         return Near(pieces, weights_of(finite), distance[:, :, 0], total, goal)
 
+    def trust(self, distance: Array, caution: float) -> Array:
+        """Return the share of a value that is left where the nearest piece is far, (n, O) float32.
+
+        Args:
+            distance: (n, O), to the nearest piece of each option; infinite: it has none.
+            caution: the share by which a value falls, about, where this distance is the usual one
+                of the K-th neighbour.
+        """
+        far = np.where(np.isfinite(distance), distance, 0.0) / self.units
+        share: Array = (1.0 / (1.0 + caution * far)).astype(np.float32)
+        return share
+
+    @cached_property
+    def units(self) -> Array:
+        """The usual distance of the K-th neighbour of each option, (O,) float32.
+
+        Where the log has too few calls to tell, it is 1, a standard deviation.
+        """
+        each = np.array([group.usual for _, group in self.groups], np.float32)
+        each = np.where(np.isfinite(each), np.maximum(each, SOFT), np.float32(1.0))
+        return each.repeat([group.options for _, group in self.groups])
+
     def _options_of(self, choice: int) -> Options:
         """Return the options of a choice."""
         rows, starts = self._of_choice[choice], self._starts[choice]
@@ -331,14 +354,14 @@ class CallGraph:
             judged: what pieces pay and lead to.
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
-            caution: share by which a value falls for each unit of distance to the nearest piece.
+            caution: see ``trust``.
             novel: (O,), the distance from which on each option is new, and worth ``bonus``; None:
                 none is.
             bonus: its value.
         """
         count = judged.reward.shape[1]
         value = np.zeros((len(self.end), count), np.float32)
-        trust = trust_in(near.distance, caution)
+        trust = self.trust(near.distance, caution)
         options = np.flatnonzero(self.known | (novel is not None)).tolist()
         allowed = may[:, self.choice_of]
         if novel is None:
@@ -627,10 +650,3 @@ def _by_depth(then: Array) -> list[Array]:
     order = rows[np.argsort(depth[rows], kind="stable")]
     bounds = np.flatnonzero(np.diff(depth[order])) + 1
     return [part for part in np.split(order, bounds) if len(part)]
-
-
-def trust_in(distance: Array, caution: float) -> Array:
-    """Return the share of a value that is left at these distances; infinite ones have no call."""
-    known = np.where(np.isinf(distance), np.finfo(np.float32).max, distance)
-    trust: Array = 1.0 / (1.0 + caution * known)
-    return trust

@@ -20,7 +20,7 @@ from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.graph import CallGraph, Near, trust_in
+from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.lacking import check_possible, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
@@ -91,7 +91,8 @@ class Planner(ReadySelector):
             ``compared`` has the places. They are standardised by the log.
         neighbours: K.
         gamma: γ of one step.
-        caution: the share by which a value falls for each unit of distance to the nearest call.
+        caution: the share by which a value falls, about, where the nearest call is as far as the
+            last of the ``neighbours`` usually is.
         temperature: choices are sampled by exp(Q / (temperature · the largest |Q|)); 0: the best is
             chosen.
 
@@ -113,7 +114,7 @@ class Planner(ReadySelector):
         features: Any = None,
         neighbours: int = 5,
         gamma: float = 0.999,
-        caution: float = 0.05,
+        caution: float = 0.1,
         temperature: float = 0.0,
     ) -> None:
         super().__init__("planner")
@@ -250,7 +251,7 @@ class Planner(ReadySelector):
         # (n, O, K, J): the worth of each neighbour at each corner.
         worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
         q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
-        q = np.where(q > 0, q * trust_in(near.distance, self.caution), q)
+        q = np.where(q > 0, q * self.graph.trust(near.distance, self.caution), q)
         return np.where(np.isfinite(near.distance), q, -np.inf).astype(np.float32)
 
     def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -285,7 +285,7 @@ def test_a_plan_with_goals_that_guides_is_exported(how: Any, tmp_path: Path) -> 
             a, b = (told(world(), policy, actor, seed) for actor in (player, runner))
             assert [(skill, action) for skill, _, action in a] == close(b)
             skills_of |= {skill for skill, _, _ in a}
-    assert len(skills_of) > 1
+    assert len(skills_of) > 1 or "call_steps" in how  # there one skill does it all
 
 
 def close(steps: list[Any]) -> list[Any]:

@@ -134,11 +134,11 @@ def test_values_are_weighted_means_of_the_nearest_calls() -> None:
     # With one neighbour, the nearer one alone counts.
     sure = Planner(log, at(5), neighbours=1, gamma=0.5, caution=0.0)
     assert sure.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0)
-    # A distance costs a share of the value, wherever it is.
+    # A distance costs a share of the value; the two calls are 0.04 apart, which is usual.
     careful = Planner(log, at(5), neighbours=1, gamma=0.5, caution=1.0)
     far = careful.values(np.float32([[-0.01], [-0.5]]))[:, 0]
     assert far[0] == pytest.approx(1.0, abs=1e-3)
-    assert far[1] == pytest.approx(1 / (1 + 0.49 * scale), abs=1e-3)
+    assert far[1] == pytest.approx(1 / (1 + 0.49 / 0.04), abs=1e-3)
 
 
 def test_nothing_follows_where_the_episode_terminated() -> None:
