@@ -313,7 +313,7 @@ def _shape_of(value: Any) -> tuple[int, ...] | None:
 def _parts_given(values: Any, space: Space[Any]) -> list[Any] | None:
     """Return the parts of goals of a Dict or Tuple, in its order; None: they are others."""
     if isinstance(space, Dict):
-        if not isinstance(values, Mapping) or not set(space.spaces) <= set(values):
+        if not isinstance(values, Mapping) or set(space.spaces) != set(values):
             return None
         return [values[name] for name in space.spaces]
     assert isinstance(space, Tuple)

@@ -63,6 +63,7 @@ def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, lear
     ("space", "goals", "says"),
     [
         ("dict", {"to": 0, "side": 1}, r"gave \['to', 'side'\] as goals of skill 'go_to', but"),
+        ("dict", {"at": 0, "side": 1, "sid": 0}, r"gave \['at', 'side', 'sid'\] as goals"),
         ("dict", {"at": 0}, "a dict with 'at', 'side' was expected: its goals are of Dict"),
         ("tuple", (0, 1, 2), "a tuple of 2 parts was expected"),
     ],
