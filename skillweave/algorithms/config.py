@@ -541,11 +541,19 @@ def _acts_in(registration: Registration, space: gym.Space[Any]) -> bool:
     return isinstance(space, registration.action_spaces)
 
 
+def _has_choices_alone(space: gym.Space[Any]) -> bool:
+    """Return whether goals of a space are choices, whole numbers of a Box with bounds included."""
+    if isinstance(space, _SPACES.Box) and space.dtype.kind != "f":
+        from skillweave.spaces.action_codec import choice_counts  # needs torch
+
+        return bool(choice_counts(space))
+    return isinstance(space, _SPACES.Discrete | _SPACES.MultiDiscrete | _SPACES.MultiBinary)
+
+
 def _check_goals(config: Any, spaces: Mapping[str, gym.Space[Any]], where: str) -> None:
     """Raise a DeclarationError where a selector cannot choose goals of these spaces, by skill."""
     able = registration_of(config).chooses_goals
-    choices = _SPACES.Discrete | _SPACES.MultiDiscrete | _SPACES.MultiBinary
-    wrong = [name for name, space in spaces.items() if not isinstance(space, choices)]
+    wrong = [name for name, space in spaces.items() if not _has_choices_alone(space)]
     if able == "discrete" and not wrong:
         return
     if able == "all":

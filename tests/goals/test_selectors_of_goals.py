@@ -130,7 +130,7 @@ def test_chosen_lengths_and_goals(tmp_path):
 OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
 
 
-@pytest.mark.parametrize("space", ["number", "numbers", "bits"])
+@pytest.mark.parametrize("space", ["number", "numbers", "bits", "whole"])
 @pytest.mark.parametrize(
     "selector",
     [
