@@ -280,7 +280,8 @@ def as_goals(
     if goals.shape != wanted:
         raise kind(
             f"{who} gave goals of shape {goals.shape} for {skill}, but {wanted} was expected: one "
-            f"goal of {short(space)} for each of the {n} environments"
+            f"goal of {short(space)} for "
+            + ("one environment" if n == 1 else f"each of the {n} environments")
         )
     goals = goals if rows is None else goals[rows]
     if goals.dtype == dtype:

@@ -185,6 +185,7 @@ def test_a_player_keeps_its_own_goal(tmp_path):
         ("dict", {"at": (0, 0)}, "a dict with 'at', 'side' was expected"),
         ("dict", {"at": (0, 5), "side": 1}, "out of goal_space"),
         ("tuple", ((0, 0),), "a tuple of 2 parts was expected"),
+        ("dict", {"at": (0,), "side": 1}, r"\(1, 2\) was expected: .* for one environment$"),
         ("tuple", 3, "gave"),
     ],
 )
