@@ -105,7 +105,7 @@ class Foreign(Memoryless):
             raise
         except (Exception, SystemExit) as error:
             raise PolicyError(
-                f"{self._who} fails on {self.given}: {error_text(error)}{self.after_failure(error)}"
+                f"{self._who} fails on {self.given}: {error_text(error)}{self._advice_on(error)}"
             ) from error
 
     @property
@@ -113,7 +113,7 @@ class Foreign(Memoryless):
         """Return what the policy is given, for messages."""
         return f"observations of {short(self.observation_space, 300)}"
 
-    def after_failure(self, error: BaseException) -> str:
+    def _advice_on(self, error: BaseException) -> str:
         """Return advice where the policy failed when it was tried out; empty: none."""
         return ""
 

@@ -149,7 +149,7 @@ class MappedPolicy(Foreign):
         named = (f"{name}: {x.described}" if name else x.described for name, x in inputs.items())
         return f"the inputs that sees gives, {'; '.join(named)}"
 
-    def after_failure(self, error: BaseException) -> str:
+    def _advice_on(self, error: BaseException) -> str:
         """Return advice where an argument is missing, or whole observations are given."""
         if not self.mapping.state and "required positional argument" in str(error):
             return "; one with a recurrent state needs state=, the shape of this state"
