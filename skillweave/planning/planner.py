@@ -114,7 +114,7 @@ class Planner(ReadySelector):
         features: Any = None,
         neighbours: int = 5,
         gamma: float = 0.999,
-        caution: float = 0.1,
+        caution: float = 0.03,
         temperature: float = 0.0,
     ) -> None:
         super().__init__("planner")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -160,6 +160,8 @@ class ObsCodec:
     scales: tuple[PixelScale, ...] = field(compare=False)  # of each image
     unclear: tuple[str, ...] = ()
     """The images whose axis of channels neither the shape nor a setting determines."""
+    is_one_vector: bool = False
+    """The bytes of an observation are float32 numbers in the vector's order."""
 
     def split(self, obs: Tensor | Sequence[Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
         """Split raw observations into a vector and images.
@@ -171,7 +173,7 @@ class ObsCodec:
             The vector float32 (*lead, size); each image (*lead, C, H, W) in its own dtype.
         """
         if isinstance(obs, Tensor):
-            if self._is_one_vector:
+            if self.is_one_vector:
                 return obs.view(torch.float32), ()
             lead = obs.shape[: obs.ndim - len(self.item)]
             raw: Sequence[Tensor] = [leaf.read(obs) for leaf in self.leaves]
@@ -189,17 +191,6 @@ class ObsCodec:
             return vectors[0], tuple(images)
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
-
-    @cached_property
-    def _is_one_vector(self) -> bool:
-        """The bytes of an observation are float32 numbers in the vector's order."""
-        at = 0
-        for leaf in self.leaves:
-            plain = leaf.image is None and not leaf.choices and leaf.dtype == torch.float32
-            if not plain or leaf.place is None or leaf.place.start != at:
-                return False
-            at = leaf.place.stop
-        return self.item == (at,)
 
     @property
     def may_be_wrong(self) -> bool:
@@ -298,16 +289,29 @@ def obs_codec(space: gym.Space[Any], planes: Literal["first", "last"] | None = N
     check_size(space, "observation", sum(leaf.size for leaf in vectors))
     pixels = sum(leaf.size for leaf in leaves) - sum(leaf.size for leaf in vectors)
     check_size(space, "observation", pixels, 16 * LARGEST)
+    item = obs_shape(space) if dtype.fields is None else (dtype.itemsize,)
     return ObsCodec(
         space=space,
         size=sum(leaf.size for leaf in vectors),
         images=tuple(layout.shape for layout in layouts),
         scaled=any(leaf.real for leaf in vectors),
-        item=obs_shape(space) if dtype.fields is None else (dtype.itemsize,),
+        item=item,
         leaves=leaves,
         scales=tuple(_scale(leaf) for leaf in leaves if leaf.image is not None),
         unclear=tuple(_described(leaf) for leaf in unclear),
+        is_one_vector=item == (_floats_without_gap(leaves),),
     )
+
+
+def _floats_without_gap(leaves: Iterable[_Leaf]) -> int | None:
+    """Return the bytes of leaves that are float32 numbers without gaps; None: they are not."""
+    end = 0
+    for leaf in leaves:
+        plain = leaf.image is None and not leaf.choices and leaf.dtype == torch.float32
+        if not plain or leaf.place is None or leaf.place.start != end:
+            return None
+        end = leaf.place.stop
+    return end
 
 
 def _scale(leaf: _Leaf) -> PixelScale:

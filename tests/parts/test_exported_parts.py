@@ -100,8 +100,8 @@ def compare_choices(policy: Any, folder: Any, code: Any, kind: str) -> None:
     obs, _ = env.reset(seed=0)
     for _ in range(20):
         action = player.act(obs)
-        assert (runner.act(obs) == action).all()
-        assert (again.act(obs) == action).all()
+        assert np.array_equal(runner.act(obs), action)
+        assert np.array_equal(again.act(obs), action)
         obs, *_ = env.step(action)
 
 
