@@ -183,10 +183,14 @@ def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
 def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
     """Return a mask as (A,) bool; ``what`` begins messages."""
     named = parts(space)
-    is_tuple = isinstance(space, gym.spaces.Tuple) and isinstance(value, tuple | list)
-    if named is not None and (is_tuple or isinstance(value, Mapping)):
-        given = value if isinstance(value, Mapping) else dict(zip(named, value, strict=False))
-        if not set(given) <= set(named) or (is_tuple and len(value) != len(named)):
+    by_place = isinstance(space, gym.spaces.Tuple) and _is_by_place(value)
+    if named is not None and (by_place or isinstance(value, Mapping)):
+        if by_place and len(value) != len(named):
+            raise ValueError(
+                f"{what} has {len(value)} parts, but actions of {short(space)} have {len(named)}"
+            )
+        given = dict(zip(named, value, strict=True)) if by_place else value
+        if not set(given) <= set(named):
             raise ValueError(
                 f"{what} has the parts {short(list(given))}, but actions of {short(space)} have "
                 f"{', '.join(map(repr, named))}"
@@ -207,6 +211,13 @@ def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
         )
     allowed: Array = mask.reshape(-1) != 0
     return allowed
+
+
+def _is_by_place(value: Any) -> bool:
+    """Return whether the mask of a Tuple is a list of masks, and not one of numbers."""
+    if not isinstance(value, tuple | list):
+        return False
+    return not all(isinstance(each, int | float | np.number | np.bool_) for each in value)
 
 
 def _flat(value: Any) -> Array:

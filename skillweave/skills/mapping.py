@@ -580,8 +580,8 @@ def _places(settings: Any, name: str) -> slice | tuple[int, ...] | None:
             return value
     elif _is_place(value):
         return (int(value),)
-    elif isinstance(value, range | list | tuple | np.ndarray) and np.ndim(value) == 1:
-        places = list(value)
+    elif isinstance(value, range | list | tuple | np.ndarray):
+        places = list(np.atleast_1d(value)) if isinstance(value, np.ndarray) else list(value)
         if places and all(_is_place(x) for x in places):
             return tuple(int(x) for x in places)
     raise DeclarationError(f"{where}; it must be a slice, or a list of places, counted from 0")

@@ -186,6 +186,16 @@ def test_a_wrong_mask_names_its_part(mask, says, tmp_path):
         sw.train_agent(spec, ON, 64, tmp_path / "two", quiet=True)
 
 
+def test_a_mask_of_a_tuple_may_be_one_list():
+    space = gym.spaces.Tuple((gym.spaces.Discrete(2), gym.spaces.Discrete(3)))
+    expected = [True, False, True, True, False]
+    assert checked_mask([1, 0, 1, 1, 0], space).tolist() == expected
+    assert checked_mask([[1, 0], (1, 1, 0)], space).tolist() == expected
+    assert checked_mask((None, [1, 1, 0]), space).tolist() == [True, True, True, True, False]
+    with pytest.raises(ValueError, match="has 3 parts, but actions of .* have 2"):
+        checked_mask(([1, 0], [1, 1, 1], [1]), space)
+
+
 def test_real_numbers_have_no_mask(tmp_path):
     real = gym.spaces.Dict(arm=gym.spaces.Box(-1, 1, (2,), np.float32))
     policy = sw.from_function(

@@ -240,6 +240,7 @@ def zeros(x: Array) -> Array:
         ({"sees": ("gyro", sw.Goal)}, r"sees\[1\] is the class Goal; write Goal\(\)"),
         ({"sees": {"": "gyro"}}, "the names of the policy's inputs"),
         ({"sees": (0, -1)}, r"Part.places is .*counted from 0"),
+        ({"acts": [[0], [1, 2]]}, r"Acts.to is \[\[0\], \[1, 2\]\]; .*counted from 0"),
         ({"sees": "gyro", "goal": 1.0}, r"does not take it: write Goal\(\)"),
         (
             {"sees": sw.Goal(high=0.5), "goal": 1.0},
