@@ -1001,8 +1001,8 @@ class Run:
         if goal is not None:
             if skill is None:
                 raise DeclarationError(
-                    f"{who}: goal is {short(goal)}, but the selector chooses goals: name the skill "
-                    'that is to act alone, skill="go_to"'
+                    f"{who}: goal is {short(goal)}, and a goal is given to one skill that acts alone: "
+                    'name it, skill="go_to"'
                 )
             return self._alone(skill).with_goal(goal, who)
         return self.policy if skill is None else self._alone(skill)

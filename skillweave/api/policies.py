@@ -108,7 +108,7 @@ def load_policy(
             folder = hub.download_policy(hub.check_name(name), revision)
         except RunError as error:
             raise RunError(
-                f"there is no folder {name}, so it was sought on the hub: {error}"
+                f"there is no folder {name}, and it cannot be loaded from the hub: {error}"
             ) from error
     elif folder.is_file() and folder.name != MANIFEST:
         raise RunError(

@@ -22,7 +22,7 @@ from skillweave.runs.initial_policies import (
     Learnt,
     learners_of_run,
     options_of,
-    part_of,
+    recorded_part,
     record_initial_policies,
     same_shapes,
 )
@@ -81,7 +81,7 @@ def starts(
             chooses = options_of(content, name)
             goal_space = None if role.skill is None else role.skill.goal_space
             _check_start(name, algorithm, chooses, learnt[name], places[name], goal_space)
-            _check_part(name, part_of(content, name), learnt[name].part, places[name])
+            _check_part(name, recorded_part(content, name), learnt[name].part, places[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 

@@ -16,6 +16,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.skill_set import skills_below
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
+from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.paths import join
 from skillweave.selectors import ReadySelector
@@ -58,23 +59,28 @@ def _check_learner(role: Role, where: str) -> None:
     if role.config is not None:
         check_spaces(role.config, role.action_space, where)
         read_by(role.config, role.observation_space, where)
-        if role.skill is not None and role.skill.goal_space is not None:
-            _check_sees_goal(role, where)
+        _check_seen(role, where)
     if role.skill is not None and isinstance(role.skill.policy, Learnable):
         who = f"skill {role.path!r}"
         goals = role.skill.goal_space
         role.skill.policy.check(role.observation_space, role.action_space, goals, who)
 
 
-def _check_sees_goal(role: Role, where: str) -> None:
-    """Raise a DeclarationError where the networks of a skill with goals do not see the goal."""
+def _check_seen(role: Role, where: str) -> None:
+    """Raise a DeclarationError where networks see what is not there, or do not see a goal."""
     codec = obs_codec(role.observation_space)
-    first = codec.size - obs_codec(goal_part(role.observation_space)).size
+    has_goals = role.skill is not None and role.skill.goal_space is not None
+    goal = obs_codec(goal_part(role.observation_space)).size if has_goals else 0
+    first = codec.size - goal
     for name in ("network", "critic"):
         network = getattr(role.config, name, None)
-        if network is None or first == codec.size:
+        if not isinstance(network, Network) or network.sees is None:
             continue
-        if max(seen_places(network, codec)) < first:
+        try:
+            places = seen_places(network, codec)
+        except DeclarationError as error:
+            raise DeclarationError(f"{where}{error}") from None
+        if goal and max(places) < first:
             raise DeclarationError(
                 f"{where}{name}.sees leaves out the goal, whose places are {first} to "
                 f"{codec.size - 1}, after those of the observation: add them, or the key 'goal'"

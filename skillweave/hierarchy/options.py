@@ -20,7 +20,7 @@ from skillweave.messages import short
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import GOAL, SKILL
 from skillweave.skills.goals import as_goals
-from skillweave.spaces import obs_dtype, pack, unpack
+from skillweave.spaces import obs_dtype, unpack
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.types import Array
 
@@ -105,7 +105,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         goals = None
         if self._player.goals:
             choice = self._choices(actions)
-            skill = self._checked(choice[SKILL])
+            skill = choice[SKILL]
             goals = self._player.goals_in(choice, self._obs, "OptionsEnv.step")
         else:
             skill = self._checked(actions)
@@ -208,7 +208,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         space = self.single_action_space
         assert isinstance(space, ChoiceSpace)
         if isinstance(actions, np.ndarray) and actions.dtype.fields is not None:
-            return pack(space, actions)
+            self._checked(actions[SKILL])
+            return actions.reshape(self.num_envs)
         given = actions.get(GOAL) if isinstance(actions, Mapping) else None
         goals_of: Mapping[str, Any] = given if isinstance(given, Mapping) else {}
         if set(space.goal_spaces) - set(goals_of) or SKILL not in actions:

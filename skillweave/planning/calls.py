@@ -310,12 +310,14 @@ def _alike(now: str, then: str) -> bool:
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
     """Return the places of the environment's observation that each skill's network sees.
 
-    None: all, or the policy is no network, or the skill has a part of observations of its own.
+    None: all, or the policy is no network, or the skill has a part of observations of its own, or
+    corrects a policy, which sees all.
     """
     found: list[tuple[int, ...] | None] = []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
         part, places = skills.part(i), getattr(policy, "seen_places", None)
-        if places is None or (part is not None and part.inputs is not None):
+        sees_else = part is not None and (part.inputs is not None or part.base is not None)
+        if places is None or sees_else:
             found.append(None)
             continue
         if skill.goal_space is not None:  # goals come after the observation

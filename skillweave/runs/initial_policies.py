@@ -41,7 +41,7 @@ class Learnt:
     chooses: Chooses
     """The options that it chooses among, if it is a selector or a critic of skills."""
     part: Mapping[str, Any] | None = None
-    """Of a skill of a run: its ``part_of``; else None."""
+    """Of a skill of a run: its ``recorded_part``; else None."""
 
 
 Chooses = tuple[tuple[str, ...], tuple[int, ...]]
@@ -69,12 +69,12 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry["name"]).items():
             sha256 = sums[name]
             steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
-            chooses, part = options_of(run.manifest, name), part_of(run.manifest, name)
+            chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
             learnt[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses, part)
     return learnt
 
 
-def part_of(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+def recorded_part(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """Return what a skill sees, what it acts on and its correction; None: of no skill."""
     for skill in manifest.get("skills", ()):
         if skill["name"] == name:

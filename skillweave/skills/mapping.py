@@ -667,7 +667,7 @@ def _from_json(kind: type[Any], data: Any, where: str) -> Any:
         raise DeclarationError(f"{where}: {error}") from None
 
 
-FURTHER = (
+OTHER_FIELDS = (
     *("source", "function", "fields", "choices", "whole"),
     *("kind", "file", "code", "output", "outputs", "shapes", "logits", "sampled", "with_goal"),
 )
@@ -678,7 +678,7 @@ def _check_names(kind: type[Any], data: Mapping[str, Any], where: str) -> None:
     """Raise a DeclarationError where an unknown field looks like a misspelt one."""
     known = [f.name for f in fields(kind)]
     for name in data:
-        if name not in (*known, *FURTHER) and (hint := meant(str(name), known, "")):
+        if name not in (*known, *OTHER_FIELDS) and (hint := meant(str(name), known, "")):
             place = f"{where}." if where else ""
             raise DeclarationError(f"{place}{shortened(str(name), 80)} is unknown{hint}")
 

@@ -60,7 +60,7 @@ def test_a_goal_that_cannot_be(run, tmp_path):
         run.evaluate(2, skill="go_to", goal=(5, 5))
     with pytest.raises(DeclarationError, match="skill 'rest' has no goals"):
         run.evaluate(2, skill="rest", goal=EAST)
-    with pytest.raises(DeclarationError, match=r"render\(\): goal is .* name the skill"):
+    with pytest.raises(DeclarationError, match=r"render\(\): goal is .* name it, skill="):
         run.render(tmp_path / "a.gif", goal=EAST)
     whole = run.evaluate(2, quiet=True)
     with pytest.raises(DeclarationError, match=r'evaluate\(skill="go_to"\) scores a skill alone'):

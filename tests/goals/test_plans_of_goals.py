@@ -314,9 +314,10 @@ def test_calls_are_compared_by_the_numbers_of_the_observation_that_a_network_see
     assert planned.evaluate(1, quiet=True).returns
 
 
-def test_calls_of_a_skill_with_a_part_are_compared_by_all() -> None:
+@pytest.mark.parametrize("declares", [{"sees": (1, 0)}, {"policy": sw.Residual(lambda o: -o)}])
+def test_calls_of_a_part_or_a_correction_are_compared_by_all(declares: Any) -> None:
     algorithm = sw.PPO(num_envs=4, n_steps=16, network=sw.Network((8,), sees=(0,)))
-    own = type("Own", (sw.Skill,), {"sees": (1, 0), "algorithm": algorithm, "max_steps": 3})
+    own = type("Own", (sw.Skill,), {"algorithm": algorithm, "max_steps": 3, **declares})
     rule = {"selector": lambda obs: ["own"] * len(obs)}
     env = sw.EnvSpec(Point, engine="sync", workers=1)
     run = declared([own()], env=env, steps=64, **rule).train(quiet=True)

@@ -365,6 +365,13 @@ def test_a_network_that_leaves_out_the_goal_is_refused():
     declared(algorithm=sw.PPO(network=sw.Network((8,), sees=(0, "goal")))).check_spaces()
 
 
+def test_a_network_that_sees_what_is_not_there_is_named_with_its_skill():
+    wrong = sw.PPO(network=sw.Network((8,), sees=("observatoin", "goal")))
+    words = "skill 'go_to': Network.sees names 'observatoin', .* is 'observation' meant?"
+    with pytest.raises(DeclarationError, match=words):
+        declared(algorithm=wrong).check_spaces()
+
+
 def test_goals_are_the_same_for_the_same_seed(tmp_path):
     run = declared().train(tmp_path / "run", quiet=True)
 
