@@ -143,9 +143,8 @@ def leaves(goal: Any) -> list[Any]:
 def filled(goal: Any, value: Any) -> Any:
     """Return a goal (1, ...) after a value, or one for each of its parts, was written into it."""
     if (names := goal.dtype.names) is not None:
-        parts = value
-        if isinstance(value, tuple | list):
-            parts = dict(zip(names, value, strict=True))
+        by_place = isinstance(value, tuple | list)
+        parts = dict(zip(names, value, strict=True)) if by_place else value
         for name in names:
             filled(goal[name], parts[name])
         return goal
@@ -287,9 +286,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
     def seen(self, name: str, parts: Any) -> Any:
         """Return an input: its parts, joined and scaled."""
         x = np.concatenate([scaled(self.part(part), part) for part in parts], axis=1)
-        return scaled(x, self.entry["scaling"].get(name, {})).reshape(
-            1, *self.entry["shapes"][name]
-        )
+        x = scaled(x, self.entry["scaling"].get(name, {}))
+        return x.reshape(1, *self.entry["shapes"][name])
 
     def part(self, part: Any) -> Any:
         """Return the numbers of a part of an input, (1, K)."""
@@ -353,9 +351,8 @@ class _Model(_Code):  # a model from elsewhere, or a function, behind a mapping
             return to[int(x.argmax())] + space["start"]
         sizes = np.ravel(space["n"] if space["type"] == "Discrete" else space["nvec"])
         parts = np.split(x[0], np.cumsum(sizes)[:-1])
-        return (
-            np.reshape([part.argmax() for part in parts], np.shape(space["start"])) + space["start"]
-        )
+        best = np.reshape([part.argmax() for part in parts], np.shape(space["start"]))
+        return best + space["start"]
 
 
 class _Part(_Model):  # a policy that sees and writes a part, perhaps as a correction of another
@@ -491,8 +488,9 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         if not may.any():
             raise ValueError(f"no skill may start in observation {self.runner.obs[0]}")
         choice, goals = self.parted(self.selector.act(may[None], self))
-        if not any(choice == i for i in np.flatnonzero(may)):
-            names = [self.skills[i // lengths]["name"] for i in np.flatnonzero(may)]
+        free = np.flatnonzero(may).tolist()
+        if choice not in free:
+            names = dict.fromkeys(self.skills[i // lengths]["name"] for i in free)
             raise ValueError(f"the selector chose {choice}; it may choose {', '.join(names)}")
         return choice, goals
 
@@ -672,10 +670,8 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
         reward = self.advance([*events, False, True], values)
         call = self.calls[-1]
         call.steps += 1
-        call.reward, call.discount = (
-            call.reward + call.discount * reward,
-            call.discount * self.entry["gamma"],
-        )
+        call.reward += call.discount * reward
+        call.discount *= self.entry["gamma"]
         if len(self.lengths) and last.why == LIMIT:
             at = min(np.searchsorted(self.lengths, call.steps), len(self.lengths) - 1)
             call.choice = last.skill * len(self.lengths) + int(at)
@@ -700,11 +696,9 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
 
     def features(self) -> list[Any]:
         """Return what each skill's calls are compared by, (F,) each."""
-        each, obs = [], self.runner.obs
+        each, obs, kinds = [], self.runner.obs, ("mean", "scale", "varies", "places")
         for i, code in enumerate(self.entry["features"]):
-            part: Any = {
-                k: self.data.get(f"{k}.{i}") for k in ("mean", "scale", "varies", "places")
-            }
+            part: Any = {k: self.data.get(f"{k}.{i}") for k in kinds}
             raw: Any = self.runner.code[code](obs) if code else np.reshape(obs, (1, -1))
             raw = raw if code else raw.astype("f4")[:, part["places"]]
             raw = np.asarray(raw, "f8").ravel()
