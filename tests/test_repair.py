@@ -295,8 +295,8 @@ def test_measuring_stops_and_says_what_was_not_measured(
     first = declare(Wrong(), Flip(), steps=512).train(tmp_path / "run", quiet=True)
     (result,) = repaired(first, tmp_path / "new", **SHORT | {"calls": 100_000}).repairs
     stopped = (
-        r"Measuring stopped after 4,\d+ steps: press was called \d+ times of 100,000 after flip, "
-        r"which was done in [\d,]+ of [\d,]+ calls\.$"
+        r"Measuring stopped after 4,\d+ steps: 100,000 calls of press after flip were wanted, and "
+        r"there were \d+; flip was done in [\d,]+ of [\d,]+ calls\.$"
     )
     assert re.search(stopped, result.blame)
     assert re.search(r"so the earlier weights are kept\. " + stopped, result.sentence)

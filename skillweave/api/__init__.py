@@ -1001,7 +1001,7 @@ class Run:
         if goal is not None:
             if skill is None:
                 raise DeclarationError(
-                    f"{who}: goal is {short(goal)}, and a goal is given to one skill that acts alone: "
+                    f"{who}: goal is {short(goal)}, and one skill that acts alone is given a goal: "
                     'name it, skill="go_to"'
                 )
             return self._alone(skill).with_goal(goal, who)

@@ -12,7 +12,14 @@ from skillweave.envs.infos import MASK, batched_infos, checked_mask, observes_ma
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
 from skillweave.messages import short
-from skillweave.spaces import choice_counts, env_form, obs_dtype, obs_shape, put_observation
+from skillweave.spaces import (
+    allows_each,
+    choice_counts,
+    env_form,
+    obs_dtype,
+    obs_shape,
+    put_observation,
+)
 from skillweave.spaces.packing import parts
 from skillweave.types import Array, Memory, Policy, Step
 
@@ -140,8 +147,7 @@ class Player:
             allowed = checked_mask(mask, self.policy.action_space)
         except ValueError as error:
             raise DeclarationError(f"act(): {error}") from error
-        starts = np.cumsum((0, *self._choices[:-1]))
-        if not np.logical_or.reduceat(allowed, starts).all():
+        if not allows_each(allowed, self._choices):
             raise DeclarationError("act(): its action_mask allows no action")
         return allowed[None]
 

@@ -22,8 +22,8 @@ from skillweave.runs.initial_policies import (
     Learnt,
     learners_of_run,
     options_of,
-    recorded_part,
     record_initial_policies,
+    recorded_part,
     same_shapes,
 )
 from skillweave.seeding import Seeds

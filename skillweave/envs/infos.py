@@ -15,6 +15,7 @@ from skillweave.messages import short
 from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import (
     action_codec,
+    allows_each,
     choice_counts,
     obs_dtype,
     obs_shape,
@@ -256,7 +257,7 @@ class ActionMasks:
         self._space = space
         self._num_envs = num_envs
         self._observed = observation_space is not None and observes_mask(observation_space, space)
-        self._parts = choice_counts(space)
+        self._choices = choice_counts(space)
         self.now = now
         """(N, A) bool; None: no environment has returned a mask so far. Never changed in place."""
 
@@ -280,21 +281,21 @@ class ActionMasks:
         value = info.get("action_mask")
         if value is None and self._observed and obs is not None:
             value = obs[MASK].reshape(len(obs), -1)
-        if not self._parts or (value is None and self.now is None):
+        if not self._choices or (value is None and self.now is None):
             return
         ids = np.arange(self._num_envs) if ids is None else ids
-        size = sum(self._parts)
+        size = sum(self._choices)
         mask = np.ones((len(ids), size), bool)
         if value is not None:
             present = np.asarray(info.get("_action_mask", np.ones(len(ids), bool)))
             mask[present] = self._checked(value, (len(ids), size))[present]
-        starts = np.cumsum((0, *self._parts[:-1]))
-        free = np.logical_or.reduceat(mask, starts, axis=1).all(axis=1)
+        free = allows_each(mask, self._choices)
         over = np.zeros(len(ids), bool) if ended is None else ended
         if not (free | over).all():
             raise EnvError(
                 f"environment {ids[np.flatnonzero(~free & ~over)[0]]} allows no action, though its "
-                "episode continues: its action_mask is 0 everywhere; allow at least one action"
+                "episode continues: its action_mask is 0 for all values of a choice; allow at "
+                "least one"
             )
         mask[~free] = True
         now = np.ones((self._num_envs, size), bool) if self.now is None else self.now.copy()

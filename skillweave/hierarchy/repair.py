@@ -270,9 +270,9 @@ def measure(
             shortage = ""
             if seen < calls:
                 shortage = (
-                    f"Measuring stopped after {steps:,} steps: {skill} was called {seen:,} times "
-                    f"of {calls:,} after {after}, which was done in {succeeded:,} of {tried:,} "
-                    "calls."
+                    f"Measuring stopped after {steps:,} steps: {calls:,} calls of {skill} after "
+                    f"{after} were wanted, and there were {seen:,}; {after} was done in "
+                    f"{succeeded:,} of {tried:,} calls."
                 )
                 tell(shortage)
             gain = np.mean(rates[True]) - np.mean(rates[False]) if all(rates.values()) else 0.0

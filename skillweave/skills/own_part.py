@@ -570,12 +570,10 @@ class OwnPart:
 
     def _free(self, own: Array) -> Array:
         """Return where each of its own parts has an allowed choice, (…) bool."""
-        from skillweave.spaces import choice_counts  # needs torch
+        from skillweave.spaces import allows_each, choice_counts  # needs torch
 
         assert self.written is not None
-        starts = np.cumsum([0, *choice_counts(self.written.space)[:-1]])
-        free = np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1)
-        return np.asarray(free)
+        return np.asarray(allows_each(own, choice_counts(self.written.space)))
 
     def check_mask(self, mask: Array | None, action: Array) -> None:
         """Raise a SkillError where a mask (n, A) leaves it no choice, or forbids the rest.

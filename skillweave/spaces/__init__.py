@@ -4,7 +4,13 @@
 networks; ``ActionCodec`` converts actions of a policy to the environment's.
 """
 
-from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec, choice_counts
+from skillweave.spaces.action_codec import (
+    ActionCodec,
+    JointCodec,
+    action_codec,
+    allows_each,
+    choice_counts,
+)
 from skillweave.spaces.choices import (
     ChoiceCodec,
     ChoiceSpace,
@@ -24,6 +30,7 @@ __all__ = [
     "NumberedChoiceCodec",
     "ObsCodec",
     "action_codec",
+    "allows_each",
     "choice_codec",
     "choice_counts",
     "env_form",

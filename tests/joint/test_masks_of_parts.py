@@ -192,7 +192,7 @@ def test_a_mask_of_a_tuple_may_be_one_list():
     assert checked_mask([1, 0, 1, 1, 0], space).tolist() == expected
     assert checked_mask([[1, 0], (1, 1, 0)], space).tolist() == expected
     assert checked_mask((None, [1, 1, 0]), space).tolist() == [True, True, True, True, False]
-    with pytest.raises(ValueError, match="has 3 parts, but actions of .* have 2"):
+    with pytest.raises(ValueError, match=r"has 3 parts, but actions of .* have 2"):
         checked_mask(([1, 0], [1, 1, 1], [1]), space)
 
 
