@@ -131,7 +131,7 @@ class Player:
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
-        if self._needs_goal:  # of a skill that acts alone, where the episode starts
+        if self._needs_goal:  # where the episode starts
             assert isinstance(self.policy, SkillAlone)
             self.policy.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
             self._needs_goal = False  # only now: without its goal it must not act

@@ -573,7 +573,7 @@ class OwnPart:
         from skillweave.spaces import allows_each, choice_counts  # needs torch
 
         assert self.written is not None
-        return np.asarray(allows_each(own, choice_counts(self.written.space)))
+        return allows_each(own, choice_counts(self.written.space))
 
     def check_mask(self, mask: Array | None, action: Array) -> None:
         """Raise a SkillError where a mask (n, A) leaves it no choice, or forbids the rest.

@@ -277,8 +277,7 @@ def allows_each(mask: Array, counts: Sequence[int]) -> Array:
         counts: the number of values of each choice, as of ``choice_counts``.
     """
     starts = np.cumsum((0, *counts[:-1]))
-    free: Array = np.logical_or.reduceat(mask, starts, axis=-1).all(axis=-1)
-    return free
+    return np.asarray(np.logical_or.reduceat(mask, starts, axis=-1).all(axis=-1))
 
 
 def _joint(space: gym.Space[Any], place: tuple[str, ...]) -> JointCodec:
