@@ -24,7 +24,7 @@ from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
-from skillweave.types import Array, Memory, Policy, Step
+from skillweave.types import Array, Memory, Policy, Step, prefixed, unprefixed
 
 
 class OwnPolicy:
@@ -64,7 +64,7 @@ class OwnPolicy:
         memory = self.policy.start(n)
         if self._base is None:
             return memory
-        return _joined(memory, self._base.start(n))
+        return memory | prefixed(BASE, self._base.start(n))
 
     def act(
         self,
@@ -87,7 +87,7 @@ class OwnPolicy:
         memory, of_base = _split(memory)
         base, of_base = self._base.act(of_base, own, None, deterministic=True, rng=rng)
         learnt, memory = self.policy.act(memory, own, mask, **how)
-        return self._part.correction.apply(base, learnt), _joined(memory, of_base)
+        return self._part.correction.apply(base, learnt), memory | prefixed(BASE, of_base)
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Let the policy notice a step, of which the action is the skill's own part."""
@@ -96,7 +96,7 @@ class OwnPolicy:
             return self.policy.observe(memory, step)
         memory, of_base = _split(memory)
         of_base = self._base.observe(of_base, step)
-        return _joined(self.policy.observe(memory, step), of_base)
+        return self.policy.observe(memory, step) | prefixed(BASE, of_base)
 
     def _seen(self, obs: Array) -> Array:
         """Return what the policy sees of observations that hold the task's state."""
@@ -108,18 +108,15 @@ class OwnPolicy:
         return source_of(self.policy)
 
 
-BASE = "base."
+BASE = "base"
 """Begins the names in a memory of what a policy that is corrected remembers."""
 
 
 def _split(memory: Memory) -> tuple[Memory, Memory]:
     """Return the memory of the correction, and of the policy that it corrects."""
-    base = {k.removeprefix(BASE): v for k, v in memory.items() if k.startswith(BASE)}
-    return {k: v for k, v in memory.items() if not k.startswith(BASE)}, base
-
-
-def _joined(memory: Memory, base: Memory) -> Memory:
-    return memory | {f"{BASE}{k}": v for k, v in base.items()}
+    base = unprefixed(BASE, memory)
+    beside = prefixed(BASE, base)
+    return {k: v for k, v in memory.items() if k not in beside}, base
 
 
 class OwnSelector(ReadySelector):

@@ -202,7 +202,7 @@ class CallGraph:
         self._after: Near | None = None
 
     @property
-    def groups(self) -> list[tuple[int, Group]]:
+    def groups(self) -> list[tuple[int, OptionGroup]]:
         """All options in their order: the choice, and options of it that share their calls."""
         return [
             (choice, group)
@@ -415,7 +415,7 @@ class CallGraph:
 
 
 @dataclass(frozen=True)
-class Group:
+class OptionGroup:
     """Options whose calls count for one another: one, or the goals of the nearest calls."""
 
     options: int
@@ -458,7 +458,7 @@ class Options:
         """
         raise NotImplementedError
 
-    def groups(self, k: int) -> list[Group]:
+    def groups(self, k: int) -> list[OptionGroup]:
         """Return the options in their order, with the pieces that count for them, by tie order."""
         raise NotImplementedError
 
@@ -513,13 +513,13 @@ class Apart(Options):
         pieces = self._rows[places] if len(self._rows) else places
         return pieces, far, np.repeat(self._goal[None], len(to), axis=0)
 
-    def groups(self, k: int) -> list[Group]:
+    def groups(self, k: int) -> list[OptionGroup]:
         """Return a group for each option; see ``Options.groups``."""
         groups = []
         for some, goal, usual in zip(self._mine, self._goal, self.usual(k), strict=True):
             mine = some[tie_order(len(some))]
             goals = np.full(len(mine), goal)
-            groups.append(Group(1, self._rows[mine], self._starts[mine], goals, usual))
+            groups.append(OptionGroup(1, self._rows[mine], self._starts[mine], goals, usual))
         return groups
 
     def usual(self, k: int) -> list[float]:
@@ -555,10 +555,11 @@ class ByGoal(Options):
         pieces, far, goal = self._near(to, k, without)
         return pieces, _without_far(far, self.usual(k)), goal
 
-    def groups(self, k: int) -> list[Group]:
+    def groups(self, k: int) -> list[OptionGroup]:
         """Return one group, of all options; see ``Options.groups``."""
-        mine, usual = tie_order(len(self._rows)), self.usual(k)
-        return [Group(self.count, self._rows[mine], self._starts[mine], self._call[mine], usual)]
+        mine = tie_order(len(self._rows))
+        rows, starts, call = self._rows[mine], self._starts[mine], self._call[mine]
+        return [OptionGroup(self.count, rows, starts, call, self.usual(k))]
 
     def usual(self, k: int) -> float:
         """Return the usual distance of an option's k-th neighbour."""

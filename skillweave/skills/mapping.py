@@ -143,7 +143,7 @@ KINDS: dict[str, type[Any]] = {
 class Acts:
     """A policy's output as an action: clipped, then ``number * scale + offset``.
 
-    Whole numbers of a Box are the nearest to these.
+    Where actions are whole numbers of a Box, the result is rounded.
 
     ```python
     import skillweave as sw
