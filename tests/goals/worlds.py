@@ -47,6 +47,22 @@ class Point(gym.Env):
         return self._obs(), float(far < 0.2), False, self.steps >= 30, {"success": far < 0.2}
 
 
+class Drawn(Point):
+    """A point that can be filmed."""
+
+    metadata: Any = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self) -> Any:
+        frame = np.full((64, 64, 3), 220, np.uint8)
+        x, y = (16 * (self.place + 2)).astype(int).clip(2, 61)
+        frame[y - 2 : y + 3, x - 2 : x + 3] = (200, 30, 30)
+        return frame
+
+
 def place_of(obs: Any) -> Any:
     """Return where the point is, (n, 2)."""
     return obs["place"] if obs.dtype.fields else obs

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from goals.worlds import declared
+from goals.worlds import Drawn, declared
 from reporting.cart import RECIPE
 from reporting.walkway import CALLS, declare
 
@@ -45,7 +46,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     how: dict[str, Any] = {"episodes": 5, "filmed": 2}
     opened = RunDirectory.open(folder / "walk")
     write_report(opened, found["walk"], run.policy, run.declaration.spec, **how)
-    aims = declared().train(folder / "goals", quiet=True)
+    aims = declared(env=Drawn).train(folder / "goals", quiet=True)
+    aims.log_calls(200, num_envs=2)
     write_report(
         RunDirectory.open(aims.path), found["goals"], aims.policy, aims.declaration.spec, episodes=2
     )
@@ -261,6 +263,29 @@ def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> 
     )
     assert (opened.said, opened.foreign()) == ([], [])
     opened.page.close()
+
+
+def test_films_of_hand_overs_and_choices_name_goals(browser: Any, pages: dict[str, Path]) -> None:
+    opened = Opened(browser, pages["goals"])
+    page, goal = opened.page, "(0.9, 0.9)"
+    page.wait_for_function("document.getElementById('pair-video').readyState >= 2")
+    assert re.match(r"go_to \(\S+, \S+\)( ends|: )", page.inner_text("#pair-now"))
+    cues = """() => {
+        const track = document.querySelector("#pair-video track").track;
+        track.mode = "showing";
+        return [...(track.cues ?? [])].map(cue => cue.text);
+    }"""
+    page.evaluate(cues)
+    page.wait_for_function(f"({cues})().length > 0")
+    words = page.evaluate(cues)
+    assert all(re.fullmatch(r"go_to \(\S+, \S+\)( ends)?", text) for text in words)
+    points = page.locator("#choices .mark-symbol path")
+    points.first.scroll_into_view_if_needed()
+    points.first.hover(force=True)
+    page.wait_for_selector("#vg-tooltip-element.visible")
+    assert goal in page.inner_text("#vg-tooltip-element")
+    assert (opened.said, opened.foreign()) == ([], [])
+    page.close()
 
 
 def test_charts_follow_what_is_chosen(browser: Any, pages: dict[str, Path]) -> None:

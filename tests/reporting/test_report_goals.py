@@ -9,8 +9,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from goals.worlds import SPACES, GoTo, Rest, aim_of, declared
+from goals.worlds import SPACES, Drawn, GoTo, Rest, aim_of, declared
 
+from skillweave.reporting.report.calls import decision_data
+from skillweave.reporting.report.charts import choices
+from skillweave.reporting.report.hand_over import hand_over_section
 from skillweave.reporting.report.single import play_episodes
 from skillweave.skills.goal_spaces import shown_goal
 
@@ -112,6 +115,42 @@ def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
     played = play_episodes(run.policy, run.declaration.spec, 4, 0, 0, True, 2)
     encoding = played.goals[0]["spec"]["encoding"]
     assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
+
+
+def test_films_of_hand_overs_and_choices_name_goals(tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    skills = [walks("two", SPACES["box"]), walks("other", SPACES["dict"]), Rest()]
+
+    def selector(obs: Any) -> Any:
+        names = np.where(obs[:, 0] < 0, "two", np.where(obs[:, 1] < 0, "other", "rest"))
+        side = (obs[:, 0] > 0.2).astype(int)
+        return names, {"two": -obs.clip(-1, 1), "other": {"at": -obs.clip(-1, 1), "side": side}}
+
+    run = declared(skills, env=Drawn, selector=selector).train(tmp_path / "run", quiet=True)
+    log, spec = run.log_calls(400, num_envs=2), run.declaration.spec
+    with_goals = {skill.name: skill for skill in skills[:2]}
+    section = hand_over_section(log, spec, {}, with_goals, filmed=True)
+    clips = [(c, clip) for c in section.data["hand_over"]["cells"].values() for clip in c["clips"]]
+    assert {cell["skill"] for cell, _ in clips} == {"two", "other", "rest"}
+    for cell, clip in clips:
+        for skill, goal in ((cell["skill"], "goal"), (cell["before"], "before_goal")):
+            form = {"two": r"\(\S+, \S+\)", "other": r"\(at \(\S+, \S+\), side [01]\)"}
+            assert re.fullmatch(form.get(skill, ""), clip[goal])
+    logged = {shown_goal(goal.astype(np.float32)) for goal in log.goals["two"][log.skill == 0]}
+    assert {clip["goal"] for cell, clip in clips if cell["skill"] == "two"} <= logged
+    none = hand_over_section(log, spec, {}, {}, filmed=True).data["hand_over"]["cells"]
+    assert {clip["goal"] for cell in none.values() for clip in cell["clips"]} == {""}
+
+    played = play_episodes(run.policy, spec, 4, 0, 0, True, 2)
+    decisions = decision_data(played.log)
+    called = [call for episode in played.log.episodes for call in episode.calls]
+    assert decisions["goals"] == [call.goal for call in called]
+    assert len(decisions["goals"]) == len(decisions["rows"])
+    fields = [
+        [f["field"] for f in choices(["two"], ["red"], goals=g)["encoding"]["tooltip"]]
+        for g in (True, False)
+    ]
+    assert fields == [["what", "x", "y", "goal"], ["what", "x", "y"]]
 
 
 def test_a_report_without_goals_has_none(tmp_path: Path) -> None:

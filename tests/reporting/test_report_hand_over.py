@@ -44,7 +44,7 @@ def log(run: Run) -> CallLog:
 
 def section(log: CallLog, spec: Any = None, filmed: bool = True) -> hand_over.Section:
     spec = EnvSpec(Ragged) if spec is None else spec
-    return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, filmed=filmed)
+    return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
 
 
 def test_the_matrix_and_the_ends(log: CallLog) -> None:

@@ -119,7 +119,8 @@ def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[st
     """Return the decisions by observation: names of coordinates, and a row for each decision.
 
     A row is the coordinates, then the skill, then whether its call succeeded (None: not known).
-    Only coordinates that vary are there; the episode's step is the last one.
+    Only coordinates that vary are there; the episode's step is the last one. Each row has its goal
+    in words; empty: it has none.
     """
     calls = [call for episode in log.episodes for call in episode.calls]
     every = -(-len(calls) // MOST_DECISIONS)
@@ -132,7 +133,9 @@ def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[st
         [*(rounded(v[i]) for v in columns.values()), call.skill, call.succeeded]
         for i, call in enumerate(calls)
     ]
-    return {"names": list(columns), "rows": table if columns else [], "every": every}
+    rows = table if columns else []
+    goals = [call.goal for call in calls]
+    return {"names": list(columns), "rows": rows, "goals": goals, "every": every}
 
 
 def seen(calls: Sequence[Call], named: ObsNames | None) -> tuple[list[str], list[list[float]]]:

@@ -76,8 +76,14 @@ def curve(label: str, color: str) -> Spec:
     return chart(f"Learning curve of {label}", 190, encoding=encoding, layer=layers)
 
 
-def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
-    """Return a chart of decisions over two coordinates; the page sets values and names."""
+def choices(skills: Sequence[str], colors: Sequence[str], *, goals: bool = False) -> Spec:
+    """Return a chart of decisions over two coordinates; the page sets values and names.
+
+    Args:
+        skills: their names.
+        colors: of each skill.
+        goals: the values have goals, in words.
+    """
     scale = {"domain": list(skills), "range": list(colors)}
     shapes = ["circle", "square", "triangle-up", "diamond", "cross", "triangle-down"]
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
@@ -91,6 +97,7 @@ def choices(skills: Sequence[str], colors: Sequence[str]) -> Spec:
             {"field": "what", "title": "chosen"},
             {"field": "x", "format": ",.4~r"},
             {"field": "y", "format": ",.4~r"},
+            *([{"field": "goal"}] if goals else []),
         ],
     }
     mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}

@@ -35,6 +35,9 @@ from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.seeding import Seeds, global_generators
+from skillweave.skills import Skill
+from skillweave.skills.goal_spaces import shown_goal
+from skillweave.skills.goals import goals_of
 from skillweave.spaces import env_form
 from skillweave.types import Array
 
@@ -88,13 +91,19 @@ class _Cell:
 
 
 def hand_over_section(
-    log: CallLog, spec: EnvSpec | None, colors: Mapping[str, str], *, filmed: bool
+    log: CallLog,
+    spec: EnvSpec | None,
+    colors: Mapping[str, str],
+    with_goals: Mapping[str, Skill],
+    *,
+    filmed: bool,
 ) -> Section:
     """Return the section for a log.
 
     Args:
         spec: of the environment; None: unknown, so nothing can be filmed.
         colors: of the skills.
+        with_goals: the skills with goals, by path.
         filmed: play calls again, and film them.
     """
     matrix, missing = log.hand_over(), []
@@ -118,7 +127,8 @@ def hand_over_section(
     done = ("done", "not done")
     data = {
         "cells": {
-            f"{i}-{j}": _cell(matrix, i, j, log, cell, film) for (i, j), cell in cells.items()
+            f"{i}-{j}": _cell(matrix, i, j, log, cell, film, with_goals)
+            for (i, j), cell in cells.items()
         },
         "colors": dict(colors),
         "words": list(done),
@@ -228,7 +238,13 @@ def _points(
 
 
 def _cell(
-    matrix: HandOver, i: int, j: int, log: CallLog, cell: _Cell, film: Film | None
+    matrix: HandOver,
+    i: int,
+    j: int,
+    log: CallLog,
+    cell: _Cell,
+    film: Film | None,
+    with_goals: Mapping[str, Skill],
 ) -> dict[str, Any]:
     """Return a cell for the page's script."""
     calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
@@ -246,11 +262,22 @@ def _cell(
                 "to": clip.frame + -(-(clip.lead + clip.steps) // film.every) + HOLD,
                 "done": bool(log.succeeded[clip.row]),
                 "steps": int(log.tau[clip.row]),
+                "goal": _goal(log, clip.row, with_goals),
+                "before_goal": _goal(log, _before(log, clip.row), with_goals) if i else "",
             }
             for clip in cell.clips
             if film is not None
         ],
     }
+
+
+def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
+    """Return the goal of a call in words; empty: it has none, or its space is not known."""
+    name = log.skills[int(log.skill[row])]
+    goals, numbers = goals_of(with_goals.get(name)), log.goals.get(name)
+    if goals is None or numbers is None or numbers.shape[1] != goals.size:
+        return ""
+    return shown_goal(goals.from_flat(numbers[[row]])[0])
 
 
 # The film

@@ -203,7 +203,10 @@ def write_report(
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
     log = _log(run, missing)
-    section = None if log is None else _hand_over(log, spec, colors, filmed > 0, missing)
+    with_goals = {} if played is None else played.with_goals
+    section = (
+        None if log is None else _hand_over(log, spec, colors, with_goals, filmed > 0, missing)
+    )
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
@@ -242,11 +245,12 @@ def _hand_over(
     log: CallLog,
     spec: EnvSpec | None,
     colors: Mapping[str, str],
+    with_goals: Mapping[str, Skill],
     filmed: bool,
     missing: list[str],
 ) -> Section:
     """Return the section about the run's log of calls; add what is missing."""
-    section = hand_over_section(log, spec, colors, filmed=filmed)
+    section = hand_over_section(log, spec, colors, with_goals, filmed=filmed)
     missing += section.missing
     return section
 
@@ -418,6 +422,7 @@ def _episodes(played: Played) -> dict[str, Any]:
         decisions = decision_data(log, played.named)
         used = sorted({row[-2] for row in decisions["rows"]})
         names = [log.labels[i] for i in used]
-        decisions["spec"] = charts.choices(names, [colors[i] for i in used])
+        goals = any(decisions["goals"])
+        decisions["spec"] = charts.choices(names, [colors[i] for i in used], goals=goals)
         data["decisions"] = decisions
     return data

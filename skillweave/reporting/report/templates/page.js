@@ -79,7 +79,7 @@
   // The selector's choices
 
   const drawChoices = () => {
-    const { names, rows, spec } = data.decisions;
+    const { names, rows, goals, spec } = data.decisions;
     const [across, up] = [$("across"), $("up")].map((s) => Number(s.value));
     const bySuccess = $("hue").value === "success";
     const word = (row) => {
@@ -87,7 +87,7 @@
       const succeeded = row[names.length + 1];
       return succeeded === null ? "not known" : succeeded ? "success" : "no success";
     };
-    const values = rows.map((row) => ({ x: row[across], y: row[up], what: word(row) }));
+    const values = rows.map((row, i) => ({ x: row[across], y: row[up], what: word(row), goal: goals[i] || "none" }));
     const shown = structuredClone(spec);
     shown.data = { values };
     const titles = { x: names[across], y: names[up] };
@@ -120,8 +120,9 @@
     }
   }
 
-  // Films: one file each, with the skills' names as captions
+  // Films: one file each, with the skills' names and goals as captions
 
+  const withGoal = (skill, goal) => [skill, goal].filter(Boolean).join(" ");
   const load = (video, id, fps, cues) => {
     const bytes = Uint8Array.from(atob($(id).textContent.trim()), (c) => c.charCodeAt(0));
     video.src = URL.createObjectURL(new Blob([bytes], { type: "video/mp4" }));
@@ -195,7 +196,8 @@
     }
     if (video) {
       load(video, "hand-film", film.fps, Object.values(cells).flatMap(({ skill, before, clips }) =>
-        clips.flatMap((c) => [[c.from, c.call, `${before} ends`], [c.call, c.to, skill]])));
+        clips.flatMap((c) => [
+          [c.from, c.call, `${withGoal(before, c.before_goal)} ends`], [c.call, c.to, withGoal(skill, c.goal)]])));
       const follow = () => {
         if (!clip) return;
         const frame = Math.floor(video.currentTime * film.fps + 1e-3);
@@ -204,8 +206,8 @@
           if (frame > clip.to || frame < clip.from) video.currentTime = (clip.from + 0.5) / film.fps;
         }
         const { skill, before } = cells[cell];
-        $("pair-now").textContent = frame < clip.call ? `${before} ends` :
-          `${skill}: ${clip.done ? "done" : "not done"} after ${clip.steps} steps`;
+        $("pair-now").textContent = frame < clip.call ? `${withGoal(before, clip.before_goal)} ends` :
+          `${withGoal(skill, clip.goal)}: ${clip.done ? "done" : "not done"} after ${clip.steps} steps`;
       };
       video.addEventListener("timeupdate", follow);
       video.addEventListener("seeked", follow);
@@ -243,7 +245,7 @@
   };
   // The skill of a call, with its goal.
   const called = (episode, i) =>
-    [data.labels[episode.calls[i][0]], episode.goals?.[i]].filter(Boolean).join(" ");
+    withGoal(data.labels[episode.calls[i][0]], episode.goals?.[i]);
   const words = (episode, [, start, steps, why, reward, , succeeded], i) =>
     `call ${i + 1}: ${called(episode, i)}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
     `reward ${signed(reward)}${succeeded === null ? "" : succeeded ? ", success" : ", no success"}`;
