@@ -41,6 +41,8 @@ FIRST_SEED = 1_000_000
 """Episode i of ``evaluate(seed=s)`` starts from Gymnasium seed ``FIRST_SEED·(s + 1) + i``."""
 USUAL_ENVS = 16
 """Environments side by side in an evaluation where ``num_envs`` is not given."""
+SEEMS_ENDLESS = 1_000
+"""Steps of an episode without a known limit after which an evaluation says where it will be cut."""
 
 
 @dataclass(frozen=True)
@@ -312,7 +314,7 @@ def _evaluate(
     watch: Callable[[Played], None] | None,
     info: tuple[str, ...] | None,
 ) -> Evaluation:
-    default_limit, threshold, pooled = _describe(spec)
+    own_limit, threshold, pooled = _describe(spec)
     envs = make_engine(spec, episodes if pooled else min(n, episodes))
     try:
         spaces = envs.observation_space, envs.action_space
@@ -324,7 +326,8 @@ def _evaluate(
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS
-        starts = SeededEpisodes(envs, seeds, limit or default_limit)
+        most = limit or longest_evaluation(own_limit)
+        starts = SeededEpisodes(envs, seeds, most)
         first = starts.obs[:1].copy()
         moments = play(
             policy,
@@ -333,6 +336,8 @@ def _evaluate(
             rng=np.random.default_rng([seed, 1]),
             seed=seed,
         )
+        if limit is None and own_limit is None:
+            moments = _with_notice(moments, spec.name, most)
         calls = None if info is None else PlayedCalls(policy, spaces, info=info)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
         if calls is not None:
@@ -344,14 +349,34 @@ def _evaluate(
         envs.close()
 
 
-def _describe(spec: EnvSpec) -> tuple[int, float | None, bool]:
-    """Return an environment's longest episode, reward threshold, and True if it is in a pool."""
+def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
+    """Return an environment's time limit, reward threshold, and True if it is in a pool."""
     env = spec.make()
     try:
         threshold = env.spec.reward_threshold if env.spec else None
-        return longest_evaluation(time_limit(env)), threshold, in_pool(spec, env)
+        return time_limit(env), threshold, in_pool(spec, env)
     finally:
         env.close()
+
+
+def _with_notice(moments: Iterator[Played], name: str, most: int) -> Iterator[Played]:
+    """Yield what is played; give a notice once where an episode seems to have no end of its own.
+
+    Args:
+        name: of the environment.
+        most: the steps after which an episode is cut.
+    """
+    told = False
+    for played in moments:
+        yield played
+        if not told and played.step.elapsed[~played.over].max(initial=0) >= SEEMS_ENDLESS:
+            told = True
+            notice(
+                f"{name}: an episode has run {SEEMS_ENDLESS:,} steps without an end, and no time "
+                f"limit is known: the evaluation cuts episodes after {most:,} steps. Give it a "
+                "smaller number, evaluate(max_steps=1000), or give the environment a limit: "
+                "EnvSpec(..., wrappers=(lambda env: gymnasium.wrappers.TimeLimit(env, 1000),))"
+            )
 
 
 def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> None:

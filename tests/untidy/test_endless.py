@@ -6,7 +6,7 @@ import pytest
 
 import skillweave as sw
 from skillweave.envs import checks
-from skillweave.training import stage_log
+from skillweave.training import evaluation, stage_log
 
 SMALL = sw.PPO(num_envs=2, n_steps=32, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
@@ -81,6 +81,34 @@ def test_evaluations_have_a_limit_of_their_own(tmp_path):
     assert (found.lengths, found.cut) == ((100,) * 3, 3)
     assert "3 never ended and were cut after 100 steps (max_steps)" in str(found)
     assert run.evaluate(2, max_steps=130).lengths == (130, 130)
+
+
+def test_an_evaluation_says_early_and_once_where_episodes_are_cut(monkeypatch):
+    monkeypatch.setattr(evaluation, "SEEMS_ENDLESS", 40)
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    at = []
+    message = (
+        r"Endless: an episode has run 40 steps without an end, and no time limit is known: the "
+        r"evaluation cuts episodes after 100 steps\. Give it a smaller number, "
+        r"evaluate\(max_steps=1000\)"
+    )
+
+    def watch(played):
+        at.append(len(told))
+
+    with pytest.warns(UserWarning, match=message) as told:
+        sw.evaluate(policy, Endless, episodes=3, num_envs=1, watch=watch)
+    assert len(told) == 1
+    assert at[:42] == [0] * 40 + [1] * 2  # while it is played
+
+
+def test_an_evaluation_with_a_limit_or_ends_says_nothing(monkeypatch):
+    monkeypatch.setattr(evaluation, "SEEMS_ENDLESS", 50)
+    policy = sw.from_function(lambda obs: np.zeros(len(obs), int))
+    limited = sw.EnvSpec(Endless, wrappers=(lambda e: gym.wrappers.TimeLimit(e, 80),))
+    assert sw.evaluate(policy, Endless, episodes=1, max_steps=80).lengths == (80,)
+    assert sw.evaluate(policy, limited, episodes=1).lengths == (80,)
+    assert sw.evaluate(policy, Limited, episodes=1).lengths == (50,)
 
 
 def test_a_longer_limit_that_is_known_is_kept(tmp_path):
