@@ -111,7 +111,11 @@ class Runner:
         return bool(np.asarray(self.code[name](about))[0])
 
     def action(self, value: Any) -> Any:
-        """Return an action that code gave, within its space."""
+        """Return an action that code gave, within the bounds of a Box.
+
+        Raises:
+            ValueError: it is none of the space.
+        """
         space = self.space
         dtype = self.space.get("dtype", "int64")
         shape = space.get("shape", np.shape(space.get("nvec", 0)))
@@ -120,10 +124,17 @@ class Runner:
             dtype = "int8"
         if space["type"] == "Box":
             value = np.reshape(value, shape)
+            if not np.isfinite(value).all():
+                raise ValueError(f"a policy returned the action {value}: NaN or an infinity")
             if np.dtype(dtype).kind in "iu" and value.dtype.kind == "f":
                 value = np.rint(value)
             value = np.clip(value, *bounds(space, dtype))
-        return np.asarray(value, dtype).reshape(shape)[()]
+            return np.asarray(value, dtype)[()]
+        given = np.reshape(value, shape)
+        action = np.nan_to_num(given).astype(dtype)
+        if not (inside(action[None], space) and (action == given).all()):
+            raise ValueError(f"a policy returned {given}, which is no action of {space}")
+        return action[()]
 
 
 def blank(entry: Any) -> Any:

@@ -11,8 +11,10 @@ import pytest
 import torch
 from test_networks import NESTED, one_by_one, same
 
+import skillweave as sw
 from skillweave import from_onnx, from_torch
 from skillweave.api.player import Player
+from skillweave.errors import PolicyError
 from skillweave.export.runner import Runner
 from skillweave.export.states import States
 from skillweave.export.write import write_export
@@ -124,3 +126,34 @@ def test_a_module_acts_as_here(tmp_path: Path) -> None:
     space = SPACES["MultiDiscrete"][0]
     policy = from_torch(Sees()).bind(NESTED, space, "it")
     assert len(compare(policy, tmp_path, 5)) > 1
+
+
+@pytest.mark.parametrize(
+    ("space", "returned"),
+    [
+        (gym.spaces.Discrete(3), 9),
+        (gym.spaces.Discrete(3), -1),
+        (gym.spaces.Discrete(3), 1.5),
+        (gym.spaces.Discrete(3), np.nan),
+        (gym.spaces.Discrete(3, start=2), 0),
+        (gym.spaces.MultiDiscrete([3, 2]), [1, 2]),
+        (gym.spaces.MultiBinary(2), [0, 3]),
+        (gym.spaces.Box(0, 2, (2,), np.int64), [np.nan, 1]),
+        (gym.spaces.Box(-1, 1, (2,), np.float32), [np.inf, 0]),
+    ],
+    ids=str,
+)
+def test_an_action_that_does_not_exist_is_refused_as_in_training(
+    space: Any, returned: Any, tmp_path: Path
+) -> None:
+    seen, obs = gym.spaces.Box(-1, 1, (2,), np.float32), np.zeros(2, np.float32)
+    policy = sw.from_function(
+        lambda obs: np.repeat(np.asarray(returned)[None], len(obs), 0),
+        observation_space=seen,
+        action_space=space,
+    )
+    with pytest.raises(PolicyError, match=r"no action of|NaN or an infinity|whole numbers"):
+        Player(policy).act(obs)
+    export = sw.save_policy(policy, tmp_path)
+    with pytest.raises(ValueError, match=r"a policy returned .*(no action of|NaN or an infinity)"):
+        Runner(tmp_path, export.functions).act(obs)
