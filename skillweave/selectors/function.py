@@ -99,7 +99,7 @@ class FunctionSelector(ReadySelector):
         choices = Discrete(len(self.skills))
         chosen = checked_actions(chosen, len(obs), choices, self._who, SkillError)
         if goals is None:
-            probe(function, arguments, len(obs), self._who, value)
+            probe(function, arguments, len(obs), self._who)
         self._check_starts(chosen, obs, mask)
         if not self.goal_spaces:
             return chosen, memory

@@ -42,8 +42,7 @@ def answer(
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
         raise SkillError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
-    result = None if may_change else array
-    probe(function, about, n, f"{who}: {method}()", result, repeats=not may_change)
+    probe(function, about, n, f"{who}: {method}()", answered=None if may_change else array)
     return array
 
 

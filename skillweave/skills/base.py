@@ -55,8 +55,7 @@ class Skill:
     Every method is batched: arrays over N environments in, one array (N,) out, so the same class
     runs on one environment and on a thousand. Methods must be functions of their arguments: keep no
     state of an environment in ``self`` (``step`` has the observation before and after). At its
-    first call each is called twice, and one that answers otherwise is refused. So is one whose
-    answer for an environment depends on the rows of others, as with ``step.goal[0]``.
+    first call each is called twice, and one that answers otherwise is refused.
 
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.
@@ -401,7 +400,7 @@ class Reflex:
             return np.repeat(self.fixed(space)[None], n, axis=0)
         result = called(self.action, obs, label)
         actions = checked_actions(result, n, space, label, SkillError)
-        probe(self.action, obs, n, label, result, space)
+        probe(self.action, obs, n, label, space)
         return actions
 
 

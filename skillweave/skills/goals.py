@@ -7,7 +7,6 @@ A skill with a goal is one policy for many tasks: its networks see the observati
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -33,7 +32,6 @@ from skillweave.skills.goal_spaces import (
     repeated,
 )
 from skillweave.skills.outputs import called
-from skillweave.skills.probing import probe
 from skillweave.types import Array, read_only
 
 
@@ -115,11 +113,8 @@ class Goals:
         Raises:
             SkillError: the skill's ``goals`` failed, or returned something else.
         """
-        draw, who, before = self.skill.goals, self._label, copy.deepcopy(rng)
-        given = called(lambda seen: draw(seen, rng), read_only(obs), who)
-        goals = self.fitted(obs, given, who)
-        probe(draw, (obs, before), len(obs), who, given, self.space)
-        return goals
+        given = called(lambda seen: self.skill.goals(seen, rng), read_only(obs), self._label)
+        return self.fitted(obs, given, self._label)
 
     def fitted(
         self, obs: Array, goal: Any, who: str, kind: type[SkillweaveError] = SkillError
@@ -138,10 +133,9 @@ class Goals:
         goals = as_goals(goal, len(obs), self.space, who, self._who, kind)
         if self.skill.defines("clip_goal"):
             who, kind = f"{self._who}: clip_goal()", SkillError
-            clip, chosen = self.skill.clip_goal, read_only(goals)
-            clipped = called(lambda seen: clip(seen, chosen), read_only(obs), who)
-            goals = as_goals(clipped, len(obs), self.space, who, self._who, kind)
-            probe(clip, (obs, chosen), len(obs), who, clipped, self.space)
+            goals = as_goals(
+                self._clipped(obs, goals, who), len(obs), self.space, who, self._who, kind
+            )
         return self._inside(goals, who, kind)
 
     def _inside(self, goals: Array, who: str, kind: type[SkillweaveError]) -> Array:
@@ -150,6 +144,9 @@ class Goals:
             advice = "" if self.skill.defines("clip_goal") else f"; {ADVICE}"
             raise kind(_is_out(goals[row], self.space, who, self._who) + advice)
         return goals
+
+    def _clipped(self, obs: Array, goal: Array, who: str) -> Any:
+        return called(lambda seen: self.skill.clip_goal(seen, read_only(goal)), read_only(obs), who)
 
     def one(self, goal: Any, who: str) -> Array:
         """Return a copy of one goal as a batch of one, checked.

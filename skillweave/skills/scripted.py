@@ -121,18 +121,16 @@ class ScriptedPolicy(MappedPolicy):
                 obs, goal = read_only(seen[OBSERVATION]), read_only(seen[GOAL])
                 return function(obs, goal=goal) if by_name else function(obs, goal)
 
-            value = called(both, given, who, kind=PolicyError)
-            arguments: Any = (given[OBSERVATION], given[GOAL])
-            names = (GOAL,) if by_name else ()
-        else:
-            value, arguments, names = called(function, given, who, kind=PolicyError), given, ()
+            action = called(both, given, who, kind=PolicyError)
+            return self._array(action, len(given))
+        value = called(function, given, who, kind=PolicyError)
         action = self._array(value, len(given))
         mapping = self.mapping
         space, n = self.action_space, len(given)
         if space is not None and mapping.acts is None and mapping.chunk is None:
             shape = space.shape or ()
             if action.shape == (n, *shape):
-                probe(function, arguments, n, who, value, space, PolicyError, names=names)
+                probe(function, given, n, who, space, PolicyError)
         return action
 
     def _array(self, value: Any, n: int) -> Array:
