@@ -366,11 +366,11 @@ def _with_notice(moments: Iterator[Played], name: str, most: int) -> Iterator[Pl
         name: of the environment.
         most: the steps after which an episode is cut.
     """
-    told = False
+    said = False
     for played in moments:
         yield played
-        if not told and played.step.elapsed[~played.over].max(initial=0) >= SEEMS_ENDLESS:
-            told = True
+        if not said and played.step.elapsed[~played.over].max(initial=0) >= SEEMS_ENDLESS:
+            said = True
             notice(
                 f"{name}: an episode has run {SEEMS_ENDLESS:,} steps without an end, and no time "
                 f"limit is known: the evaluation cuts episodes after {most:,} steps. Give it a "
