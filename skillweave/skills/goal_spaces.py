@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -183,6 +183,37 @@ def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
     from skillweave.spaces.packing import parts  # needs torch, which declaring does not
 
     return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
+
+
+def given_parts(space: gym.Space[Any], value: Any) -> dict[str, Any] | None:
+    """Return the parts of a value of a Dict or Tuple by name; None: its parts are others.
+
+    Those of a tuple or list have their places as names, those of a structured array its fields.
+    """
+    names, given = parts_of(space) or {}, value
+    if isinstance(value, tuple | list) and isinstance(space, gym.spaces.Tuple):
+        given = {str(place): part for place, part in enumerate(value)}
+    elif isinstance(value, np.ndarray) and value.dtype.names:
+        given = {name: value[name] for name in value.dtype.names}
+    if not isinstance(given, Mapping) or set(given) != set(names):
+        return None
+    return {name: given[name] for name in names}
+
+
+def in_words(space: gym.Space[Any], value: Any, each: Literal["part", "array"]) -> tuple[str, str]:
+    """Return what was given in place of parts, and which are expected, for messages.
+
+    Args:
+        each: the word for a part.
+    """
+    names = parts_of(space) or {}
+    expected = f"a dict {'with' if each == 'part' else 'of arrays for'} "
+    expected += ", ".join(map(repr, names))
+    if isinstance(space, gym.spaces.Tuple):
+        expected = f"a tuple of {len(names)} {each}s"
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        return short(list(value.dtype.names)), expected
+    return short(list(value) if isinstance(value, Mapping) else value), expected
 
 
 def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:

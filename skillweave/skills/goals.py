@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Dict, Tuple
+from gymnasium.spaces import Tuple
 
 from skillweave.errors import DeclarationError, EnvError, SkillError, SkillweaveError
 from skillweave.messages import short
@@ -22,7 +22,9 @@ from skillweave.skills.goal_spaces import (
     GOAL,
     OBSERVATION,
     example_of,
+    given_parts,
     goals_space,
+    in_words,
     joint_dtype,
     leaf_paths,
     numbers_in,
@@ -255,20 +257,17 @@ def as_goals(
         raise kind(f"{who} returned None, but goals {wanted} were expected: is a return missing?")
     inner = parts_of(space)
     if inner is not None and not isinstance(values, np.ndarray):
-        given = _parts_given(values, space)
-        if given is None:
-            what = f"a dict with {', '.join(map(repr, inner))}"
-            if isinstance(space, Tuple):
-                what = f"a tuple of {len(inner)} parts"
-            has = short(list(values)) if isinstance(values, Mapping) else short(values)
+        given = given_parts(space, values)
+        if given is None or (isinstance(space, Tuple) and isinstance(values, Mapping)):
+            has, expected = in_words(space, values, "part")
             raise kind(
-                f"{who} gave {has} as goals of {skill}, but {what} was expected: its goals are of "
-                f"{short(space)}"
+                f"{who} gave {has} as goals of {skill}, but {expected} was expected: its goals are "
+                f"of {short(space)}"
             )
         packed = np.zeros(n if rows is None else len(rows), dtype)
-        for (name, part), value in zip(inner.items(), given, strict=True):
+        for name, part in inner.items():
             whose = f"the part {name!r} of {skill}"
-            packed[name] = as_goals(value, n, part, who, whose, kind, rows)
+            packed[name] = as_goals(given[name], n, part, who, whose, kind, rows)
         return packed
     try:
         goals = np.asarray(values)
@@ -309,18 +308,6 @@ def _shape_of(value: Any) -> tuple[int, ...] | None:
         return shape
     except ValueError:
         return None
-
-
-def _parts_given(values: Any, space: Space[Any]) -> list[Any] | None:
-    """Return the parts of goals of a Dict or Tuple, in its order; None: they are others."""
-    if isinstance(space, Dict):
-        if not isinstance(values, Mapping) or set(space.spaces) != set(values):
-            return None
-        return [values[name] for name in space.spaces]
-    assert isinstance(space, Tuple)
-    if not isinstance(values, tuple | list) or len(values) != len(space.spaces):
-        return None
-    return list(values)
 
 
 def _is_out(goal: Array, space: Space[Any], who: str, skill: str) -> str:

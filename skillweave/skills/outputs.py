@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, NoReturn
 
@@ -14,6 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import error_text, short
+from skillweave.skills.goal_spaces import given_parts, in_words, parts_of
 from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.tracebacks import is_users
 from skillweave.types import Array, Step
@@ -177,25 +177,17 @@ def _checked_parts(
     value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError]
 ) -> Array:
     """Convert the parts of actions to one array (n,); see ``checked_actions``."""
-    from skillweave.spaces.packing import obs_dtype, parts  # needs torch
+    from skillweave.spaces.packing import obs_dtype  # needs torch
 
-    named = parts(space) or {}
-    given: Any = value
-    if isinstance(value, tuple | list) and isinstance(space, Tuple):
-        given = dict(zip(map(str, range(len(value))), value, strict=True))
-    elif isinstance(value, np.ndarray) and value.dtype.names:
-        given = {name: value[name] for name in value.dtype.names}
-    if not isinstance(given, Mapping) or set(given) != set(named):
-        what = f"a dict of arrays for {', '.join(map(repr, named))}"
-        if isinstance(space, Tuple):
-            what = f"a tuple of {len(named)} arrays"
-        has = short(list(given)) if isinstance(given, Mapping) else short(value)
+    given = given_parts(space, value)
+    if given is None:
+        has, expected = in_words(space, value, "array")
         raise kind(
-            f"{who} returned {has}, but {what} was expected, each with a row for each of the {n} "
-            f"environments: actions are of {short(space)}"
+            f"{who} returned {has}, but {expected} was expected, each with a row for each of the "
+            f"{n} environments: actions are of {short(space)}"
         )
     action = np.zeros(n, obs_dtype(space))
-    for name, part in named.items():
+    for name, part in (parts_of(space) or {}).items():
         action[name] = checked_actions(given[name], n, part, f"{who}: part {name!r}", kind)
     return action
 
