@@ -31,7 +31,7 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
     """Return the entry of a planner in ``policy.json``, without its file, and the file's bytes.
 
     Raises:
-        PolicyError: each episode has a goal of its own, for which the runner cannot plan.
+        PolicyError: each episode has another goal, for which the runner cannot plan.
     """
     task, graph, machine = planner.task, planner.graph, planner.machine
     if isinstance(task, GoalTask) and task.columns is not None:

@@ -350,7 +350,7 @@ class States:
 def _is_joined(policy: Policy | None) -> bool:
     """Return whether the policy of a skill with goals observes observation and goal as one.
 
-    What takes the goal by an input of its own does not; of a hierarchy only the selector does.
+    What takes the goal by another input does not; of a hierarchy only the selector does.
     """
     mapped = isinstance(policy, MappedPolicy) and policy.has_goals
     return not mapped and not isinstance(policy, HierarchyPolicy)

@@ -310,7 +310,7 @@ def _alike(now: str, then: str) -> bool:
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
     """Return the places of the environment's observation that each skill's network sees.
 
-    None: all, or the policy is no network, or the skill has a part of observations of its own, or
+    None: all, or the policy is no network, or the skill sees its own part of observations, or
     corrects a policy, which sees all.
     """
     found: list[tuple[int, ...] | None] = []

@@ -360,7 +360,7 @@ def _describe(spec: EnvSpec) -> tuple[int | None, float | None, bool]:
 
 
 def _with_notice(moments: Iterator[Played], name: str, most: int) -> Iterator[Played]:
-    """Yield what is played; give a notice once where an episode seems to have no end of its own.
+    """Yield what is played; give a notice once where an episode seems never to end.
 
     Args:
         name: of the environment.

@@ -226,7 +226,7 @@ def with_goals(space: str, seed: int = 0, **how: Any) -> Any:
     return run, run.log_calls(2_000, num_envs=4, seed=seed), how
 
 
-def told(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
+def acted_in(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
     """Of each step of an episode the running skill, its goal, and the action."""
     obs, info = env.reset(seed=seed)
     actor.reset()
@@ -254,7 +254,7 @@ def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> No
     runner, player = Runner(tmp_path, code=export.functions), Player(policy)
     goals, calls_fail = set(), 0
     for seed in range(6):
-        plain, fenced = ([told(e(), policy, a, seed) for a in (player, runner)] for e in WORLDS)
+        plain, fenced = ([acted_in(e(), policy, a, seed) for a in (player, runner)] for e in WORLDS)
         assert plain[0] == plain[1]
         assert fenced[0] == fenced[1]
         goals |= {goal for _, goal, _ in plain[0] + fenced[0]}
@@ -282,7 +282,7 @@ def test_a_plan_with_goals_that_guides_is_exported(how: Any, tmp_path: Path) -> 
     runner, player, skills_of = Runner(tmp_path, code=export.functions), Player(policy), set()
     for seed in range(6):
         for world in WORLDS:
-            a, b = (told(world(), policy, actor, seed) for actor in (player, runner))
+            a, b = (acted_in(world(), policy, actor, seed) for actor in (player, runner))
             assert [(skill, action) for skill, _, action in a] == close(b)
             skills_of |= {skill for skill, _, _ in a}
     assert len(skills_of) > 1 or "call_steps" in how  # there one skill does it all

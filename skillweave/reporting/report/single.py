@@ -204,9 +204,10 @@ def write_report(
     colors = _colors(run, played)
     log = _log(run, missing)
     with_goals = {} if played is None else played.with_goals
-    section = (
-        None if log is None else _hand_over(log, spec, colors, with_goals, filmed > 0, missing)
-    )
+    section: Section | None = None
+    if log is not None:
+        section = hand_over_section(log, spec, colors, with_goals, filmed=filmed > 0)
+        missing += section.missing
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
@@ -239,20 +240,6 @@ def _log(run: RunDirectory, missing: list[str]) -> CallLog | None:
         missing.append(f"There is no hand-over: {_sentence(error)}")
         return None
     return log if log is not None and len(log) else None
-
-
-def _hand_over(
-    log: CallLog,
-    spec: EnvSpec | None,
-    colors: Mapping[str, str],
-    with_goals: Mapping[str, Skill],
-    filmed: bool,
-    missing: list[str],
-) -> Section:
-    """Return the section about the run's log of calls; add what is missing."""
-    section = hand_over_section(log, spec, colors, with_goals, filmed=filmed)
-    missing += section.missing
-    return section
 
 
 def _sentence(error: SkillweaveError) -> str:
