@@ -15,17 +15,26 @@ class CallEnd(IntEnum):
     RUNNING = 0
     """It has not ended."""
     OWN = 1
-    """The skill's ``termination`` ended it."""
+    """The skill's ``termination`` ended it, perhaps in the episode's last step."""
     LIMIT = 2
     """A limit was reached: ``max_steps``, ``call_steps``, or the length that was chosen."""
     INTERRUPTED = 3
     """The selector ended it, as a new decision was worth more."""
     EPISODE = 4
-    """The episode ended, or has just started: no call runs."""
+    """The episode ended the call, or has just started: no call runs."""
 
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = map(int, CallEnd)
 """The same as plain integers, with which arrays are compared six times as fast."""
+
+
+def end_with_episode(end: Array, over: Array) -> None:
+    """Set in ``end`` (n,) that episodes ended calls, but for those that ended by themselves.
+
+    Args:
+        over: (n,) bool, the episode is over.
+    """
+    end[over & (end != OWN)] = EPISODE
 
 
 @dataclass(frozen=True)

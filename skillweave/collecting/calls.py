@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import EPISODE
 from skillweave.collecting.guide import as_logits
 from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
@@ -81,7 +80,7 @@ class OpenCalls:
             kept[name] for name in ("acted", "open", "reward", "discount", "tau")
         )
         lead, acts, reward = trace.lead, steps["valid"], steps["reward"]
-        reset = trace["call_end"] == EPISODE
+        reset = trace["terminated"] | trace["truncated"]
         begins = trace.get(f"{self.level.path}{SELECTOR}/decided")
         begins = np.zeros(lead, bool) if begins is None else begins
         over, cut, first = (np.zeros(lead, bool) for _ in range(3))

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import EPISODE, LIMIT, RUNNING
+from skillweave.collecting.call_end import EPISODE, LIMIT, RUNNING, end_with_episode
 from skillweave.collecting.calls import OpenCalls
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.guide import ActiveGuide
@@ -210,8 +210,8 @@ class HierarchyCollector(Collector):
             step = replace(step, goal=goal)
         end = self.player.observe(self.memory, self._all, step)
         terminated, truncated = self._ends(step, end)
+        end_with_episode(end, terminated | truncated)
         ended = np.flatnonzero(terminated | truncated)
-        end[ended] = EPISODE
         self._write(out, step, end)
         out.write(terminated=terminated, truncated=truncated)
         self.obs = raw.next_obs
@@ -359,7 +359,7 @@ class HierarchyCollector(Collector):
         goal, goals = trace.get(f"{path}/goal"), level.player.goals.get(level.skills.index(skill))
         steps = steps_of(trace, skill, acts, elapsed, end, goal)
         # Elsewhere it is called again at once.
-        ends = (end == EPISODE) | timed_out(trace, skill, elapsed)
+        ends = trace["terminated"] | trace["truncated"] | timed_out(trace, skill, elapsed)
         if goal is not None:  # with another goal another trajectory begins
             other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
             ends[:-1] |= other
@@ -372,7 +372,7 @@ class HierarchyCollector(Collector):
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]
-        goes_on = acts & (trace["call_end"] != EPISODE)
+        goes_on = acts & ~(trace["terminated"] | trace["truncated"])
         starts = ~np.concatenate([before[None], goes_on[:-1]])
         before[:] = goes_on[-1]
         return batch.replace(recurrent_state=self._states[path], episode_start=starts)
@@ -392,12 +392,13 @@ class HierarchyCollector(Collector):
         steps = steps_of(trace, skill, acts, elapsed, end, goal)
         own = trace[below.path + "call_end"]
         limited = steps["truncated"] & timed_out(trace, skill, elapsed)
-        closes = (own != RUNNING) | (end == EPISODE) | limited
+        over = trace["terminated"] | trace["truncated"]
+        closes = (own != RUNNING) | over | limited
         if goal is not None:  # in its next call it decides again
             closes |= end != RUNNING
         # The hierarchy's own end cuts the calls below it, unless it is called again at once.
         cut = (own == RUNNING) & (end != RUNNING)
-        inner = np.where(end == EPISODE, np.int8(EPISODE), np.int8(LIMIT))
+        inner = np.where(over, np.int8(EPISODE), np.int8(LIMIT))
         return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
 
     def _check_lengths(self) -> None:

@@ -26,7 +26,15 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.call_end import EPISODE, INTERRUPTED, LIMIT, OWN, RUNNING, Interruption
+from skillweave.collecting.call_end import (
+    EPISODE,
+    INTERRUPTED,
+    LIMIT,
+    OWN,
+    RUNNING,
+    Interruption,
+    end_with_episode,
+)
 from skillweave.collecting.guide import ActiveGuide, LastCall
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet
@@ -385,7 +393,7 @@ class Player:
                     self._observe_skill(memory, i, rows, mine, elapsed[mine], step, end)
         if self.skills.interruption is not None:
             self._interrupt(self.skills.interruption, memory, rows, step, end)
-        end[step.terminated | step.truncated] = EPISODE
+        end_with_episode(end, step.terminated | step.truncated)
         memory["end"][rows] = end
         self._watch(memory, rows, step, running, elapsed, end)
         return end

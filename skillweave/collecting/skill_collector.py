@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import EPISODE, LIMIT, OWN, RUNNING
+from skillweave.collecting.call_end import LIMIT, OWN, RUNNING, end_with_episode
 from skillweave.collecting.collector import SUCCESS, Collector
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.player import Turn, actor_of
@@ -340,7 +340,7 @@ class SkillCollector(Collector):
                     skill, step, elapsed[rows], rows, None if goal is None else goal[rows]
                 )
                 end[rows[judge(skill, part, rows).stops]] = OWN
-        end[raw.terminated | raw.truncated] = EPISODE
+        end_with_episode(end, raw.terminated | raw.truncated)
         if playing is not None:
             end[~playing] = RUNNING
         return end

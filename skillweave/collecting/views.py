@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skillweave.collecting.call_end import EPISODE, OWN, RUNNING
+from skillweave.collecting.call_end import OWN, RUNNING
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
@@ -54,10 +54,6 @@ def steps_of(
         check_reads_goal(skill, step)
     over = acts & (end != RUNNING)
     terminated = acts & (trace["env_terminated"] | (end == OWN))
-    # The end of an episode hides the skill's own termination, so it is asked again there.
-    if skill is not None and skill.defines("termination"):
-        hidden = (end == EPISODE) & over & ~terminated
-        terminated[hidden] = judged(trace, skill, "stops", hidden, elapsed, goal)
     reward = rewards_of(trace, skill, acts, elapsed, goal)
     truncated = over & ~terminated
     return Batch(reward=reward, terminated=terminated, truncated=truncated, valid=acts)
@@ -111,7 +107,7 @@ def timed_out(trace: Trace, skill: Skill, elapsed: Array) -> Array:
 def judged(
     trace: Trace,
     skill: Skill,
-    what: Literal["reward", "stops", "success"],
+    what: Literal["reward", "success"],
     acts: Array,
     elapsed: Array,
     goal: Array | None = None,

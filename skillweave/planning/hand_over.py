@@ -279,6 +279,8 @@ class CallEnds:
     calls: int
     reasons: dict[str, int]
     """Calls by the reason of their end: own, limit, interrupted, episode."""
+    own_with_episode: int
+    """Calls that ended by themselves in the episode's last step; ``reasons`` has them as own."""
     steps: float
     """Mean steps of a call."""
     succeeded: float
@@ -289,6 +291,8 @@ class CallEnds:
     def __str__(self) -> str:
         """Return all but the quantiles as a sentence."""
         ends = ", ".join(f"{why} {count / self.calls:.0%}" for why, count in self.reasons.items())
+        if self.own_with_episode:
+            ends += f"; own in the episode's last step {self.own_with_episode / self.calls:.0%}"
         return (
             f"{self.skill}: {self.calls:,} calls of {self.steps:.1f} steps, of which "
             f"{self.succeeded:.0%} succeeded; ends: {ends}"
@@ -307,6 +311,7 @@ def call_ends(log: CallColumns, skill: str) -> CallEnds:
         skill,
         len(some),
         reasons,
+        int(((some.end_reason == CallEnd.OWN) & (some.terminated | some.truncated)).sum()),
         float(some.tau.mean()),
         float(some.succeeded.mean()),
         np.quantile(vector.reshape(len(some), -1), (0.1, 0.5, 0.9), axis=0),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.call_end import CallEnd, end_with_episode
 from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import level_of
@@ -64,8 +64,10 @@ class SkillReport:
     """Calls that went on to their limit after they had succeeded, of a skill with neither
     an end nor a length of its own."""
     hasty: Count = field(default=0, compare=False)
-    """Calls that ended by themselves within two steps, without success, of a skill whose own reward
-    was below 0 in the last of them."""
+    """Calls that ended by themselves within two steps, before the episode's end, without success,
+    of a skill whose own reward was below 0 in the last of them."""
+    own_with_episode: Count = field(default=0, compare=False)
+    """Calls that ended by themselves in the episode's last step; ``ended`` has them as ``own``."""
 
     @property
     def length_mean(self) -> float | None:
@@ -90,6 +92,7 @@ class SkillReport:
             "calls": self.calls,
             "length_mean": self.length_mean,
             "ended": dict(self.ended),
+            "own_with_episode": self.own_with_episode,
             "success_rate": self.success_rate,
             "return_mean": self.return_mean,
         }
@@ -154,6 +157,7 @@ class SkillTally:
         self._succeeded = np.zeros(count, np.int64)
         self._late = np.zeros(count, np.int64)
         self._hasty = np.zeros(count, np.int64)
+        self._own_with_episode = np.zeros(count, np.int64)
         self._endless = np.array(
             [self.skills is not None and is_endless(self.skills, i) for i in range(count)], bool
         )
@@ -203,6 +207,7 @@ class SkillTally:
             np.add.at(self._ended, (acting[ended], outcome.why[ended]), 1)
             self._hand_over(played, outcome, ended)
             done = outcome.why == CallEnd.OWN
+            self._own_with_episode += np.bincount(acting[done & played.over], minlength=count)
             again = self._done[played.episode] == acting
             self._idle += np.bincount(acting[done & again], minlength=count)
             self._done[played.episode] = np.where(done, acting, -1)
@@ -213,7 +218,7 @@ class SkillTally:
             )
             late = before & outcome.succeeded & (outcome.why == CallEnd.LIMIT)
             self._late += np.bincount(acting[late], minlength=count)
-            hasty = done & (played.elapsed <= 2) & self._pays[acting] & (reward < 0)
+            hasty = done & ~played.over & (played.elapsed <= 2) & self._pays[acting] & (reward < 0)
             self._hasty += np.bincount(acting[hasty & ~outcome.succeeded], minlength=count)
             self._has_succeeded[played.episode] = outcome.has_succeeded
         self._returns[played.episode, acting] += reward
@@ -276,6 +281,7 @@ class SkillTally:
                 idle=int(self._idle[i]),
                 late=int(self._late[i]),
                 hasty=int(self._hasty[i]),
+                own_with_episode=int(self._own_with_episode[i]),
             )
             if i in self._below:
                 reports |= self._below[i].reports()
@@ -329,6 +335,7 @@ class CallTally:
         if skill.defines("success"):
             self.reached = np.zeros(episodes, bool)
         self._ended = dict.fromkeys(ENDS.values(), 0)
+        self._own_with_episode = 0
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
@@ -354,8 +361,8 @@ class CallTally:
         if limit is not None:
             why[elapsed >= limit] = CallEnd.LIMIT
         why[outcome.stops] = CallEnd.OWN
-        ended = played.step.terminated[rows] | played.step.truncated[rows]
-        why[ended | (played.over[rows] & (why == CallEnd.RUNNING))] = CallEnd.EPISODE
+        end_with_episode(why, (played.over & ~played.cut)[rows])
+        why[played.cut[rows] & (why == CallEnd.RUNNING)] = CallEnd.EPISODE
         over = np.flatnonzero(why != CallEnd.RUNNING)
         if self._below is not None:
             self._below.add(rows_of(played, rows))
@@ -364,6 +371,7 @@ class CallTally:
             return
         for reason, name in ENDS.items():
             self._ended[name] += int((why == reason).sum())
+        self._own_with_episode += int(((why == CallEnd.OWN) & played.over[rows]).sum())
         if self.reached is not None:
             ended_rows = rows[over]
             last = _outcome(self._skill, played, self._elapsed[played.episode], ended_rows)
@@ -383,6 +391,7 @@ class CallTally:
             succeeded=None if self.reached is None else int(self.reached.sum()),
             return_sum=float(self._returns.sum()) if has_reward else None,
             first=calls,
+            own_with_episode=self._own_with_episode,
         )
         below = {} if self._below is None else self._below.reports()
         return {self._path: report} | below

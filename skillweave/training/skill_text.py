@@ -17,6 +17,8 @@ def skill_rows(skills: Mapping[str, SkillReport]) -> list[list[str]]:
             _percent(report.ended[end] / report.calls) if report.ended and report.calls else "–"
             for end in ENDS.values()
         ]
+        if report.own_with_episode:
+            ends[0] += f" ({_percent(report.own_with_episode / report.calls)} last step)"
         rows.append(
             [
                 name,

@@ -181,6 +181,7 @@ WHEN: dict[str, Any] = {
     "unlucky": lambda step: (step.elapsed >= 2) & (step.reward < -0.5),
     "info": lambda step: step.timed_out | (step.info["t"] % 5 == 0),
     "acted": lambda step: (step.action == 0) & (step.obs[:, T] % 2 == 1),
+    "over": lambda step: step.terminated | step.truncated,
 }
 STOPS = WHEN | {
     "fast": lambda step: np.abs(step.next_obs[:, 1]) > 0.4,  # CartPole
@@ -395,6 +396,7 @@ FOUR = (LEFT, RIGHT, ZIGZAG, PAID)
 PUSH, FALL = SkillCase("push", max_steps=2), SkillCase("hover", max_steps=5)
 BALANCE = SkillCase("balance", starts="left of the middle", stops="fast")
 HOVER, TURN = SkillCase("hover", starts="sinking", stops="rising"), SkillCase("turn")
+OVER, ENDING = SkillCase("net", stops="over"), SkillCase("right", stops="over", wins="rich")
 BELOW = LevelCase((COUNTS, RIGHT, LEFT), 2, ("edge",), "counts")
 MIDDLE = LevelCase((SkillCase(BELOW, max_steps=3), ZIGZAG), 5)
 BY_HAND: dict[str, Case] = {
@@ -410,6 +412,13 @@ BY_HAND: dict[str, Case] = {
     ),
     "in three levels": Case(
         LevelCase((SkillCase(MIDDLE, stops="passed", wins="rich"), LEFT), 7, ("shy",)), resumed=True
+    ),
+    "own ends with the episode": Case(LevelCase((OVER, ENDING, COUNTS), 4), resumed=True),
+    "own ends with the episode, below": Case(
+        LevelCase((SkillCase(LevelCase((OVER, COUNTS), 3), stops="over"), ENDING), 5), rows=4
+    ),
+    "own ends with the episode, of an automaton": Case(
+        LevelCase((OVER, ENDING, SkillCase(LevelCase((OVER,)))), 2, selector="automaton")
     ),
     "stuck": Case(LevelCase((SkillCase(LevelCase((EVEN,))), ZIGZAG), 6)),
     "interrupted": Case(LevelCase((COUNTS, LEFT, NET), 9, margin=0.5)),

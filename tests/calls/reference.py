@@ -217,7 +217,7 @@ class Life:
             gain = worth[-1] - worth[self.skill]
             if any(self.startable(self.level, step.next_obs[0])) and gain > self.level.margin:
                 self.end = INTERRUPTED
-        if step.terminated[0] or step.truncated[0]:
+        if (step.terminated[0] or step.truncated[0]) and self.end != OWN:
             self.end = EPISODE
         succeeded = self.end == OWN
         if case.wins is not None and self.end != RUNNING:
@@ -303,7 +303,7 @@ def moments_of(case: Case, seed: int, choices: list[int] | None) -> Iterator[Mom
         life.observe(step)
         yield Moment(
             obs, action, next_obs, float(step.reward[0]), terminated, truncated, acted,
-            {"end": EPISODE} if over else life.remembered(), decision, life.ahead(next_obs),
+            life.remembered(), decision, life.ahead(next_obs),
             life.overridden,
         )  # fmt: skip
         obs = next_obs

@@ -41,7 +41,9 @@ def compare(case: Case, played: Played) -> list[list[Moment]]:
             assert got.reward == want.reward, where
             assert got.overridden in (None, want.overridden), where
             if got.observed:
-                agree(played, got.observed, want.observed, f"{where}, after the step")
+                over = played.restarts and (want.terminated or want.truncated)
+                after = {"end": CallEnd.EPISODE} if over else want.observed
+                agree(played, got.observed, after, f"{where}, after the step")
         found.append(wanted[: len(steps)])
     return found
 

@@ -17,7 +17,6 @@ from reference_calls import seeds_of
 
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.levels import UntrainedHierarchy
@@ -68,6 +67,8 @@ class Played:
     """A pattern of the names in memories that it does not have."""
     ready_is_guide: bool = False
     """A ready selector is remembered as a guide."""
+    restarts: bool = True
+    """What it remembers after an episode's last step is that of the next episode."""
     chooses: bool = True
     """The case's selector chooses; else the user does, and the reference follows it."""
 
@@ -342,11 +343,11 @@ def alone(case: Case) -> Played:
         end = player.observe(memory, rows, step)
         watch.observed(rows, memory)
         np.testing.assert_array_equal(end, memory["end"])
-        obs, over = raw.next_obs.copy(), np.flatnonzero(end == CallEnd.EPISODE)
+        obs, over = raw.next_obs.copy(), np.flatnonzero(raw.terminated | raw.truncated)
         if len(over):
             obs[over], age[over] = engine.reset_some(over), 0
             player.restart(memory, over)
-    return Played(watch.episodes)
+    return Played(watch.episodes, restarts=False)
 
 
 # Policies in evaluation and deployment -----------------------------------------------------------
@@ -362,7 +363,7 @@ def evaluated(case: Case) -> Played:
         assert played.after is not None
         watch.step(played.episode, played.step.action, played.step, played.chosen, True)
         watch.observed(played.episode, played.after, True)
-    return Played(watch.episodes)
+    return Played(watch.episodes, restarts=False)
 
 
 def deployed(case: Case) -> Played:

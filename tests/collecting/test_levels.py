@@ -282,6 +282,26 @@ def test_what_a_selector_below_remembers_begins_with_each_new_call():
     assert rows["episode_start"].any()
 
 
+class Ending(Skill):
+    """Ends by itself in each episode's last step."""
+
+    def termination(self, step):
+        return step.terminated | step.truncated
+
+
+def test_memory_starts_with_each_episode_also_where_the_call_ended_by_itself():
+    engine = make_engine(EnvSpec(Walk, engine="sync"), N)
+    skills = SkillSet((Ending(),), (None,), call_steps=3)
+    learners = {"ending": Remembering(N, 3)}
+    collector = HierarchyCollector(engine, Choices(N, 1), skills, learners=learners)
+    collector.start(Seeds(7))
+    rows = collector.collect(next(asked(ROWS, collector))).batches["ending"]
+    assert (rows["episode_start"] == (rows["obs"][..., T] == 0)).all()
+    assert (rows["dist_params"][..., 0] == rows["obs"][..., T]).all()
+    assert rows["terminated"].sum() > 8
+    assert not rows["truncated"][:-1].any()
+
+
 def test_no_environment_waits_and_every_step_has_one_owner():
     collector = collector_of(Paid, 4, 3)
     for request in itertools.islice(asked(ROWS, collector), 3):

@@ -57,10 +57,11 @@ def by_hand(obs: Any, skill: int, age: int, most: int) -> list[Any]:
         door |= place == LAST and key
         found.append((place, key, door))
         over = place > LAST
-        if over or age + t == 40:
-            return [found, CallEnd.EPISODE, over, not over]
+        late = age + t == 40 and not over
         if (skill == 0 and key) or (skill == 1 and place == LAST):
-            return [found, CallEnd.OWN, False, False]
+            return [found, CallEnd.OWN, over, late]
+        if over or late:
+            return [found, CallEnd.EPISODE, over, late]
     return [found, CallEnd.LIMIT, False, False]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter as Tally
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED
 from skillweave.training.skill_report import SkillReport
-from skillweave.training.skill_text import skill_table
+from skillweave.training.skill_text import skill_rows, skill_table
 
 # A walk shows the number of its episode.
 pytestmark = pytest.mark.filterwarnings("ignore:.*starts another episode")
@@ -97,7 +98,8 @@ def reference(kinds, episodes, call_steps, reflexes):
             steps = one.call(i)
             skill, told, last = skills[i], found[skills[i].name], steps[-1]
             own = bool(skill.termination(last)[0])
-            told["ended"].append("episode" if one.over else "own" if own else "limit")
+            told["ended"].append("own" if own else "episode" if one.over else "limit")
+            told["both"].append(own and one.over)
             told["steps"].append(len(steps))
             told["success"].append(bool(skill.success(last)[0]))
             told["return"].append(sum(float(np.float32(skill.reward(s)[0])) for s in steps))
@@ -116,6 +118,7 @@ def test_reports_are_those_of_calls_played_one_after_another(call_steps, reflexe
         told = wanted[name]
         assert (report.steps, report.calls) == (sum(told["steps"]), len(told["steps"]))
         assert report.ended == NONE | Tally(told["ended"])
+        assert report.own_with_episode == sum(told["both"])
         defines = name in ("paid", "lucky", "steady")
         assert report.succeeded == (sum(told["success"]) if defines else None)
         assert report.return_sum == pytest.approx(sum(told["return"]), rel=1e-6, abs=1e-4)
@@ -130,7 +133,7 @@ def test_sums_add_up_and_do_not_depend_on_how_many_stand_side_by_side(num_envs):
     assert found == evaluate(policy, spec, episodes=30, num_envs=3)
     assert sum(r.steps for r in found.skills.values()) == sum(found.lengths)
     assert all(sum(r.ended.values()) == r.calls > 0 for r in found.skills.values())
-    assert sum(r.ended["episode"] for r in found.skills.values()) == 30
+    assert sum(r.ended["episode"] + r.own_with_episode for r in found.skills.values()) == 30
     shares = [r["share"] for r in found.to_json()["skills"].values()]
     assert sum(shares) == pytest.approx(1.0)
 
@@ -165,11 +168,12 @@ def test_by_hand_a_call_that_the_step_limit_cuts_ends_with_the_episode(limit, cu
     assert found.to_json()["skills"] == {
         "paid": {
             "share": 1.0, "steps": 2 * limit, "calls": calls, "length_mean": 2 * limit / calls,
-            "ended": ended, "success_rate": 1.0, "return_mean": paid.return_sum / calls,
+            "ended": ended, "own_with_episode": 0, "success_rate": 1.0,
+            "return_mean": paid.return_sum / calls,
         },
         "zigzag": {
             "share": 0.0, "steps": 0, "calls": 0, "length_mean": None, "ended": NONE,
-            "success_rate": None, "return_mean": None,
+            "own_with_episode": 0, "success_rate": None, "return_mean": None,
         },
     }  # fmt: skip
     assert found.cut == 2
@@ -186,6 +190,8 @@ def test_the_table_for_people():
         "go       75%  1,200     2.5  25%    75%           0%       0%      50%    -1.5",
         "stand    25%      0       –    –      –            –        –        –       –",
     ]
+    both = replace(some["go"], own_with_episode=120)
+    assert skill_rows({"go": both})[1][4] == "25% (10% last step)"
 
 
 class Far(Steady):
@@ -235,10 +241,10 @@ def test_a_skill_that_is_called_where_its_work_is_done_is_told(call_steps):
     found = told(first, Far, Left, call_steps=call_steps)[1]
     far = found.skills["far"]
     # Four steps, the fourth perhaps in a call of its own, which a limit made necessary. Then one
-    # call for each step, the last of which the episode's end cuts.
+    # call for each step.
     before = [1 + (call_steps == 3 and n > 3) for n in found.lengths]
     assert far.calls == sum(k + max(0, n - 4) for k, n in zip(before, found.lengths, strict=True))
-    assert far.idle == sum(max(0, n - 5) for n in found.lengths) > far.calls / 2
+    assert far.idle == sum(max(0, n - 4) for n in found.lengths) > far.calls / 2
     if call_steps == 3:
         return  # its other calls are about as short
     assert found.for_people().splitlines()[-1] == (
@@ -490,8 +496,8 @@ def test_a_skill_for_which_it_is_best_to_end_at_once_is_told(kind):
     name = kind.__name__.lower()
     found = told(by_turns, kind, Left)[1]
     there = found.skills[name]
-    # The episode's end cuts the others.
-    assert there.hasty == there.ended["own"] > there.calls / 2
+    # In an episode's last step it has no choice.
+    assert there.hasty == there.ended["own"] - there.own_with_episode > there.calls / 2
     failed = "" if kind is Silent else ", without success"
     assert found.for_people().splitlines()[-1] == (
         f"{there.hasty:,} of {there.calls:,} calls of {name!r} ended by its termination() within "

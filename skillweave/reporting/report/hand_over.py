@@ -30,7 +30,7 @@ from skillweave.reporting.report.calls import (
 )
 from skillweave.reporting.report.film import HOLD, USUAL_FPS, Film
 from skillweave.reporting.report.numbers import number, percent, scale_of
-from skillweave.reporting.report.skills_table import WHY
+from skillweave.reporting.report.skills_table import WHY, end_cells
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
@@ -190,7 +190,7 @@ def _end_rows(log: CallLog) -> list[dict[str, Any]]:
                 "name": name,
                 "calls": f"{ends.calls:,}",
                 "length": number(ends.steps, max(ends.steps, 10)),
-                "ends": [percent(ends.reasons[why] / ends.calls) for why in WHY],
+                "ends": end_cells(ends.reasons, ends.own_with_episode, ends.calls),
                 "done": percent(ends.succeeded),
             }
         )

@@ -34,12 +34,20 @@ def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
                 "percent": percent(report.steps / total if total else 0.0),
                 "calls": f"{calls:,}",
                 "length": number(report.length_mean, longest),
-                "ends": [percent(report.ended[w] / calls if known else None) for w in WHY],
+                "ends": end_cells(report.ended, report.own_with_episode, calls if known else 0),
                 "success": percent(report.success_rate),
                 "return": number(report.return_mean),
             }
         )
     return rows
+
+
+def end_cells(reasons: Mapping[str, int], own_with_episode: int, calls: int) -> list[str]:
+    """Return the shares of the ends of calls; 0 ``calls``: unknown."""
+    cells = [percent(reasons[why] / calls if calls else None) for why in WHY]
+    if own_with_episode:
+        cells[0] += f" ({percent(own_with_episode / calls)} in the last step)"
+    return cells
 
 
 def about(skill: Skill) -> str:
