@@ -43,7 +43,7 @@ from skillweave.envs.infos import allowed_rows
 from skillweave.errors import PolicyError, SkillError
 from skillweave.skills import apply_reflexes, path_of
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION, SKILL
-from skillweave.skills.goals import CallGoals, Goals, goals_of
+from skillweave.skills.goals import TRIES, CallGoals, Goals, goals_of
 from skillweave.skills.outputs import blame
 from skillweave.skills.own_part import ZERO, Rest
 from skillweave.types import Array, Memory, Memoryless, Policy, Step
@@ -427,8 +427,14 @@ class Player:
         """Return the selector's memory, the same arrays under its own names."""
         return {k: memory[f"selector.{k}"] for k in self._selector_keys}
 
-    def _decide(self, memory: Memory, rows: Array, seen: Array, turn: Turn) -> None:
+    def _decide(
+        self, memory: Memory, rows: Array, seen: Array, turn: Turn, tries: int = TRIES
+    ) -> None:
         """Choose in environments ``rows`` (k,), and start the calls.
+
+        A call whose goal holds already ends at no step, and is no decision: a selector that samples
+        chooses again. After the last of its ``tries`` the call runs; so does that of a selector
+        that would choose the same again.
 
         Args:
             seen: (k, …) what the selector sees.
@@ -448,14 +454,26 @@ class Player:
             may = chances > 0.0 if guide.restricts else may
         if self.selector is None:
             assert may is not None, "nothing chooses"
-            choice = may.argmax(axis=1)  # the guide has left one
-        else:
-            how = Turn(greedy, turn.rng, turn.age, trace=turn.trace)
-            choice = np.asarray(self.selector.act(self.of_selector(memory), rows, seen, may, how))
-        if self.goals:
-            self._begin_with_goals(memory, rows, choice, obs)
-        else:
-            self.begin(memory, rows, choice)
+            self.begin(memory, rows, may.argmax(axis=1))  # the guide has left one
+            return
+        how, own = Turn(greedy, turn.rng, turn.age, trace=turn.trace), self.of_selector(memory)
+        before = {k: v[rows] for k, v in own.items()}
+        choice = np.asarray(self.selector.act(own, rows, seen, may, how))
+        self._begin_with_goals(memory, rows, choice, obs)
+        samples = isinstance(self.selector, LearnerActor) or not greedy
+        if samples and self._ready is None and tries > 1:
+            again = np.flatnonzero(self._holds(memory, rows, obs))
+            if len(again):
+                _put(own, rows[again], {k: v[again] for k, v in before.items()})
+                self._decide(memory, rows[again], seen[again], turn, tries - 1)
+
+    def _holds(self, memory: Memory, rows: Array, obs: Array) -> Array:
+        """Return where the goals of calls that start in ``obs`` (k, …) hold already, (k,) bool."""
+        holds = np.zeros(len(rows), bool)
+        for i, goals in self.goals.items():
+            mine = np.flatnonzero(memory["skill"][rows] == i)
+            holds[mine] = goals.hold(obs[mine], goals.read(memory[f"goal.{i}"][rows[mine]]))
+        return holds
 
     def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:
         """Start the calls of choices (k,), which have goals if the selector gives some."""

@@ -8,6 +8,7 @@ Python code is given by name; it receives one observation as a batch of one.
 """
 
 import json
+from contextlib import suppress
 from functools import reduce
 from operator import getitem
 from pathlib import Path
@@ -18,6 +19,7 @@ import numpy as np
 import onnxruntime as ort
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = range(5)  # how a call has ended
+TRIES = 16  # the most choices for a call, where the goals of those before hold already
 DTYPES = {  # of inputs, by ONNX's names
     "float": "f4",
     "double": "f8",
@@ -467,19 +469,35 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
         lengths, runner = self.entry["lengths"] or [np.inf], self.runner
         if self.why != RUNNING:
             self.given, may = runner.goal, self.may_start()
-            choice, goals = self.as_selector(lambda: self.decided(may, len(lengths)))
-            skill, length = divmod(int(choice), len(lengths))
-            self.goal = self.fitted(self.skills[skill], goals.get(skill))
-            part = self.policies[skill]
-            if skill != self.skill or (self.goal is not None and isinstance(part, _Hierarchy)):
-                part.reset()
-            self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
-            self.skill, self.elapsed, self.why = skill, 0, RUNNING
+            before = getattr(self.selector, "memory", None)
+            for _ in range(TRIES):
+                self.selector.memory = before
+                choice, goals = self.as_selector(lambda: self.decided(may, len(lengths)))
+                skill, length = divmod(int(choice), len(lengths))
+                self.goal = self.fitted(self.skills[skill], goals.get(skill))
+                part = self.policies[skill]
+                if skill != self.skill or (self.goal is not None and isinstance(part, _Hierarchy)):
+                    part.reset()
+                self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
+                self.skill, self.elapsed, self.why = skill, 0, RUNNING
+                if not self.holds(self.skills[skill]["termination"]):
+                    break
         action = self.with_goal(lambda: self.policies[self.skill].act(mask))
         for condition, code, fixed in self.entry["reflexes"]:
             if runner.asks(condition, runner.obs):
                 action = runner.action(fixed if code is None else runner.code[code](runner.obs)[0])
         return action
+
+    def holds(self, termination: Any) -> bool:
+        """Return whether its goal ends the call at no step: a selector that samples goes on."""
+        if self.goal is None or not termination or not self.selector.entry.get("noise"):
+            return False
+        runner, no = self.runner, np.zeros(1, "f4")
+        still = {"obs": runner.obs, "next_obs": runner.obs, "action": no, "reward": no, "info": {}}
+        runner.latest = still
+        with suppress(Exception):
+            return runner.asks(termination, runner.step(1, False, self.goal))
+        return False
 
     def with_goal(self, act: Any) -> Any:
         """Return what the running skill does, where it sees its goal."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,10 @@ from skillweave.skills.goal_spaces import (
     repeated,
 )
 from skillweave.skills.outputs import called
-from skillweave.types import Array, read_only
+from skillweave.types import Array, Step, read_only
+
+TRIES = 16
+"""The most goals that are chosen for a call, where those before hold already."""
 
 
 def goals_of(skill: Skill | None) -> Goals | None:
@@ -112,11 +116,33 @@ class Goals:
     def draw(self, obs: Array, rng: np.random.Generator) -> Array:
         """Return goals to practise in observations ``obs`` (n, …), from ``Skill.goals``.
 
+        Goals that hold already are drawn again, at most ``TRIES`` times.
+
         Raises:
             SkillError: the skill's ``goals`` failed, or returned something else.
         """
-        given = called(lambda seen: self.skill.goals(seen, rng), read_only(obs), self._label)
-        return self.fitted(obs, given, self._label)
+        goal, rows = self.read(self.start(len(obs))).copy(), np.arange(len(obs))
+        for _ in range(TRIES):
+            given = called(lambda seen: self.skill.goals(seen, rng), read_only(obs), self._label)
+            goal[rows] = self.fitted(obs, given, self._label)
+            again = self.hold(obs, goal[rows])
+            if not again.any():
+                break
+            obs, rows = obs[again], rows[again]
+        return goal
+
+    def hold(self, obs: Array, goal: Array) -> Array:
+        """Return the goals (n, *goal_shape) for which a call would end at once, (n,) bool.
+
+        For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
+        fails for such a step, as it reads ``info`` for example, no goal holds.
+        """
+        zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
+        no = zeros > 0
+        still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
+        with suppress(Exception), np.errstate(all="ignore"):
+            return np.array(self.skill.termination(still), bool).reshape(len(obs))
+        return no
 
     def fitted(
         self, obs: Array, goal: Any, who: str, kind: type[SkillweaveError] = SkillError

@@ -22,12 +22,7 @@ from skillweave.types import Array, Policy, unprefixed
 
 _MEMORIES = ("chosen", "after")
 """Fields of a step that hold a policy's memory."""
-ENDS = {
-    CallEnd.OWN: "own",
-    CallEnd.LIMIT: "limit",
-    CallEnd.INTERRUPTED: "interrupted",
-    CallEnd.EPISODE: "episode",
-}
+ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
 """Names of the ends of calls in reports."""
 
 
@@ -92,7 +87,6 @@ class SkillReport:
             "calls": self.calls,
             "length_mean": self.length_mean,
             "ended": dict(self.ended),
-            "own_with_episode": self.own_with_episode,
             "success_rate": self.success_rate,
             "return_mean": self.return_mean,
         }

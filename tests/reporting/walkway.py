@@ -86,7 +86,7 @@ CALLS = [
     (0, 0, 2, "own", 3.0, 4.0, False),
     (1, 2, 3, "limit", 6.0, 6.0, None),
     (0, 5, 2, "own", 7.0, 4.0, False),
-    (0, 7, 2, "episode", 11.0, 4.0, True),
+    (0, 7, 2, "own", 11.0, 4.0, True),
 ]
 """The calls of each episode, by hand."""
 

@@ -168,12 +168,11 @@ def test_by_hand_a_call_that_the_step_limit_cuts_ends_with_the_episode(limit, cu
     assert found.to_json()["skills"] == {
         "paid": {
             "share": 1.0, "steps": 2 * limit, "calls": calls, "length_mean": 2 * limit / calls,
-            "ended": ended, "own_with_episode": 0, "success_rate": 1.0,
-            "return_mean": paid.return_sum / calls,
+            "ended": ended, "success_rate": 1.0, "return_mean": paid.return_sum / calls,
         },
         "zigzag": {
             "share": 0.0, "steps": 0, "calls": 0, "length_mean": None, "ended": NONE,
-            "own_with_episode": 0, "success_rate": None, "return_mean": None,
+            "success_rate": None, "return_mean": None,
         },
     }  # fmt: skip
     assert found.cut == 2
