@@ -471,8 +471,9 @@ class Player:
         """Return where the goals of calls that start in ``obs`` (k, …) hold already, (k,) bool."""
         holds = np.zeros(len(rows), bool)
         for i, goals in self.goals.items():
-            mine = np.flatnonzero(memory["skill"][rows] == i)
-            holds[mine] = goals.hold(obs[mine], goals.read(memory[f"goal.{i}"][rows[mine]]))
+            if len(mine := np.flatnonzero(memory["skill"][rows] == i)):
+                goal = goals.read(memory[f"goal.{i}"][rows[mine]])
+                holds[mine] = goals.hold(obs[mine], goal)
         return holds
 
     def _begin_with_goals(self, memory: Memory, rows: Array, choice: Array, obs: Array) -> None:

@@ -159,7 +159,9 @@ class Skill:
     def goals(self, obs: Array, rng: np.random.Generator) -> Array:
         """Return goals to practise where it learns or is evaluated by itself, (n, *goal_shape).
 
-        Elsewhere the selector chooses goals. Default: elements of ``goal_space`` at random.
+        Elsewhere the selector chooses goals. Default: elements of ``goal_space`` at random. It is
+        asked again for goals that hold already (``termination`` is true for a step that stands
+        still), at most 16 times.
 
         Args:
             obs: (n, *obs_shape), where the calls start.

@@ -283,6 +283,21 @@ def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
     assert len(set(goals)) > 2  # the other skill, and several goals
 
 
+def test_a_selector_that_samples_chooses_goals_that_do_not_hold(tmp_path: Path) -> None:
+    """At 0 the goals 2 and 4 hold, and 3 does not; the selector remembers one decision."""
+    policy = made(go_to("number"), selector=RECURRENT, greedy_selector=False)[1]
+    runner = Runner(tmp_path, write_export(tmp_path, policy, "point").functions, seed=0)
+    obs, seen = np.zeros(2, np.float32), []
+    for seed in range(8):
+        player = Player(policy, seed=seed)
+        runner.reset()
+        assert len({str(p.act(obs)) for p in (player, runner)}) == 1
+        assert player.memory["goal.0"][0] == runner.root.goal[0] == 3
+        seen += [player.memory.get("selector.rnn"), runner.root.selector.memory.get("memory")]
+    for memory in seen[1:]:
+        np.testing.assert_allclose(memory, seen[0], atol=1e-5)
+
+
 def test_the_range_of_goals_is_in_the_file(tmp_path: Path) -> None:
     _, policy = made(Reaching, Rest)
     export = write_export(tmp_path, policy, "point")

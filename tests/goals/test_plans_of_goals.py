@@ -262,7 +262,7 @@ def test_a_skill_with_goals_that_was_never_called_is_not_chosen() -> None:
 @pytest.mark.slow
 def test_a_trained_selector_starts_from_a_plan_with_goals(tmp_path: Any) -> None:
     run = ready()
-    log = run.log_calls(3_000, num_envs=8)
+    log = run.log_calls(3_000, num_envs=8, seed=1)
     planned = run.plan(near(1.4, 0.3), log)
     config = sw.PPO(num_envs=2, n_steps=16, batch_size=8, update_epochs=1, learning_rate=1e-9)
     declared_again = planned.with_selector(config, steps=32)
