@@ -6,8 +6,10 @@ numbers of all environments at once, in a few microseconds per step, with any en
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
@@ -15,6 +17,7 @@ import numpy as np
 
 from skillweave.envs.image_bounds import ImageBounds
 from skillweave.envs.infos import MASK, checked_mask, observes_mask
+from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
@@ -52,6 +55,8 @@ LIKE_METHODS = (
     "legal_actions",
 )
 """Attributes that return masks in other libraries, ``action_masks`` if it is not a method."""
+LAST_OBSERVATIONS = ("final_obs", "final_observation", "terminal_observation")
+"""Keys of info with an episode's last observation, where the environment resets itself."""
 _REWARDS = f"it must be finite, and at most {LARGEST_REWARD:g} in size: learners square it"
 
 
@@ -103,6 +108,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._fits = _fits(env.observation_space)
         for wrapper in _wrappers(env):
             _refuse_changing(wrapper, name)
+        self._drawn_spaces = _drawn_spaces(env)
         self._looked = number != 0  # only the first of several is checked
         self._chooses = bool(choice_counts(env.action_space))
         masks = _attribute(env, "action_masks") if self._chooses else None
@@ -112,6 +118,9 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the environment and check the result."""
         self._elapsed = 0
+        if seed is not None:
+            for i, space in enumerate(self._drawn_spaces, 1):  # not the stream of env.np_random
+                space.seed((seed + i * 0x5BD1E995) % 2**31)
         try:
             result = self.env.reset(seed=seed, options=options)
         except SkillweaveError:
@@ -156,6 +165,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             truncated = self._flag(truncated, "truncated")
         if type(info) is not dict:
             self._check_info(info)
+        if terminated or truncated:
+            obs, info = last_observation(obs, info, self.env)
         if self._chooses:
             info = self._with_mask(info, over=terminated or truncated)
         return obs, reward, terminated, truncated, info
@@ -286,6 +297,62 @@ def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any
     while isinstance(env, gym.Wrapper):
         yield env
         env = env.env
+
+
+def _drawn_spaces(env: gym.Env[Any, Any]) -> list[gym.Space[Any]]:
+    """Return the spaces from which an environment and its wrappers may draw; of a Dict its parts.
+
+    A space that stands in a class is copied, so that each environment draws from its own.
+    """
+    by_id: dict[int, gym.Space[Any]] = {}
+    for layer in (env.unwrapped, *_wrappers(env)):
+        for kind in ("action_space", "observation_space"):
+            shared = inspect.getattr_static(type(layer), kind, None)
+            if isinstance(shared, gym.Space) and kind not in vars(layer):
+                setattr(layer, kind, copy.deepcopy(shared))
+            by_id |= {id(space): space for space in _leaves(getattr(layer, kind, None))}
+    return list(by_id.values())
+
+
+def _leaves(space: Any) -> Iterator[gym.Space[Any]]:
+    """Yield a space, or the parts of a Dict or Tuple: a Dict's own seed() is slow."""
+    if isinstance(space, gym.Space):
+        inner = parts(space)
+        if inner is None:
+            yield space
+        for part in (inner or {}).values():
+            yield from _leaves(part)
+
+
+def last_observation(obs: Any, info: dict[str, Any], env: Any) -> tuple[Any, dict[str, Any]]:
+    """Return the true last observation of an episode, and ``info`` without it.
+
+    An environment that resets itself returns the first observation of the next episode, and puts
+    the last one into ``info``, perhaps as a batch of one; its wrappers have not converted that.
+
+    Args:
+        obs, info: of the last step.
+        env: the environment that returned them.
+    """
+    for key in LAST_OBSERVATIONS:
+        value = info.get(key)
+        if value is None or not np.all(info.get(f"_{key}", True)):
+            continue
+        fits = _fits(env.observation_space)
+        for unbatched in (copy.copy, first_row):
+            with suppress(Exception):
+                last = unbatched(value)
+                for layer in reversed(list(_wrappers(env))):
+                    if isinstance(layer, gym.ObservationWrapper):
+                        last = layer.observation(last)
+                if fits(last):
+                    return last, {k: v for k, v in info.items() if k != key}
+        notice(
+            f"info[{key!r}] at an episode's end is {_described(value)}, which is not in the "
+            f"observation_space {short(env.observation_space, 200)}, so it is not used. If the "
+            "environment resets itself, put the episode's last observation there"
+        )
+    return obs, info
 
 
 _INSTEAD = {

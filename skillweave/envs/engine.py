@@ -12,6 +12,7 @@ for environments whose dynamics follow from these two.
 
 from __future__ import annotations
 
+import copy
 import functools
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -23,10 +24,10 @@ import numpy as np
 
 from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, batched_infos
+from skillweave.envs.infos import ActionMasks, allowed_rows, batched_infos, random_actions
 from skillweave.errors import EnvError, SkillweaveError, reworded
 from skillweave.notices import are_collected, notice
-from skillweave.seeding import GlobalDraws
+from skillweave.seeding import GlobalDraws, Seeds, global_generators
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 from skillweave.types import Array, Step
@@ -120,9 +121,12 @@ class GymnasiumEngine:
 
     Args:
         first: the number of the first environment, for messages.
+        check_seed: check before training that the first environment repeats itself.
     """
 
-    def __init__(self, make: Any, num_envs: int, name: str, first: int = 0) -> None:
+    def __init__(
+        self, make: Any, num_envs: int, name: str, first: int = 0, check_seed: bool = False
+    ) -> None:
         makers = [functools.partial(make, number=first + i) for i in range(num_envs)]
         self._envs = SyncEnvs(makers, name)
         self.num_envs = num_envs
@@ -135,6 +139,9 @@ class GymnasiumEngine:
         )
         self._watch = Watch(name, self.observation_space, num_envs, first)
         self._name = name
+        self._check_seed = check_seed and first == 0
+        self.trains = False
+        """Learners learn from these environments."""
         self._draws = GlobalDraws(LOOKS if are_collected() else 0)
         self._action_dtype = obs_dtype(self.action_space)
         shape = num_envs, *obs_shape(self.action_space)
@@ -146,6 +153,8 @@ class GymnasiumEngine:
 
     def reset(self, seed: int) -> Array:
         """Reset all environments from one seed; return observations (N, *obs_shape)."""
+        if self.trains and self._check_seed:
+            self._check_repeats()
         self._root = seed
         self._episode[:] = 0
         return self.reset_some(self._all)
@@ -218,6 +227,29 @@ class GymnasiumEngine:
         self._masks.see(info, ids, obs=obs)
         return self._watch.check_reset(obs, ids)
 
+    def _check_repeats(self) -> None:
+        """Give a notice if a seed and an action have two outcomes in environment 0."""
+        self._check_seed = False
+        row = self._all[:1]
+        outcomes = []
+        for _ in range(2):
+            with global_generators(Seeds(0) / "check"):
+                obs = self.reset_some(row, [0])
+                mask = allowed_rows(self.mask(), row)
+                rng = np.random.default_rng(0)
+                raw = self._act(random_actions(self.action_space, 1, rng, mask), row)
+            numbers = obs, raw.next_obs, raw.reward, raw.terminated, raw.truncated
+            outcomes.append([part for array in numbers for part in _parts(array)])
+        # Physics engines do not repeat the last digits.
+        pairs = zip(*outcomes, strict=True)
+        if not all(np.allclose(a, b, 1e-4, 1e-6, equal_nan=True) for a, b in pairs):
+            notice(
+                f"{self._name}: two resets with the same seed, each with the same first action, "
+                "had different results, so the same seed may give other weights. Draw from "
+                "self.np_random alone, which super().reset(seed=seed) seeds, and let reset() clear "
+                "all state; EnvSpec(..., check_seed=False) ends this message"
+            )
+
     def _notice_draws(self) -> None:
         """Give a notice if the environments have just drawn from global generators."""
         if drawn := self._draws.end():
@@ -266,7 +298,7 @@ class SyncEnvs:
             self.close()
             raise
         self.observation_space = self.envs[0].observation_space
-        self.action_space = self.envs[0].action_space
+        self.action_space = copy.deepcopy(self.envs[0].action_space)  # seeded by others
         self._dtype = obs_dtype(self.observation_space)
         self._shape = obs_shape(self.observation_space)
         self._parts = self._dtype.names is not None

@@ -116,7 +116,7 @@ def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> d
     if plain and all(_alike(info, first) for info in infos):
         return {key: np.concatenate([info[key] for info in infos]) for key in first}
     return batched_infos(
-        [one for info, n in zip(infos, counts, strict=True) for one in _single(info, n)]
+        [one for info, n in zip(infos, counts, strict=True) for one in single_infos(info, n)]
     )
 
 
@@ -130,12 +130,12 @@ def _alike(info: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     )
 
 
-def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
+def single_infos(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     """Return the info of each of n environments: the inverse of ``batched_infos``."""
     each: list[dict[str, Any]] = [{} for _ in range(n)]
     for key in info_keys(info):
         column = info[key]
-        values = _single(column, n) if isinstance(column, dict) else column
+        values = single_infos(column, n) if isinstance(column, dict) else column
         present = info.get(f"_{key}", np.ones(n, bool))
         for row in np.flatnonzero(present):
             each[row][key] = values[row]
@@ -318,6 +318,8 @@ OWN_REWARD = "env_reward"
 OWN_SUCCESS = "env_success"
 SUCCESS = "success"
 """Keys of info: the first two where a task gives the reward and says what success is."""
+IS_SUCCESS = "is_success"
+"""The key of success in Stable-Baselines3 and Gymnasium-Robotics."""
 
 
 def own_step(step: Step) -> Step:
@@ -338,10 +340,22 @@ def own_step(step: Step) -> Step:
 def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
     """Return the success of n environments' episodes by ``info["success"]``.
 
+    Where that is missing, ``info["is_success"]`` counts.
+
     Returns:
         (n,) float64, NaN where an environment reports none; None: no environment reports any.
     """
-    success = np.asarray(info.get(SUCCESS))
+    success = _success(info, SUCCESS, n)
+    if OWN_REWARD in info:  # the success of the environment is not the task's
+        return success
+    other = _success(info, IS_SUCCESS, n)
+    if success is None or other is None:
+        return other if success is None else success
+    return np.where(np.isnan(success), other, success)
+
+
+def _success(info: Mapping[str, Any], key: str, n: int) -> Array | None:
+    success = np.asarray(info.get(key))
     if success.shape == (n,) and success.dtype == object:  # for example None until it is known
         known = [isinstance(value, NUMBERS) for value in success]
         if not any(known):
@@ -350,7 +364,7 @@ def reported_success(info: Mapping[str, Any], n: int) -> Array | None:
         return np.array(values, float)
     if success.shape != (n,) or success.dtype.kind not in "biuf":
         return None
-    present = np.asarray(info.get("_success", np.ones(n, bool)))
+    present = np.asarray(info.get(f"_{key}", np.ones(n, bool)))
     return np.where(present, success != 0, np.nan)
 
 
@@ -363,6 +377,8 @@ def info_numbers(info: Mapping[str, Any], key: str, ids: Array, n: int) -> Array
     Raises:
         EnvError: a value is not a number; the message names its type.
     """
+    if key == SUCCESS and key not in info and OWN_REWARD not in info:
+        key = IS_SUCCESS
     if key not in info:
         return None
     values = info[key]

@@ -102,6 +102,8 @@ class EnvSpec:
             are split among them; None: one process.
         obs_names: names of an observation's numbers in reports: a name for each, or for a Dict such
             lists by key. None: those of the environment's attribute ``obs_names``.
+        check_seed: before training, reset one environment twice to one seed, with a step each, and
+            give a notice if the outcomes differ. Not in a pool.
 
     Raises:
         DeclarationError: a field has a wrong type, or fields do not fit each other; the message
@@ -114,8 +116,9 @@ class EnvSpec:
     engine: EngineName = "auto"
     workers: AtLeastOne | None = None
     pool: PoolMaker | None = None
-    # Names do not make a different environment.
+    # These do not make a different environment.
     obs_names: Names | None = field(default=None, compare=False, repr=False)
+    check_seed: bool = field(default=True, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if is_batched(self.env):
@@ -297,7 +300,7 @@ def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first:
                 f"EnvPool cannot run {spec.name}: it is not installed (extra 'envpool'), or "
                 "lacks the environment with these spaces, settings and wrappers; use engine='auto'"
             )
-    return GymnasiumEngine(spec.make, num_envs, spec.name, first)
+    return GymnasiumEngine(spec.make, num_envs, spec.name, first, spec.check_seed)
 
 
 def cores() -> int:

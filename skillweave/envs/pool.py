@@ -146,7 +146,7 @@ class _OneOfPool(gym.Env[Any, Any]):
             new = int(self.np_random.integers(POOL_SEEDS)) if seed is None else seed % POOL_SEEDS
             self._pool = self._make(num_envs=1, threads=1, seed=new)
         obs, info = self._pool.reset(self._ids)
-        return self._seen(obs), _first(info)
+        return self._seen(obs), first_row(info)
 
     def step(self, action: Any) -> Any:
         if self._pool is None:
@@ -156,7 +156,7 @@ class _OneOfPool(gym.Env[Any, Any]):
             many = many.astype(np.int32)  # EnvPool's
         obs, reward, terminated, truncated, info = self._pool.step(many, self._ids)
         ends = bool(terminated[0]), bool(truncated[0])
-        return self._seen(obs), float(reward[0]), *ends, _first(info)
+        return self._seen(obs), float(reward[0]), *ends, first_row(info)
 
     def render(self) -> Any:
         if self.render_mode is None or self._pool is None:
@@ -172,11 +172,11 @@ class _OneOfPool(gym.Env[Any, Any]):
         return unpack(self.observation_space, pack(self.observation_space, obs)[0])
 
 
-def _first(info: dict[str, Any]) -> dict[str, Any]:
-    """Return the first row of each array."""
-    return {
-        k: _first(v) if isinstance(v, dict) else v[0] if np.ndim(v) else v for k, v in info.items()
-    }
+def first_row(value: Any) -> Any:
+    """Return the first row of an array, or of each array in a dict."""
+    if isinstance(value, dict):
+        return {k: first_row(v) for k, v in value.items()}
+    return value[0] if np.ndim(value) else value
 
 
 @checked_names

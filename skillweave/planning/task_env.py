@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.envs.checks import last_observation
 from skillweave.envs.infos import OWN_REWARD, OWN_SUCCESS, SUCCESS, batched_infos
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
@@ -109,6 +110,8 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
         """Take a step; the reward is the task's."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._elapsed += 1
+        if terminated or truncated:
+            obs, info = last_observation(obs, info, self.env)
         after = self._batch_of_one(obs)
         step = Step(
             obs=self._obs,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -13,11 +15,13 @@ from gymnasium import Space
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError
 from skillweave.messages import short, shortened
+from skillweave.notices import notice
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import SEES, checksum
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.skills.plan import Shapes
+from skillweave.spaces import choice_counts, obs_shape
 from skillweave.types import Array
 
 NUMBERS = {
@@ -32,6 +36,21 @@ NUMBERS = {
     "tensor(uint8)": np.uint8,
 }
 """Supported types of an input, by ONNX's names."""
+OTHER = re.compile(
+    "(?<!q)(?<!q_)value|vf|critic|baseline|adv|std|sigma|var|entropy|log_?p|shape|size|version|"
+    "state|hidden|(?<![a-z])[hc]_"
+)
+"""Names of outputs that are no actions."""
+ACTION = re.compile("action|logit|mean|policy|(?<![a-z])(act|mu|loc|pi|q)(?![a-z])|q_?value")
+"""Names of outputs that are actions, or by which one is chosen."""
+
+
+def _rank(name: str) -> tuple[bool, ...]:
+    """Return the rank of an output as the action, by its name; the lowest is the best."""
+    name = name.lower()
+    other, action = OTHER.search(name), ACTION.search(name)
+    exact = name in ("action", "actions")
+    return other is not None, action is None, "deterministic" not in name, not exact
 
 
 class OnnxPolicy(MappedPolicy):
@@ -78,7 +97,10 @@ class OnnxPolicy(MappedPolicy):
             raise PolicyError(
                 f"{file} takes {found or 'nothing'}; it must take one batch of observations{more}"
             )
-        self.output = output or next((n for n in names if n not in states.values()), names[0])
+        ranks = {name: _rank(name) for name in names if name not in states.values()}
+        best = [n for n, rank in ranks.items() if rank == min(ranks.values())] or names
+        self.output = output or best[0]
+        self._alike = [] if output else best
         self._inputs = {i.name: i for i in inputs}
         self.free = [i.name for i in free]
         batches = [self._inputs[name].shape[0] for name in self.free]
@@ -112,6 +134,7 @@ class OnnxPolicy(MappedPolicy):
             PolicyError: its input has another shape; the message names both.
         """
         bound = super().bind(observation_space, action_space, who)
+        bound._choose_output()
         if self.mapping.sees is not None:
             return bound
         mine = self._inputs[self.free[0]].shape[1:]
@@ -126,6 +149,26 @@ class OnnxPolicy(MappedPolicy):
                 f"{observation_space}: {SEES}"
             )
         return bound
+
+    def _choose_output(self) -> None:
+        """Choose by shape among outputs whose names do not say which is the action."""
+        if len(self._alike) < 2:
+            return
+        size = math.prod(obs_shape(self.action_space))
+        choices = sum(choice_counts(self.action_space)) or size
+        fitting = [
+            o.name
+            for o in self._session.get_outputs()
+            if o.name in self._alike
+            and math.prod(n for n in o.shape[1:] if isinstance(n, int))
+            == (size if "int" in o.type else choices)
+        ] or self._alike
+        self.output = fitting[0]
+        if len(fitting) > 1:
+            notice(
+                f"{self._who}: any of its outputs {', '.join(fitting)} could be the action, and "
+                f"{self.output!r} is used: name the right one, output={self.output!r}"
+            )
 
     def expected(self) -> Shapes:
         """Return the shapes of its inputs, without those of its state."""
@@ -273,7 +316,8 @@ def from_onnx(
 
     Args:
         path: the file; weights in a second file beside it are read, too.
-        output: the name of the output to use; None: the first.
+        output: the name of the output to use; None: the one that is named like an action, or that
+            alone has the actions' shape; a value never goes before others.
         sees: the parts of the observation that the policy takes; None: the whole observation.
         goal: the value of ``Goal()`` in ``sees``, a command for example: numbers, or a function of
             observations that returns (n, numbers).

@@ -18,6 +18,7 @@ from gymnasium.spaces import Box, Dict, MultiBinary
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
+from skillweave.notices import notice
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of
@@ -113,6 +114,8 @@ class SB3Policy(MappedPolicy):
         rng = rng or np.random.default_rng()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(rng.integers(2**62)))
+            rows = next(iter(inputs.values())) if isinstance(inputs, dict) else inputs
+            _reset_noise(self.policy, len(rows))
             return self.policy.predict(parts, deterministic=False)[0], ()
 
     def source(self) -> dict[str, Any]:
@@ -138,10 +141,28 @@ def _copied(policy: Any, space: Space[Any]) -> Any:
     After training its latest distribution is part of a graph, which cannot be copied; acting once
     replaces it.
     """
+    import torch
+
     from skillweave.spaces import unpack
 
+    with torch.random.fork_rng(devices=[]):
+        _reset_noise(policy, 1)
     policy.predict(unpack(space, made_up(space, 1)), deterministic=True)
     return copy.deepcopy(policy)
+
+
+def _has_gsde(policy: Any) -> bool:
+    """Return whether a policy has noise that depends on the state (``use_sde``)."""
+    return bool(getattr(getattr(policy, "actor", policy), "use_sde", False))
+
+
+def _reset_noise(policy: Any, n: int) -> None:
+    """Draw the noise of gSDE for n environments, outside of any graph."""
+    import torch
+
+    if _has_gsde(policy):
+        with torch.no_grad():
+            policy.reset_noise(n)
 
 
 @overload
@@ -199,6 +220,7 @@ def from_sb3(
         trust: True if you trust the author: opening the files may run any code in them.
         normalize: the ``VecNormalize`` that scaled observations in training, or the file in which
             it was saved; its statistics become a part of the mapping. The zip does not hold them.
+            None: the one that a model in memory still has. False: none.
         sees: the parts of the observation that the model takes; of a model with Dict observations
             a list for each part by name; see ``from_onnx``.
         goal: the value of ``Goal()`` in ``sees``; see ``from_onnx``.
@@ -216,6 +238,10 @@ def from_sb3(
         DeclarationError: an argument has a wrong type.
     """
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
+    if normalize is None:
+        normalize = _statistics_of(model)
+    elif normalize is False:
+        normalize = None
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_sb3(): learn is {short(learn)}; it must be True or False")
     if not isinstance(model, str | Path):
@@ -253,6 +279,21 @@ def from_sb3(
     return SB3Policy(loaded, file, checksum(content), _mapping(loaded, normalize, trust, options))
 
 
+def _statistics_of(model: Any) -> Any:
+    """Return the ``VecNormalize`` of a model in memory; of a zip, say which file may hold it."""
+    if not isinstance(model, str | Path):
+        return getattr(model, "get_vec_normalize_env", lambda: None)()
+    file = Path(model)
+    # RL Baselines3 Zoo has them in a folder of the zip's name.
+    files = *file.parent.glob("*.pkl"), *file.with_suffix("").glob("*.pkl")
+    if scales := sorted(str(f) for f in files if "normali" in f.name.lower()):
+        notice(
+            f"{file}: {scales[0]} may hold the scaling of its observations. If it was trained so, "
+            f"add normalize={scales[0]!r}; normalize=False ends this message"
+        )
+    return None
+
+
 def _learnable(
     model: Any, file: Path | None, normalize: Any, trust: bool, options: dict[str, Any]
 ) -> Learnable:
@@ -272,9 +313,7 @@ def _learnable(
         )
     kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
     spaces = model.observation_space, model.action_space
-    gsde = getattr(policy, "use_sde", False) or getattr(policy, "use_gsde", False)
-    gsde = gsde or getattr(getattr(policy, "actor", None), "use_sde", False)
-    if kind not in kinds or hasattr(policy, "lstm_actor") or gsde:
+    if kind not in kinds or hasattr(policy, "lstm_actor") or _has_gsde(policy):
         raise PolicyError(
             f"{name} cannot learn on: only the networks of {', '.join(kinds)} without memory and "
             "without gSDE are known. Let it act as it is (without learn=True)"
@@ -330,9 +369,11 @@ def _check_features(extractor: Any, name: str) -> None:
 
 def _moments(
     normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
-) -> tuple[Array, Array, float]:
-    """Return mean, variance and number of observations, by ``VecNormalize``."""
+) -> tuple[Array, Array, float] | None:
+    """Return mean, variance and number of observations, by ``VecNormalize``; None: not scaled."""
     normalize = _opened(normalize, trust, space, action_space)
+    if not getattr(normalize, "norm_obs", True):
+        return None
     rms: Any = getattr(normalize, "obs_rms", None)
     if isinstance(rms, dict) or not isinstance(space, Box):
         raise PolicyError(
@@ -401,7 +442,7 @@ def _statistics(
     if any(name not in parts or parts[name].shape != shape for name, shape in shapes.items()):
         raise DeclarationError(
             f"normalize is {short(normalize)}; it must be the VecNormalize of the model, with "
-            f"statistics of observations {space}"
+            f"statistics of observations {space}; normalize=False takes none"
         )
     limit = float(normalize.clip_obs)
     return {

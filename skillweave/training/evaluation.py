@@ -342,7 +342,7 @@ def _evaluate(
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
         if calls is not None:
             vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)
-        if not pooled and episodes > envs.num_envs:
+        if spec.check_seed and not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
         return evaluation
     finally:

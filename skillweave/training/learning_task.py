@@ -14,7 +14,7 @@ from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import NAMED_SHARE, SkillCollector
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.envs.engine import Engine
+from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.skills import Reflex, Skill
 from skillweave.training.role import Role, agent_role
@@ -74,6 +74,8 @@ class LearningTask:
 
     def logged(self, collector: C) -> C:
         """Return a collector that logs what is to be logged."""
+        if isinstance(collector.engine, GymnasiumEngine):
+            collector.engine.trains = True
         collector.log_info, collector.log_calls = self.log_info, self.log_calls
         return collector
 
