@@ -247,6 +247,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "pool": or_none(Kind((5, "x", None, []), (sw.envpool,))),
         "obs_names": or_none(Kind((5, "x", None, [5], {"x": "y"}, {"x": [5]}),
                                   (["x", "y"], {"x": ["y"]}))),
+        "check_seed": FLAG,
     },
     sw.Agent: {
         "env": Kind((5, True, None, [], {}, gym.Env()), ("CartPole-v1", sw.EnvSpec("CartPole-v1"))),

@@ -1168,7 +1168,8 @@ def train_agent(
         algorithm: its settings, ``SAC()`` for example.
         steps: training budget in environment steps.
         target_return: stop early at this mean return of the periodic evaluation.
-        target_success: stop early at this share of episodes with a true ``info["success"]``.
+        target_success: stop early at this share of episodes with a true ``info["success"]``, or
+            ``info["is_success"]`` where that is missing.
         eval_every: environment steps between these evaluations; None: none.
         eval_episodes: episodes of each.
         checkpoint_every: environment steps between checkpoints.

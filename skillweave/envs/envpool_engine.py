@@ -17,7 +17,7 @@ from skillweave.envs.history import History
 from skillweave.envs.infos import ActionMasks, single_infos
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.errors import EnvError, MissingExtra
-from skillweave.spaces import pack, put_observation, unpack
+from skillweave.spaces import pack, put_observation
 from skillweave.types import Array
 
 RENEW_AFTER = 100_000
@@ -202,9 +202,9 @@ class EnvPoolEngine:
             raw.next_obs = raw.next_obs.copy()
             each = single_infos(last, len(ids))
             for row in np.flatnonzero(raw.terminated | raw.truncated):
-                obs = unpack(self.observation_space, raw.next_obs[row])
-                obs, _ = last_observation(obs, each[row], self)
-                put_observation(self.observation_space, raw.next_obs, row, obs)
+                obs, _ = last_observation(None, each[row], self)
+                if obs is not None:
+                    put_observation(self.observation_space, raw.next_obs, row, obs)
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
         self._watch.check_step(raw, ids)
         raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated

@@ -21,7 +21,6 @@ from skillweave.skills.foreign_policy import SEES, checksum
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.skills.plan import Shapes
-from skillweave.spaces import choice_counts, obs_shape
 from skillweave.types import Array
 
 NUMBERS = {
@@ -43,14 +42,6 @@ OTHER = re.compile(
 """Names of outputs that are no actions."""
 ACTION = re.compile("action|logit|mean|policy|(?<![a-z])(act|mu|loc|pi|q)(?![a-z])|q_?value")
 """Names of outputs that are actions, or by which one is chosen."""
-
-
-def _rank(name: str) -> tuple[bool, ...]:
-    """Return the rank of an output as the action, by its name; the lowest is the best."""
-    name = name.lower()
-    other, action = OTHER.search(name), ACTION.search(name)
-    exact = name in ("action", "actions")
-    return other is not None, action is None, "deterministic" not in name, not exact
 
 
 class OnnxPolicy(MappedPolicy):
@@ -97,10 +88,8 @@ class OnnxPolicy(MappedPolicy):
             raise PolicyError(
                 f"{file} takes {found or 'nothing'}; it must take one batch of observations{more}"
             )
-        ranks = {name: _rank(name) for name in names if name not in states.values()}
-        best = [n for n, rank in ranks.items() if rank == min(ranks.values())] or names
-        self.output = output or best[0]
-        self._alike = [] if output else best
+        self._chooses = output is None
+        self.output = output or names[0]
         self._inputs = {i.name: i for i in inputs}
         self.free = [i.name for i in free]
         batches = [self._inputs[name].shape[0] for name in self.free]
@@ -134,7 +123,6 @@ class OnnxPolicy(MappedPolicy):
             PolicyError: its input has another shape; the message names both.
         """
         bound = super().bind(observation_space, action_space, who)
-        bound._choose_output()
         if self.mapping.sees is not None:
             return bound
         mine = self._inputs[self.free[0]].shape[1:]
@@ -150,23 +138,38 @@ class OnnxPolicy(MappedPolicy):
             )
         return bound
 
-    def _choose_output(self) -> None:
-        """Choose by shape among outputs whose names do not say which is the action."""
-        if len(self._alike) < 2:
+    def fit_mapping(self) -> None:
+        """Fit the mapping to the spaces, and choose the output of the actions by its name.
+
+        Where names do not decide, shapes do.
+        """
+        super().fit_mapping()
+        if not self._chooses:
             return
+        from skillweave.spaces import choice_counts, obs_shape
+
         size = math.prod(obs_shape(self.action_space))
-        choices = sum(choice_counts(self.action_space)) or size
-        fitting = [
-            o.name
-            for o in self._session.get_outputs()
-            if o.name in self._alike
-            and math.prod(n for n in o.shape[1:] if isinstance(n, int))
-            == (size if "int" in o.type else choices)
-        ] or self._alike
-        self.output = fitting[0]
-        if len(fitting) > 1:
+        choices = sum(choice_counts(self.action_space))
+        after = dict(self.mapping.state).values()
+        ranks: dict[tuple[bool, ...], list[str]] = {}
+        for output in self._session.get_outputs():
+            name = output.name.lower()
+            numbers = math.prod(n for n in output.shape[1:] if isinstance(n, int))
+            rank = (
+                output.name in after,
+                OTHER.search(name) is not None,
+                ACTION.search(name) is None,
+                choices > 0 and "logit" not in name,
+                "deterministic" not in name,
+                name not in ("action", "actions"),
+                numbers != (choices if choices and "int" not in output.type else size),
+            )
+            ranks.setdefault(rank, []).append(output.name)
+        best = ranks[min(ranks)]
+        self.output = best[0]
+        if len(best) > 1:
             notice(
-                f"{self._who}: any of its outputs {', '.join(fitting)} could be the action, and "
+                f"{self._who}: any of its outputs {', '.join(best)} could be the action, and "
                 f"{self.output!r} is used: name the right one, output={self.output!r}"
             )
 
@@ -316,8 +319,8 @@ def from_onnx(
 
     Args:
         path: the file; weights in a second file beside it are read, too.
-        output: the name of the output to use; None: the one that is named like an action, or that
-            alone has the actions' shape; a value never goes before others.
+        output: the name of the output to use; None: the one that is named like an action, else
+            the one of the actions' shape, and never a value where there is another.
         sees: the parts of the observation that the policy takes; None: the whole observation.
         goal: the value of ``Goal()`` in ``sees``, a command for example: numbers, or a function of
             observations that returns (n, numbers).

@@ -59,7 +59,8 @@ class Evaluation:
     skills: dict[str, SkillReport] = field(default_factory=dict)  # none: a plain agent
     cut: Count = 0  # episodes that were cut at the step limit without an end
     succeeded: Count | None = None
-    """Episodes that succeeded by ``info["success"]`` of their last step; None: without that key."""
+    """Episodes that succeeded by ``info["success"]`` (else ``info["is_success"]``) of their last
+    step; None: without these keys."""
     reflexes: dict[str, Count] = field(default_factory=dict)
     """Steps in which each reflex acted, by its path."""
     alone: str | None = None

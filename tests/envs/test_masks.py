@@ -31,7 +31,7 @@ from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Array
 
 # A gate shows the number of its episode.
-pytestmark = pytest.mark.filterwarnings("ignore:.*starts another episode")
+pytestmark = pytest.mark.filterwarnings("ignore:.*(starts another episode|two resets)")
 A = 4
 
 

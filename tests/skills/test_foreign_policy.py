@@ -10,6 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, poisoned, sb3_zip
+from skills.mapped_models import onnx_model
 
 from skillweave import Acts, evaluate, from_function, from_onnx, from_sb3, from_torch
 from skillweave.errors import MissingExtra, PolicyError, SkillweaveError
@@ -160,6 +161,65 @@ def test_refusing_needs_nothing_installed_and_reads_nothing(monkeypatch, tmp_pat
     (tmp_path / "nothing.zip").touch()
     with pytest.raises(SkillweaveError, match="trust=True"):
         from_sb3(tmp_path / "nothing.zip", "ppo")
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "SAC"])
+def test_a_model_with_gsde_acts_as_its_predict_and_samples_its_distribution(name):
+    sb3 = pytest.importorskip("stable_baselines3")
+    more = {"learning_starts": 50} if name == "SAC" else {"n_steps": 64}
+    kind = getattr(sb3, name)
+    if name != "SAC":
+        more["policy_kwargs"] = {"log_std_init": -2.0}  # so that few actions are clipped
+    model = kind("MlpPolicy", "Pendulum-v1", use_sde=True, device="cpu", seed=0, **more).learn(128)
+    policy = fit(from_sb3(model), model.observation_space, model.action_space)
+    obs = ROWS[:, :3]
+    greedy = model.predict(obs, deterministic=True)[0]
+    np.testing.assert_allclose(acts(policy, obs), greedy, atol=1e-5)
+    if name == "PPO":
+        one = obs[:1].repeat(4000, 0)
+        drawn = acts(policy, one, deterministic=False, rng=np.random.default_rng(0))
+        std = model.policy.get_distribution(torch.tensor(obs[:1])).distribution.stddev.item()
+        assert drawn.std() == pytest.approx(std, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("space", "outputs", "chosen"),
+    [  # shapes by name, of what exporters write
+        (Box(-1, 1, (1,)), {"value": 1, "actions": 1}, "actions"),
+        (Box(-1, 1, (1,)), {"mu": 1, "log_std": 1, "value": 1}, "mu"),
+        (Box(-1, 1, (1,)), {"values": 1, "log_prob": 1, "28": 1}, "28"),
+        (Box(-1, 1, (2,)), {"28": 1, "33": 2}, "33"),
+        (
+            Box(-1, 1, (2,)),
+            {
+                "continuous_action_output_shape": 2,
+                "continuous_actions": 2,
+                "deterministic_discrete_actions": 1,
+                "deterministic_continuous_actions": 2,
+            },
+            "deterministic_continuous_actions",
+        ),
+        (Discrete(2), {"critic": 2, "action": 2, "logits": 2}, "logits"),
+        (Discrete(2), {"value": 1, "q_values": 2}, "q_values"),
+    ],
+)
+def test_the_output_of_the_actions_is_known_by_its_name_or_shape(tmp_path, space, outputs, chosen):
+    pytest.importorskip("onnxruntime")
+    nodes = [("MatMul", ["obs", f"w.{name}"], [name]) for name in outputs]
+    constants = {f"w.{name}": np.zeros((4, n), np.float32) for name, n in outputs.items()}
+    shapes = {name: ["n", n] for name, n in outputs.items()}
+    path = onnx_model(tmp_path / "x.onnx", nodes, {"obs": ["n", 4]}, shapes, constants)
+    assert fit(from_onnx(path), OBS, space).output == chosen
+
+
+def test_outputs_that_nothing_tells_apart_are_named(tmp_path):
+    pytest.importorskip("onnxruntime")
+    nodes = [("Identity", ["obs"], [name]) for name in "ab"]
+    path = tmp_path / "x.onnx"
+    onnx_model(path, nodes, {"obs": ["n", 4]}, {"a": ["n", 4], "b": ["n", 4]}, {})
+    with pytest.warns(UserWarning, match="a, b"):
+        assert fit(from_onnx(path), OBS, OBS).output == "a"
+    assert fit(from_onnx(path, output="b"), OBS, OBS).output == "b"
 
 
 # What does not fit ----------------------------------------------------------------------------

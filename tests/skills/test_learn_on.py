@@ -126,7 +126,8 @@ def test_the_deviation_of_actions_and_the_values_come_along():
     torch.testing.assert_close(values, theirs, atol=1e-4, rtol=1e-4)
 
 
-def test_statistics_of_observations_come_along():
+@pytest.mark.parametrize("given", [True, False])
+def test_statistics_of_observations_come_along(given):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     vec = VecNormalize(DummyVecEnv([World]))
@@ -134,7 +135,7 @@ def test_statistics_of_observations_come_along():
     for _ in range(20):
         vec.step([vec.action_space.sample()])
     model = model_of("PPO", vec)
-    learnable = sw.from_sb3(model, normalize=vec, learn=True)
+    learnable = sw.from_sb3(model, normalize=vec if given else None, learn=True)
     agent = agent_of(learnable, SMALL["PPO"], World())
     obs = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     theirs = model.predict(vec.normalize_obs(obs), deterministic=True)[0]

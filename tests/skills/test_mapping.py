@@ -209,6 +209,33 @@ def test_statistics_of_another_model_are_refused(tmp_path: Any) -> None:
         sw.from_sb3(a_model(), normalize=other)
 
 
+def test_statistics_that_a_model_has_are_used_and_a_file_beside_its_zip_is_named(
+    tmp_path: Any, recwarn: Any
+) -> None:
+    pytest.importorskip("stable_baselines3")
+    import stable_baselines3 as sb3
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    vec = VecNormalize(make_vec_env("Pendulum-v1"), norm_reward=False)
+    vec.obs_rms.mean[:], vec.obs_rms.var[:] = (1, 2, 3), (4, 5, 6)
+    model = sb3.A2C("MlpPolicy", vec, device="cpu")
+    spaces = model.observation_space, model.action_space
+    obs = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    for more, seen in (({}, vec.normalize_obs(obs)), ({"normalize": False}, obs)):
+        acted = fit(sw.from_sb3(model, **more), *spaces).act({}, obs)[0]
+        wanted = model.predict(seen, deterministic=True)[0]
+        np.testing.assert_allclose(acted, wanted, atol=1e-5)
+    vec.norm_obs = False
+    assert sw.from_sb3(model, learn=True).scaling is None
+    model.save(tmp_path / "a.zip")
+    vec.save(str(tmp_path / "my_VecNormalize.pkl"))
+    for more, notices in (({}, 1), ({"normalize": False}, 0)):
+        recwarn.clear()
+        sw.from_sb3(tmp_path / "a.zip", "a2c", trust=True, **more)
+        assert sum("my_VecNormalize.pkl" in str(each.message) for each in recwarn) == notices
+
+
 def a_model() -> Any:
     import stable_baselines3 as sb3
 

@@ -32,7 +32,7 @@ from skillweave.training.skill_report import SkillReport
 from skillweave.training.skill_text import skill_rows, skill_table
 
 # A walk shows the number of its episode.
-pytestmark = pytest.mark.filterwarnings("ignore:.*starts another episode")
+pytestmark = pytest.mark.filterwarnings("ignore:.*(starts another episode|two resets)")
 NONE = {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
 
 
