@@ -201,7 +201,7 @@ class EnvPoolEngine:
         if last:  # the pool resets itself
             raw.next_obs = raw.next_obs.copy()
             each = single_infos(last, len(ids))
-            for row in np.flatnonzero(raw.terminated | raw.truncated):
+            for row in np.flatnonzero(raw.terminated | raw.truncated).tolist():
                 obs, _ = last_observation(None, each[row], self)
                 if obs is not None:
                     put_observation(self.observation_space, raw.next_obs, row, obs)
