@@ -52,6 +52,16 @@ def is_own(frame: FrameType) -> bool:
     file = _file(frame)
     if file == "<string>":  # `python -c`; elsewhere code that was generated, as of dataclasses
         return frame.f_globals.get("__name__") == "__main__"
+    return _is_own_file(file)
+
+
+def is_own_code(code: Any) -> bool:
+    """Return whether a class or a function is the user's."""
+    file = getattr(sys.modules.get(code.__module__), "__file__", None)
+    return code.__module__ == "__main__" if file is None else _is_own_file(file)
+
+
+def _is_own_file(file: str) -> bool:
     if file.startswith("<"):
         return file.startswith((SENT, "<stdin>", "<ipython-input-"))
     path = Path(file)

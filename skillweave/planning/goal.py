@@ -94,7 +94,7 @@ class GoalTask:
     def holds(self, obs: Array, goal: Array) -> Array:
         """Return where ``goal``, (G,) or (n, G), is reached in ``obs`` (n, …), (n,) bool."""
         who, name = "goal", function_name(self.reached)
-        value = called(lambda some: self.reached(some, goal), read_only(obs), f"{who}: {name}()")
+        value = called(self.reached, read_only(obs), f"{who}: {name}()", more=(goal,))
         return checked(value, len(obs), bool, who, name)
 
     def at(self, goal: Array) -> RewardMachine:

@@ -68,7 +68,7 @@ class FunctionSelector(ReadySelector):
         function = self.function
         if self.takes_last_call:
             last = LastCall(*(read_only(memory[k]) for k in ("skill", "why", "succeeded")))
-            value = called(lambda seen: function(seen, last), read_only(obs), self._who)
+            value = called(function, read_only(obs), self._who, more=(last,))
             arguments: Any = (obs, last)
         else:
             value = called(function, read_only(obs), self._who)

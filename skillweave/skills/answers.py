@@ -37,12 +37,13 @@ def answer(
     """
     if isinstance(about, np.ndarray):
         about = read_only(about)
-    value = called(function, about, f"{who}: {method}()", elapsed, ids)
+    judges = None if may_change else True
+    value = called(function, about, f"{who}: {method}()", elapsed, ids, judges=judges)
     objects = isinstance(value, np.ndarray) and value.dtype == object
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
         raise SkillError(f"{who}: {method}(){at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, method, elapsed, ids)
-    probe(function, about, n, f"{who}: {method}()", answered=None if may_change else array)
+    probe(function, about, n, f"{who}: {method}()")
     return array
 
 

@@ -54,8 +54,9 @@ class Skill:
 
     Every method is batched: arrays over N environments in, one array (N,) out, so the same class
     runs on one environment and on a thousand. Methods must be functions of their arguments: keep no
-    state of an environment in ``self`` (``step`` has the observation before and after). At its
-    first call each is called twice, and one that answers otherwise is refused.
+    state of an environment in ``self`` (``step`` has the observation before and after). Before
+    its first call each is called several times, and one that answers otherwise is refused, or gets
+    a notice.
 
     Attributes:
         name: used in messages, files and captions; default: the class name in lower case.

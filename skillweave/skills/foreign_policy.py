@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NotRequired, Self, TypedDict
 
 import numpy as np
@@ -15,6 +16,8 @@ from gymnasium.vector.utils import batch_space
 from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
+from skillweave.skills.probing import untouched, watch
+from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Memory, Memoryless, Policy
 
 SEES = "let sees= give the parts that it takes"
@@ -100,7 +103,8 @@ class Foreign(Memoryless):
             PolicyError: it failed; the message names the policy and the space.
         """
         try:
-            self.act(self.start(2), made_up(self.observation_space, 2))
+            with untouched(getattr(self, "function", None)):
+                self.act(self.start(2), made_up(self.observation_space, 2))
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
@@ -146,8 +150,8 @@ def check_spaces(
 ) -> None:
     """Raise a PolicyError where the spaces of a policy are not those of the environment ``env``.
 
-    If only the bounds of actions differ, a notice says that its numbers are not scaled. ``whose``
-    begins messages.
+    If only the bounds of actions differ, a notice says that its numbers are not scaled; another
+    one, that a policy of the user's class keeps a state in itself. ``whose`` begins messages.
     """
     from skillweave.spaces import other_bounds, same_space  # needs torch, which declaring does not
 
@@ -168,6 +172,10 @@ def check_spaces(
             "Scale them: acts=Acts(scale=...) of a policy from elsewhere, or the wrapper "
             "gymnasium.wrappers.RescaleAction. If they are right, write acts=Acts()"
         )
+    if is_own_code(type(policy)):
+        act = partial(policy.act, policy.start(2))
+        for _ in range(2):  # the second call gives the notice
+            watch(act, made_up(observation_space, 2), (), whose, False)
 
 
 class Source(TypedDict):

@@ -13,7 +13,7 @@ from skillweave.notices import notice
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.info_read import JUDGING
 from skillweave.skills.outputs import called
-from skillweave.skills.probing import Seen, randomness_kept
+from skillweave.skills.probing import Seen, untouched
 from skillweave.types import Step
 
 _seen = Seen()
@@ -51,10 +51,10 @@ def check_reads_goal(skill: Skill, step: Step) -> None:
     watched = _Watched(**{field.name: getattr(step, field.name) for field in fields(Step)})
     watched.reads = False
     try:
-        with randomness_kept():
-            for method in JUDGING:
-                if skill.defines(method):
-                    called(getattr(skill, method), watched, f"skill {path_of(skill)!r}: {method}()")
+        with untouched(skill):
+            for method in filter(skill.defines, JUDGING):
+                who = f"skill {path_of(skill)!r}: {method}()"
+                called(getattr(skill, method), watched, who, judges=None)
     except SkillweaveError:
         return  # it is raised where the step is judged
     if not watched.reads:

@@ -123,7 +123,7 @@ class Goals:
         """
         goal, rows = self.read(self.start(len(obs))).copy(), np.arange(len(obs))
         for _ in range(TRIES):
-            given = called(lambda seen: self.skill.goals(seen, rng), read_only(obs), self._label)
+            given = called(self.skill.goals, read_only(obs), self._label, more=(rng,))
             goal[rows] = self.fitted(obs, given, self._label)
             again = self.hold(obs, goal[rows])
             if not again.any():
@@ -141,7 +141,8 @@ class Goals:
         no = zeros > 0
         still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
         with suppress(Exception), np.errstate(all="ignore"):
-            return np.array(self.skill.termination(still), bool).reshape(len(obs))
+            holds = called(self.skill.termination, still, self._label, judges=None)
+            return np.array(holds, bool).reshape(len(obs))
         return no
 
     def fitted(
@@ -174,7 +175,7 @@ class Goals:
         return goals
 
     def _clipped(self, obs: Array, goal: Array, who: str) -> Any:
-        return called(lambda seen: self.skill.clip_goal(seen, read_only(goal)), read_only(obs), who)
+        return called(self.skill.clip_goal, read_only(obs), who, more=(read_only(goal),))
 
     def one(self, goal: Any, who: str) -> Array:
         """Return a copy of one goal as a batch of one, checked.

@@ -12,7 +12,7 @@ from typing import Any
 from skillweave.errors import DeclarationError
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.outputs import called
-from skillweave.skills.probing import randomness_kept
+from skillweave.skills.probing import untouched
 from skillweave.types import Step
 
 
@@ -84,8 +84,8 @@ def info_keys_read(skill: Skill, step: Step, methods: Sequence[str] = JUDGING) -
             continue
         info = _Recording(step.info)
         where = f"skill {path_of(skill)!r}: {method}()"
-        with randomness_kept():
-            called(getattr(skill, method), replace(step, info=info), where)
+        with untouched(skill):
+            called(getattr(skill, method), replace(step, info=info), where, judges=None)
         if info.whole:
             raise DeclarationError(
                 f"{where} reads info as a whole, so it cannot be found out which keys to record "

@@ -15,6 +15,7 @@ from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.skills.goal_spaces import given_parts, in_words, parts_of
 from skillweave.skills.info_words import missing_key, odd_key
+from skillweave.skills.probing import watch
 from skillweave.tracebacks import is_users
 from skillweave.types import Array, Step
 
@@ -26,22 +27,27 @@ def called(
     elapsed: Any = None,
     ids: Array | None = None,
     kind: type[SkillweaveError] = SkillError,
+    more: tuple[Any, ...] = (),
+    judges: bool | None = False,
 ) -> Any:
-    """Return the result of a function of the user.
+    """Return the result of a function of the user; all of them are called here.
 
     Args:
-        function: takes one argument.
-        argument: a step, or observations.
+        function: takes one argument, and ``more``.
+        argument: a step, or observations; a dict: arguments by name.
         who: the function's name in messages.
         elapsed: the step of the episode, if known.
         ids: the environments of the rows.
         kind: the type of the error: PolicyError if the function is a policy.
+        more: further arguments.
+        judges: its answer to the same must never change; None: it may keep a state.
 
     Raises:
         SkillError: the function raised; the message names ``who``, the line, and the step if known.
     """
+    watch(function, argument, more, who, judges)
     try:
-        return function(argument)
+        return function(**argument) if isinstance(argument, dict) else function(argument, *more)
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:

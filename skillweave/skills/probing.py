@@ -2,23 +2,27 @@
 
 A function that ignores the axis of the environments may return the right shape by chance:
 ``step.next_obs[0]`` has four numbers for four environments of CartPole. So the function is also
-called with rows of its first call, repeated or cut to 3 and to more environments. Methods of skills
-are also called with the same rows again: where they keep a state of their own, they answer
-otherwise. Afterwards, the random streams of Python, NumPy, torch and the method's object are
-restored.
+called with rows of its first call, repeated or cut to 3 and to more environments.
+
+A function that keeps a state of its own answers otherwise after other calls. So it is called with
+the same rows again, and with zeros and large numbers before and after them. Afterwards, the random
+streams of Python, NumPy, torch and the function's objects are restored.
 """
 
 from __future__ import annotations
 
 import copy
+import inspect
 import itertools
 import random
 import sys
 import types
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +30,9 @@ from gymnasium import Space
 
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import error_text
+from skillweave.notices import notice
 from skillweave.skills.goal_spaces import parts_of
+from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Step, read_only
 
 MOST = 256
@@ -36,41 +42,151 @@ AXIS = (
     "axis=1"
 )
 """Advice in messages."""
-CHANGING = (
-    dict,
-    list,
-    set,
-    np.ndarray,
-    random.Random,
-    np.random.Generator,
-    np.random.RandomState,
+OTHERS = ("torch", "gymnasium")
+"""Packages whose objects may keep a state: modules and environments."""
+GENERATORS = (random.Random, np.random.Generator, np.random.RandomState)
+CHANGING = (dict, list, set, deque, np.ndarray, *GENERATORS)
+"""Kinds of attributes that a function may change in place."""
+DEPTH = 3
+"""The most objects between a function and an attribute that it writes."""
+REMEMBER = (
+    "compute the answer from the argument alone, and let the environment, or a wrapper, put what "
+    "must be remembered into the observation or info. A policy may have a state: "
+    "sw.from_function(function, state=shape). Where a reward should change (a bonus for what was "
+    "seldom seen), say so in its class: reward_changes = True"
 )
-"""Kinds of attributes that a method may change in place."""
+"""Advice about functions that keep a state of their own."""
 
 
 class Seen:
-    """Objects, and names of their functions, that were tested in this process."""
+    """Notes about the functions of objects in this process."""
 
     def __init__(self) -> None:
-        self._names: dict[int, tuple[weakref.ref[Any], set[str]]] = {}
+        self._notes: dict[int, tuple[weakref.ref[Any], dict[str, Any]]] = {}
+
+    def notes(self, owner: Any) -> dict[str, Any] | None:
+        """Return the notes about an object by names of its functions; None: it can have none."""
+        key = id(owner)
+        if key not in self._notes:
+            try:
+                reference = weakref.ref(owner, lambda _: self._notes.pop(key, None))
+            except TypeError:  # of some objects written in C
+                return None
+            self._notes[key] = reference, {}
+        return self._notes[key][1]
 
     def first_time(self, owner: Any, name: str) -> bool:
         """Return whether this is the first call with these arguments."""
-        key = id(owner)
-        if (entry := self._names.get(key)) is not None:
-            if name in entry[1]:
-                return False
-            entry[1].add(name)
-            return True
-        try:
-            reference = weakref.ref(owner, lambda _: self._names.pop(key, None))
-        except TypeError:  # of some objects written in C
+        notes = self.notes(owner)
+        if notes is None or name in notes:
             return False
-        self._names[key] = reference, {name}
+        notes[name] = True
         return True
 
 
 _seen = Seen()
+_faults = Seen()
+"""What is wrong with functions, until it is said."""
+
+
+def watch(
+    function: Callable[..., Any], given: Any, more: tuple[Any, ...], who: str, judges: bool | None
+) -> None:
+    """Give a notice where a function of the user keeps a state of its own, at its second call.
+
+    Before its first call, it is called with other arguments, too.
+
+    Args:
+        given: its argument; a dict: arguments by name.
+        more: further arguments.
+        who: its name in messages.
+        judges: its answer to the same must never change; None: it may keep a state.
+
+    Raises:
+        SkillError: ``judges``, and the answer changes.
+    """
+    owner, name = _owner_and_name(function)
+    if judges is None or str(getattr(function, "__module__", "")).startswith("skillweave."):
+        return
+    notes = _faults.notes(owner)
+    if notes is None:
+        return
+    fault, notes[name] = notes.get(name), ""
+    if fault:
+        notice(f"{who} {fault}")
+    elif fault is None and (names := _written(function, given, more, who if judges else "")):
+        notes[name] = (
+            f"writes {', '.join(names[:4])}, and answers by it. It runs on from one episode into "
+            f"the next, and all environments share it: {REMEMBER}"
+        )
+
+
+def _owner_and_name(function: Any) -> tuple[Any, str]:
+    """Return what the notes about a function stand under."""
+    while isinstance(function, partial):
+        function = function.func
+    return getattr(function, "__self__", function), getattr(function, "__name__", "")
+
+
+@np.errstate(all="ignore")
+def _written(
+    function: Callable[..., Any], given: Any, more: tuple[Any, ...], who: str
+) -> list[str]:
+    """Return the names of what a function writes, if answers depend on the calls before.
+
+    Args:
+        who: its name in a SkillError, raised where it answers otherwise when it is called again;
+            empty: this is no error.
+    """
+    n = next((len(x) for x in _values(given) if isinstance(x, np.ndarray) and x.ndim), 0)
+    others = [_taken(given, np.arange(n), n, factor) for factor in (0, 100, -100)]
+    with untouched(function) as spaces:
+        order = (given, given, *others, given) if spaces else (given, given) if who else ()
+        in_turn = [_answer(function, x, more, spaces) for x in order]
+        names = [
+            str(name)
+            for space, values in spaces
+            for name, value in space.items()
+            if not isinstance(value, GENERATORS) and not _close(value, values.get(name))
+        ]
+    if who and not _close(*in_turn[:2]):
+        with suppress(TypeError, ValueError):  # no numbers: this is said elsewhere
+            before, after = np.array(in_turn[:2], float)
+            row = np.abs(after - before).argmax()
+            raise SkillError(
+                f"{who} answers {before[row]:g}, and {after[row]:g} when it is asked about the "
+                "same again, so it keeps a state of its own. Steps are judged in any order and "
+                f"number, and later than they were made: {REMEMBER}"
+            )
+    alone = []
+    for x in (given, given, given, *others) if names else ():
+        with untouched(function) as spaces:
+            alone.append(_answer(function, x, more, spaces))
+    # First answers differ by random numbers of an unknown source alone.
+    if not all(_close(first, in_turn[0]) for first in alone[:3]):
+        return []
+    return [] if all(map(_close, [*alone[1:], *alone[:1]], in_turn)) else names
+
+
+Spaces = list[tuple[dict[str, Any], dict[str, Any]]]
+
+
+def _answer(function: Callable[..., Any], given: Any, more: tuple[Any, ...], spaces: Spaces) -> Any:
+    """Return the answer of a function with the random numbers of its first call."""
+    for space, values in spaces:
+        space.update({k: _copied(v) for k, v in values.items() if isinstance(v, GENERATORS)})
+    more = () if isinstance(given, dict) else (given, *map(_copied, more))
+    with untouched(None), suppress(Exception, SystemExit):
+        return function(*more, **(given if isinstance(given, dict) else {}))
+    return None
+
+
+def _close(one: Any, other: Any) -> bool:
+    """Return whether two answers are equal but for rounding."""
+    try:
+        return bool(np.isclose(one, other, rtol=1e-4, atol=1e-6, equal_nan=True).all())
+    except Exception:  # of texts, parts with names, and objects
+        return repr(one) == repr(other)
 
 
 def probe(
@@ -80,7 +196,6 @@ def probe(
     who: str,
     space: Space[Any] | None = None,
     kind: type[SkillweaveError] = SkillError,
-    answered: Array | None = None,
 ) -> None:
     """Call a function for other numbers of environments than n, at its first call.
 
@@ -91,22 +206,18 @@ def probe(
         who: the function's name in messages.
         space: of its result for one environment; None: a number.
         kind: the type of the error: PolicyError if the function is a policy.
-        answered: (n,) what it has returned, and must return again; None: it may change.
 
     Raises:
-        SkillError: its result does not have a row for each environment, or is another one when it
-            is called again; the message names it.
+        SkillError: its result does not have a row for each environment; the message names it.
     """
-    owner = getattr(function, "__self__", function)
-    if not n or not _seen.first_time(owner, getattr(function, "__name__", "")):
+    owner, name = _owner_and_name(function)
+    if not n or not _seen.first_time(owner, name):
         return
     arguments = given if isinstance(given, tuple) else (given,)
     sizes = _other_sizes(n, set(itertools.chain.from_iterable(_sizes(a, n) for a in arguments)))
     certain = all(_has_rows(a, n) for a in arguments)
-    with randomness_kept():
-        function = _on_copy(function)
-        if answered is not None:
-            _check_again(function, arguments, answered, who)
+    fault = (_faults.notes(owner) or {}).get(name)
+    with untouched(function):
         for m in sizes:
             rows = np.arange(m) % n
             try:
@@ -116,7 +227,7 @@ def probe(
                     return
                 raise kind(
                     f"{who} answers for {n} environments, but for {m} it raised "
-                    f"{error_text(error)}: {AXIS}"
+                    f"{error_text(error)}: {f'it {fault}' if fault else AXIS}"
                 ) from error
             for part, shape in _leaves(answer, space):
                 actual, wanted = np.shape(part), (m, *shape)
@@ -135,51 +246,6 @@ def _leaves(answer: Any, space: Space[Any] | None) -> Iterator[tuple[Any, tuple[
         return
     for i, (name, part) in enumerate(inner.items()):
         yield from _leaves(answer[i if isinstance(answer, tuple | list) else name], part)
-
-
-def _check_again(
-    function: Callable[..., Any], arguments: tuple[Any, ...], answered: Array, who: str
-) -> None:
-    """Raise a SkillError where a function keeps a state that its answers depend on.
-
-    A function may draw random numbers: then its answers are compared from the same ones.
-    """
-    n = len(answered)
-    with randomness_kept(_generators_of(function)):
-        first = _answer(function, arguments, n)
-    again = _answer(function, arguments, n)
-    otherwise = _answer(function, arguments, n)  # from other random numbers
-    if first is None or again is None or otherwise is None:
-        return  # called with the same rows, it fails now and then: this is said elsewhere
-    if _alike(first, again) and (_alike(first, answered) or not _alike(first, otherwise)):
-        return
-    before, after = (first, again) if _alike(answered, first) else (answered, first)
-    row = int(np.flatnonzero(~_close(before, after))[0])
-    raise SkillError(
-        f"{who} answers {before[row]:g}, and {after[row]:g} when it is asked about the same again, "
-        "so it keeps a state of its own. Steps are judged in any order and number, and later than "
-        "they were made: compute the answer from the argument alone, and let the environment, or a "
-        "wrapper, put what must be remembered into the observation or info. Where a reward should "
-        "change (a bonus for what was seldom seen), say so in its class: reward_changes = True"
-    )
-
-
-def _answer(function: Callable[..., Any], arguments: tuple[Any, ...], n: int) -> Array | None:
-    """Return the answer (n,) of a function as float64; None where it fails."""
-    try:
-        return np.asarray(function(*arguments)).astype(np.float64).reshape(n)
-    except (Exception, SystemExit):
-        return None
-
-
-def _alike(one: Array, other: Array) -> bool:
-    return bool(_close(one, other).all())
-
-
-def _close(one: Array, other: Array) -> Array:
-    """Return where two answers are equal but for rounding, (n,) bool."""
-    close: Array = np.isclose(one, other, rtol=1e-4, atol=1e-6, equal_nan=True)
-    return close
 
 
 def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
@@ -226,58 +292,84 @@ def _has_rows(given: Any, n: int) -> bool:
     )
 
 
-def _taken(given: Any, rows: Array, n: int) -> Any:
-    """Return the rows of an argument; values without rows do not change."""
+def _taken(given: Any, rows: Array, n: int, factor: float = 1.0) -> Any:
+    """Return the rows of an argument times ``factor``; values without rows do not change."""
     if is_dataclass(given):
-        parts = {f.name: _taken(getattr(given, f.name), rows, n) for f in fields(given)}
+        parts = {f.name: _taken(getattr(given, f.name), rows, n, factor) for f in fields(given)}
         kind: Any = type(given)
         return kind(**parts)
     if isinstance(given, Mapping):
-        return {key: _taken(value, rows, n) for key, value in given.items()}
+        return {key: _taken(value, rows, n, factor) for key, value in given.items()}
     if isinstance(given, np.ndarray) and given.shape[:1] == (n,):
-        return read_only(given[rows])
+        taken = given[rows]
+        if factor != 1.0:
+            taken = taken * np.float32(factor) if taken.dtype.kind == "f" else np.zeros_like(taken)
+        return read_only(taken)
     return given
 
 
-def _on_copy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the method of a copy of its object, so counters and generators do not change."""
-    if not isinstance(function, types.MethodType):
-        return function
-    try:
-        twin = copy.copy(function.__self__)
-        for name, value in vars(twin).items():
-            if isinstance(value, CHANGING):
-                vars(twin)[name] = copy.deepcopy(value)
-    except Exception:  # it cannot be copied
-        return function
-    return types.MethodType(function.__func__, twin)
-
-
-def _generators_of(function: Callable[..., Any]) -> list[Any]:
-    """Return the random generators of a method's object."""
-    found = vars(getattr(function, "__self__", None) or types.SimpleNamespace()).values()
-    return [x for x in found if isinstance(x, (np.random.Generator, random.Random))]
-
-
 @contextmanager
-def randomness_kept(generators: Sequence[Any] = ()) -> Iterator[None]:
-    """Restore the global random streams, and these generators, after the block."""
-    states = [
-        g.bit_generator.state if isinstance(g, np.random.Generator) else g.getstate()
-        for g in generators
-    ]
+def untouched(thing: Any) -> Iterator[Spaces]:
+    """Restore the global random streams, and the attributes of objects, after the block.
+
+    Args:
+        thing: a function or an object of the user.
+
+    Yields:
+        The attributes of each object, and their values before.
+    """
+    spaces = [(space, dict(space)) for space in _spaces(thing, {})]
     python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
     torch = sys.modules.get("torch")
     state = None if torch is None else torch.get_rng_state()
     try:
-        yield
+        for space, values in spaces:
+            space.update({name: _copied(value) for name, value in values.items()})
+        yield spaces
     finally:
+        for space, values in spaces:
+            for name in space.keys() - values.keys():
+                del space[name]
+            space.update(values)
         random.setstate(python)
         np.random.set_state(numpy)  # noqa: NPY002
         if torch is not None:
             torch.set_rng_state(state)
-        for generator, of_generator in zip(generators, states, strict=True):
-            if isinstance(generator, np.random.Generator):
-                generator.bit_generator.state = of_generator
-            else:
-                generator.setstate(of_generator)
+
+
+def _spaces(thing: Any, known: dict[int, Any], depth: int = DEPTH) -> Iterator[dict[str, Any]]:
+    """Yield the attributes of the user's objects in a function or an object, and its dicts.
+
+    Args:
+        known: the objects that were searched, by ``id``.
+    """
+    thing, _ = _owner_and_name(thing)
+    kinds = type(thing).__mro__
+    if id(thing) in known:
+        return
+    known[id(thing)] = thing
+    if isinstance(thing, types.FunctionType):
+        if not is_own_code(thing):
+            return
+        space = {}
+        with suppress(ValueError):  # of empty cells
+            outside = inspect.getclosurevars(thing)
+            space = {**outside.globals, **outside.nonlocals}
+    elif is_own_code(kinds[0]) and not any(x.__module__.startswith(OTHERS) for x in kinds):
+        space = getattr(thing, "__dict__", {})
+        yield space
+    elif isinstance(thing, dict) and len(thing) < MOST:
+        space = thing
+        yield space
+    else:
+        return
+    for value in list(space.values()) if depth else ():
+        yield from _spaces(value, known, depth - 1)
+
+
+def _copied(value: Any) -> Any:
+    """Return a copy of a value that may change in place; of others the value itself."""
+    try:
+        return copy.deepcopy(value) if isinstance(value, CHANGING) else value
+    except Exception:  # it cannot be copied
+        return value

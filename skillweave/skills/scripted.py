@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +17,6 @@ from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.goal_spaces import GOAL, OBSERVATION
 from skillweave.skills.mapped import (
     MappedPolicy,
-    invoke,
     model_state,
     parted,
     rows_first,
@@ -78,18 +78,17 @@ class ScriptedPolicy(MappedPolicy):
         only = inputs.get("") if isinstance(inputs, dict) else inputs
         if only is not None and not mapping.state:
             return self._actions(read_only(only)), ()
-        arguments = {k: read_only(v) for k, v in inputs.items()} if only is None else {"": only}
-        before = [read_only(x) for x in model_state(state, mapping.state)]
-        value = called(
-            lambda given: invoke(self.function, given, before, mapping.single_state),
-            arguments,
-            who,
-            kind=PolicyError,
-        )
+        before = tuple(read_only(x) for x in model_state(state, mapping.state))
+        more: tuple[Any, ...] = before if mapping.single_state else (before,)
+        given: Any = only
+        if only is None:
+            given = {k: read_only(v) for k, v in inputs.items()}
+            given |= {"state": more[0]} if mapping.state else {}
+        value = called(self.function, given, who, kind=PolicyError, more=more)
         action, after = parted(value, mapping, who)
         # Copies: the function may return the same arrays each time.
         arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
-        n = len(next(iter(arguments.values())))
+        n = len(next(iter(inputs.values())) if only is None else only)
         return self._array(action, n), rows_first(arrays, mapping.state, who)
 
     @property
@@ -115,13 +114,10 @@ class ScriptedPolicy(MappedPolicy):
         """Return what the function makes of its only input."""
         who, function = self._who, self.function
         if self.with_goal is not None:
+            obs, goal = read_only(given[OBSERVATION]), read_only(given[GOAL])
             by_name = self.with_goal == GOAL
-
-            def both(seen: Array) -> Any:
-                obs, goal = read_only(seen[OBSERVATION]), read_only(seen[GOAL])
-                return function(obs, goal=goal) if by_name else function(obs, goal)
-
-            action = called(both, given, who, kind=PolicyError)
+            function = partial(function, goal=goal) if by_name else function
+            action = called(function, obs, who, kind=PolicyError, more=() if by_name else (goal,))
             return self._array(action, len(given))
         value = called(function, given, who, kind=PolicyError)
         action = self._array(value, len(given))

@@ -1,0 +1,180 @@
+"""A user's function that answers by what it has written into its object gets one notice."""
+
+from __future__ import annotations
+
+import random
+import sys
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+from test_asked_twice import step
+
+from skillweave import tree
+from skillweave.collecting.guide import LastCall
+from skillweave.errors import PolicyError
+from skillweave.notices import collected_notices
+from skillweave.planning import GoalTask, Predicate, RewardMachine
+from skillweave.selectors import Automaton, ready_selector
+from skillweave.selectors.base import goals_at
+from skillweave.skills import Reflex, Skill, asked, from_function
+from skillweave.skills.answers import answer
+from skillweave.skills.foreign_policy import check_spaces
+from skillweave.skills.goals import Goals
+from skillweave.skills.outputs import called
+from skillweave.skills.plan import numbers_of
+from skillweave.skills.probing import watch
+from skillweave.types import Memoryless
+
+OBS = step().next_obs
+SPACES = Box(-10, 10, (1,)), Discrete(2)
+
+
+class Best:
+    """Keeps the best so far, so it answers the same when it is called twice in a row."""
+
+    best = 0.0
+
+    def __call__(self, about: Any) -> Any:
+        obs = getattr(about, "next_obs", about)
+        self.best = max(self.best, float(obs.max()))
+        return np.full(len(obs), int(self.best > 1))
+
+
+class Two(Best):
+    def __call__(self, about: Any, other: Any) -> Any:  # type: ignore[override]
+        return super().__call__(about)
+
+
+class Goal(Best):
+    def __call__(self, obs: Any, other: Any) -> Any:  # type: ignore[override]
+        return super().__call__(obs)[:, None]
+
+
+class Own(Memoryless):
+    observation_space, action_space = SPACES
+
+    def __init__(self) -> None:
+        self.inner = Best()
+
+    def act(self, memory: Any, obs: Any) -> Any:
+        return self.inner(obs), memory
+
+
+def acts(**how: Any) -> Any:
+    policy = from_function(Best(), **how).bind(*SPACES, "it")
+    policy.try_out()
+    return lambda: policy.act({}, OBS)
+
+
+def chooses(value: Any) -> Any:
+    selector = ready_selector(value, ("a", "b"))
+    assert selector is not None
+    memory, last = selector.start(4), LastCall(*np.zeros((3, 4), int))
+    return lambda: (selector.act(memory, OBS), selector.watch(memory, step(), last))
+
+
+def method(name: str) -> Any:
+    base = Goal if name in Skill.of_goals else Best
+    declared = {name: base.__call__, "goal_space": Box(0, 9, (1,))}
+    goals = Goals(type("Kind", (base, Skill), declared)())
+    about: Any = OBS if name == "initiation" else step()
+    ways = {
+        "goals": lambda: goals.draw(OBS, np.random.default_rng(0)),
+        "clip_goal": lambda: goals.fitted(OBS, OBS, "it"),
+    }
+    return ways.get(name, lambda: asked(goals.skill, name, about, 4))
+
+
+def places() -> dict[str, list[Callable[[], Any]]]:
+    """Return uses of functions of the user, by the modules that call them."""
+    never = Predicate(lambda obs: obs[:, 0] > 9)
+    machine = RewardMachine({("a", "b"): (never, Best())}, accepting={"b"})
+    task, inverse = GoalTask(Two(), goal=[1.0]), ~Predicate(Best())
+    goal, computed, own = Best(), Best(), cast(Any, Own())
+    condition, reflex = Reflex(Best(), 0), Reflex(lambda obs: obs[:, 0] > -1, Best())
+    return {
+        "planning.goal": [lambda: task.holds(OBS, OBS)],
+        "planning.machine": [lambda: machine.read(step())],
+        "planning.predicates": [lambda: inverse.at(OBS)],
+        "selectors.automaton": [chooses(Automaton({"x": "a", "y": "b"}, {("x", "y"): Best()}))],
+        "selectors.base": [lambda: goals_at(goal, None, OBS, "it")],
+        "selectors.function": [chooses(Best()), chooses(Two())],
+        "selectors.tree_policy": [chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b"))],
+        "skills.base": [
+            lambda: condition.holds(OBS),
+            lambda: reflex.apply(OBS, np.zeros(4, int), SPACES[1]),
+            *map(method, Skill.methods),
+        ],
+        "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
+        "skills.goals": [*map(method, Skill.of_goals)],
+        "skills.plan": [lambda: numbers_of(computed, OBS, "it")],
+        "skills.scripted": [acts(), acts(sees={"about": slice(0, 1)})],
+    }
+
+
+@pytest.mark.parametrize("place", sorted(places()))
+def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
+    for act in places()[place]:
+        with collected_notices() as notices:
+            for _ in range(4):
+                act()
+        assert len(notices.take()) == 1
+
+
+def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
+    others = ("outputs", "answers", "probing", "info_read", "goal_read")  # of all, or before them
+    calls = {
+        name.removeprefix("skillweave.")
+        for name, module in sys.modules.items()
+        if name.startswith("skillweave.") and not name.endswith(others)
+        for rule in (called, answer, watch)
+        if vars(module).get(rule.__name__) is rule
+    }
+    assert calls == set(places())
+
+
+class Fine:
+    """Writes what is written once, or what no answer depends on."""
+
+    table: Any = None
+    calls = 0
+
+    def __init__(self) -> None:
+        self.known: dict[float, float] = {}
+        self.buffer, self.rng, self.python = np.zeros(0), np.random.default_rng(0), random.Random(0)
+
+    @cached_property
+    def scale(self) -> float:
+        return 2.0
+
+    def __call__(self, obs: Any) -> Any:
+        self.calls += 1
+        self.table = np.arange(3.0) if self.table is None else self.table
+        self.buffer = self.buffer if len(self.buffer) == len(obs) else np.ones(len(obs))
+        values = [self.known.setdefault(x, x * self.scale) for x in obs[:, 0].tolist()]
+        self.last = self.rng.random(len(obs)) + self.python.random() + random.random()
+        return self.last + values + self.table[1] + self.buffer
+
+
+def test_caches_generators_and_unread_attributes_are_no_state() -> None:
+    fine = Fine()
+    for _ in range(4):  # a notice would be an error here
+        called(fine, OBS, "it")
+    assert fine.calls == 4, "the calls to find a state leave no trace"
+
+
+class Shaped:
+    last: Any = None
+
+    def __call__(self, obs: Any) -> Any:
+        self.last = obs[:, 0] if self.last is None else self.last + obs[:, 0]
+        return (self.last > 1).astype(int)
+
+
+def test_a_state_of_the_shape_of_the_first_call_is_named() -> None:
+    with pytest.raises(PolicyError, match=r"for 3 it raised .* last, .*state="):
+        from_function(Shaped()).bind(*SPACES, "it").try_out()
