@@ -40,7 +40,7 @@ def close_matches(name: str, known: Iterable[str]) -> str:
 
 def observed(obs: Array) -> str:
     """Return an observation for a message, in one line, its middle left out where it is long."""
-    return shortened(" ".join(np.array2string(obs, precision=3).split()), 200)
+    return shortened(" ".join(np.array2string(obs, precision=3, threshold=20).split()), 200)
 
 
 def error_text(error: BaseException) -> str:

@@ -147,8 +147,8 @@ def start_of(
 def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the predicates that a mission's text may name.
 
-    They are the skills' successes by their names, the declaration's own, and those given, of which
-    a later one replaces an earlier one of its name.
+    They are the skills' successes by their names, the declaration's own, and those given, which
+    replace others of their names.
     """
     own = {
         name: success

@@ -123,7 +123,12 @@ class Declaration(Nestable):
         self.skills = checked_skills(self.skills, RESERVED)
         self.reflexes = checked_reflexes(self.reflexes)
         check_fields(self)
-        named_predicates(self.predicates, "predicates")
+        names = {skill.name for skill in self.skills}
+        if same := sorted(names & named_predicates(self.predicates, "predicates").keys()):
+            raise DeclarationError(
+                f"predicates: {same[0]!r} is the name of a skill, too, so a mission could mean "
+                "either, the skill's success or the predicate: give the predicate another name"
+            )
         check_level(self._level("", None))
         hierarchies_of(self)  # raises where one contains itself
         for skill in self.skills:

@@ -16,14 +16,13 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import short
+from skillweave.messages import observed, short
 from skillweave.selectors.base import (
     ReadySelector,
     function_name,
     goal_as_json,
     goals_at,
     listed,
-    shown_obs,
     skill_and_goal,
 )
 from skillweave.skills.answers import answer
@@ -257,7 +256,7 @@ class Automaton(ReadySelector):
         state = self.state_names[int(memory["state"][row])]
         raise SkillError(
             f"{self._who}: in state {short(state)} none of its skills ("
-            f"{listed(tuple(self.states[state]))}) may start in observation {shown_obs(obs[row])}: "
+            f"{listed(tuple(self.states[state]))}) may start in observation {observed(obs[row])}: "
             "initiation() is False there. Add a skill to the state, or let one start there"
         )
 

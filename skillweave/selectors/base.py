@@ -12,7 +12,7 @@ from gymnasium.spaces import Dict
 
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError, SkillweaveError
-from skillweave.messages import short, shortened
+from skillweave.messages import observed, short, shortened
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of, repeated
 from skillweave.skills.goals import as_goals
@@ -90,7 +90,7 @@ class ReadySelector(Foreign):
             if len(wrong):
                 raise SkillError(
                     f"{self._who} chose skill {name!r} without a goal in observation "
-                    f"{shown_obs(obs[wrong[0]])}, but it has goals of {short(spaces[name])}: "
+                    f"{observed(obs[wrong[0]])}, but it has goals of {short(spaces[name])}: "
                     f"{self._goal_advice(name)}"
                 )
         return choices
@@ -177,11 +177,6 @@ def goal_as_json(goal: Any) -> Any:
 def listed(names: tuple[str, ...]) -> str:
     """Join names to a part of a sentence."""
     return shortened(", ".join(names), 300)
-
-
-def shown_obs(obs: Array) -> str:
-    """Format an observation for a message."""
-    return shortened(np.array2string(obs, precision=3, threshold=20), 300)
 
 
 def function_name(function: Any) -> str:

@@ -11,12 +11,11 @@ from gymnasium.spaces import Dict, Discrete
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillError
-from skillweave.messages import short
+from skillweave.messages import observed, short
 from skillweave.selectors.base import (
     ReadySelector,
     function_name,
     listed,
-    shown_obs,
     skill_and_goal,
 )
 from skillweave.skills.foreign_policy import qualified
@@ -158,7 +157,7 @@ class FunctionSelector(ReadySelector):
             may = tuple(n for n, yes in zip(self.skills, mask[row], strict=True) if yes)
             raise SkillError(
                 f"{self._who} chose skill {self.skills[int(chosen[row])]!r} in observation "
-                f"{shown_obs(obs[row])}, but its initiation() is False there; choose a skill that "
+                f"{observed(obs[row])}, but its initiation() is False there; choose a skill that "
                 f"may start there: {listed(may)}"
             )
 

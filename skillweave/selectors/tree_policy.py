@@ -15,11 +15,11 @@ import numpy as np
 from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.messages import observed
 from skillweave.selectors.base import (
     ReadySelector,
     goal_as_json,
     goals_at,
-    shown_obs,
     skill_and_goal,
 )
 from skillweave.selectors.tree import Composite, Condition, Node, Status
@@ -100,7 +100,7 @@ class TreeSelector(ReadySelector):
             row = int(np.flatnonzero(status != Status.RUNNING)[0])
             raise SkillError(
                 f"{self._who} ended ({Status(int(status[row])).name}) in observation "
-                f"{shown_obs(obs[row])} without a skill that may start there: add a Fallback whose "
+                f"{observed(obs[row])} without a skill that may start there: add a Fallback whose "
                 "last child is a skill that may start everywhere"
             )
         after = {"leaf": tick.leaf, "succeeded": tick.succeeded, "child": tick.after}

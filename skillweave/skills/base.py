@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -239,8 +240,11 @@ class Skill:
             *self.of_goals,
         ]
         for name, meant in misspelt(self, Skill, known):
+            code = getattr(getattr(self, name), "__code__", None)
+            line = code and f" ({Path(code.co_filename).name}, line {code.co_firstlineno})"
             warnings.warn(
-                f"{where} has {name!r}, which is no attribute of a skill: is {meant!r} meant?",
+                f"{where} has {name!r}, which is no attribute of a skill: is {meant!r} meant?"
+                f"{line or ''}",
                 stacklevel=2,
             )
         for method in (*self.methods, *self.of_goals):

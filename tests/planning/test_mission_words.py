@@ -62,6 +62,7 @@ def test_skills_names_mean_their_success_and_a_hierarchy_has_words() -> None:
     ("words", "says"),
     [
         ({"four": 4}, "predicates: 'four': 4 is no predicate"),
+        ({"to_key": at_four}, "'to_key' is the name of a skill"),
         ({"4": at_four}, "a name is one word that begins with a letter"),
         (at_four, "predicates is "),
     ],
