@@ -1,5 +1,6 @@
 """One torch thread, the same examples of hypothesis in each run, shapes checked."""
 
+import contextlib
 import gc
 import importlib.util
 import os
@@ -70,6 +71,13 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if missing:
         print("\nskipped for want of something that can be installed:", *missing, sep="\n  ")
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def working_directory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A temporary working directory: trainings without a directory write to ``runs/`` there."""
+    with contextlib.chdir(tmp_path_factory.mktemp("work")):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
