@@ -76,7 +76,7 @@ def run(path: Path, folder: Path, *arguments: str) -> subprocess.CompletedProces
     program = ["-c", BRIEFLY, str(path)] if path.name == "key_door.py" else [str(path), *arguments]
     return subprocess.run(
         [sys.executable, *program],
-        capture_output=True, text=True, env=env, cwd=folder, timeout=120, check=False,
+        capture_output=True, text=True, env=env, cwd=folder, timeout=600, check=False,
     )  # fmt: skip
 
 

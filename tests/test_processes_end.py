@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from living import alive, all_end
 
 PROGRAM = """
 import multiprocessing, os, socket, subprocess, sys, time
@@ -61,13 +62,6 @@ if __name__ == "__main__":
 CLOSES = ("rollout", "sleep", "socket", "part", "spawn")
 
 
-def alive(pid: int) -> bool:
-    try:
-        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
 def begun(folder: Path) -> set[int]:
     return {int(file.name.split("-")[1]) for file in folder.glob("pid-*")}
 
@@ -86,14 +80,12 @@ def test_processes_end_soon_after_their_parent_was_killed(what, tmp_path):
     time.sleep(1.5)  # in their first rollout
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    pids, until = begun(tmp_path), time.monotonic() + 10
+    pids = begun(tmp_path)
     assert len(pids) == 2
     pids |= {int(file.name.split("-")[1]) for file in tmp_path.glob("child-*")}
     assert (len(pids) > 2) == (what == "children")
     try:
-        while any(map(alive, pids)) and time.monotonic() < until:
-            time.sleep(0.1)
-        assert not any(map(alive, pids))
+        assert all_end(pids)
     finally:
         for pid in filter(alive, pids):
             os.kill(pid, signal.SIGKILL)

@@ -40,7 +40,7 @@ def run_program(folder: Path, text: str) -> str:
     paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), str(folder)])}
     command = [sys.executable, "program.py"]
     done = subprocess.run(
-        command, cwd=folder, env=os.environ | paths, capture_output=True, text=True, timeout=120
+        command, cwd=folder, env=os.environ | paths, capture_output=True, text=True, timeout=600
     )
     return done.stderr
 

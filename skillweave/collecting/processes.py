@@ -37,6 +37,8 @@ from skillweave.notices import notice
 
 PATIENCE = 1.0
 """Seconds that workers have to end by themselves when they are closed."""
+DYING = 10.0
+"""Seconds that a busy system has to end a process that was killed, or that closed its pipe."""
 SILENCE = 60.0
 """Seconds without an answer until a notice; they double with each notice."""
 
@@ -180,7 +182,7 @@ class ProcessWorker:
 
     def _end(self) -> str:
         """Return words for how its process ended."""
-        self.process.join(PATIENCE)
+        self.process.join(DYING)
         code = self.process.exitcode
         if code is not None:
             end_group(self.process.pid)
@@ -265,8 +267,8 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
         if worker.channel is not None:
             with suppress(OSError):
                 worker.channel.send(("close", None))
-    until = monotonic() + PATIENCE
-    for end in ("join", "terminate", "kill"):
+    for end, seconds in (("join", PATIENCE), ("terminate", PATIENCE / 2), ("kill", DYING)):
+        until = monotonic() + seconds
         for worker in workers:
             process = worker.process
             if process is None or process.pid is None:
@@ -274,7 +276,6 @@ def close_all(workers: Sequence[ProcessWorker]) -> None:
             if end != "join" and process.is_alive():
                 getattr(process, end)()
             process.join(max(0.0, until - monotonic()))
-        until = monotonic() + PATIENCE / 2
     for worker in workers:
         if worker.process is not None and worker.process.exitcode:
             end_group(worker.process.pid)  # it was killed before its environments were closed

@@ -14,6 +14,7 @@ from contextlib import suppress
 import gymnasium as gym
 import numpy as np
 import pytest
+from living import all_end
 from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
 
@@ -200,23 +201,12 @@ def test_workers_end_where_their_parent_is_killed_though_one_of_them_hangs():
         workers = [int(pid) for pid in said.readline().split()]
     try:
         assert parent.wait(20) == -signal.SIGKILL
-        until = time.monotonic() + 20
-        while any(alive(pid) for pid in workers) and time.monotonic() < until:
-            time.sleep(0.1)
         # The system ends a stopped process whose group has lost its parent (SIGHUP, SIGCONT).
-        assert not any(alive(pid) for pid in workers)
+        assert all_end(workers)
     finally:
         for pid in workers:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-
-
-def alive(pid):
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):

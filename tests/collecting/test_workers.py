@@ -5,11 +5,11 @@ import os
 import signal
 import sys
 import time
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from living import alive, all_end
 from toy_acting import Given, requests
 
 from skillweave.collecting.processes import ProcessCollectors
@@ -107,15 +107,6 @@ def collectors():
         each.close()
 
 
-def alive(pid: int) -> bool:
-    """Whether a process still runs; one that only waits to be asked how it ended does not."""
-    try:
-        os.kill(pid, 0)
-        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except (ProcessLookupError, FileNotFoundError):
-        return False
-
-
 def pids(collectors) -> list[int]:
     """The workers' processes."""
     return [worker.process.pid for worker in collectors._workers]
@@ -150,7 +141,7 @@ def test_closing_ends_every_process_whatever_it_does(collectors, env):
     assert rewards[0].tolist() == [p % 2**20 for p in processes for _ in range(2)]
     assert len({*processes, os.getpid()}) == 3
     made.close()
-    assert not any(alive(pid) for pid in processes)
+    assert all_end(processes)
 
 
 def test_a_constructor_that_fails_in_a_process_is_told():
@@ -209,7 +200,7 @@ def test_ctrl_c_ends_a_run_whose_environment_is_stuck(forked):
     assert told.recv() == "stopped"
     process.join(30)
     assert process.exitcode == 0
-    assert not any(alive(pid) for pid in workers)
+    assert all_end(workers)
 
 
 def test_processes_end_where_their_parent_was_killed(forked):
@@ -217,10 +208,7 @@ def test_processes_end_where_their_parent_was_killed(forked):
     workers = told.recv()
     assert all(alive(pid) for pid in workers)
     process.kill()
-    until = time.monotonic() + 30
-    while any(alive(pid) for pid in workers) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not any(alive(pid) for pid in workers)
+    assert all_end(workers)
 
 
 def test_environments_with_other_spaces_are_refused():
