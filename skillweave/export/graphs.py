@@ -25,6 +25,7 @@ from skillweave.errors import MissingExtra, PolicyError
 from skillweave.networks.heads import ActionHead, ChoiceHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
 from skillweave.spaces import ActionCodec, ChoiceCodec, ChoiceSpace, obs_dtype, obs_shape
+from skillweave.spaces.action_codec import action_codec
 from skillweave.spaces.choices import NumberedChoiceCodec
 from skillweave.spaces.packing import parts
 
@@ -103,6 +104,14 @@ def dtype_to_json(dtype: np.dtype[Any]) -> Any:
     }
 
 
+def mask_width(space: gym.Space[Any]) -> int:
+    """Return the number of choices in a mask of actions, 0 where actions have no mask."""
+    if isinstance(space, ChoiceSpace):
+        return space.choices
+    codec = action_codec(space)
+    return codec.size if codec.discrete else 0
+
+
 class _Acting(nn.Module):
     """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
 
@@ -159,9 +168,7 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
     """
     algorithm = policy.algorithm
     leaves = leaves_of(policy.observation_space)
-    choices = algorithm.codec.size if algorithm.codec.discrete else 0
-    if isinstance(policy.action_space, ChoiceSpace):
-        choices = policy.action_space.choices
+    choices = mask_width(policy.action_space)
     noise = _noise_of(algorithm) if sampled else ()
     graph = Graph(b"", choices, algorithm.memory_size, noise)
     given = {leaf.name: leaf.example() for leaf in leaves}

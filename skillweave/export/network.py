@@ -11,9 +11,12 @@ from typing import Annotated, Any, Literal, TypedDict
 import gymnasium as gym
 import numpy as np
 
+from skillweave.errors import PolicyError
+from skillweave.export import graphs
+from skillweave.messages import short
 from skillweave.settings import Check
 from skillweave.skills.mapping import Part, PolicyMapping, Source
-from skillweave.skills.onnx_file import OnnxPolicy
+from skillweave.skills.onnx_file import NUMBERS, OnnxPolicy
 from skillweave.skills.plan import leaves_of
 from skillweave.spaces import ChoiceSpace
 from skillweave.types import Array, Memory
@@ -60,6 +63,7 @@ class ExportedNetwork(OnnxPolicy):
         entry: NetworkEntry,
         observation_space: gym.Space[Any],
         action_space: gym.Space[Any],
+        output: str = "action",
     ) -> None:
         self.entry = entry
         self.extra = tuple(
@@ -69,7 +73,31 @@ class ExportedNetwork(OnnxPolicy):
             sees=leaf_inputs(observation_space),
             state=tuple((name, f"{name}.after") for name in entry["memory"]),
         )
-        super().__init__(content, file, None, observation_space, action_space, mapping)
+        super().__init__(content, file, output, observation_space, action_space, mapping)
+        self._check_inputs()
+
+    def _check_inputs(self) -> None:
+        """Raise a PolicyError where the file has other inputs than its entry and spaces say."""
+        entry, width = self.entry, graphs.mask_width(self.action_space)
+        if entry["choices"] != width:
+            raise PolicyError(
+                f"choices is {entry['choices']}; for {short(self.action_space)} it must be {width}"
+            )
+        leaves = graphs.leaves_of(self.observation_space)
+        given = {leaf.name: f"{leaf.dtype} {leaf.shape}" for leaf in leaves}
+        given |= {"mask": f"bool ({width},)"} if width else {}
+        given |= {name: f"float32 ({n},)" for name, n in entry["memory"].items()}
+        given |= {f"noise.{i}": f"float32 ({n},)" for i, (_, n) in enumerate(entry["noise"])}
+        taken = {
+            name: f"{np.dtype(NUMBERS.get(x.type, bool))} {tuple(x.shape[1:])}"
+            for name, x in self._inputs.items()
+        }
+        for name in given | taken:
+            if given.get(name) != taken.get(name):
+                raise PolicyError(
+                    f"{self.file} takes {taken.get(name, 'nothing')} as {short(name)}, not "
+                    f"{given.get(name, 'nothing')}"
+                )
 
     def fit_mapping(self) -> None:
         """Fit the mapping to the spaces; choices with goals are rows of numbers in the file."""
@@ -109,6 +137,6 @@ class ExportedNetwork(OnnxPolicy):
             given[f"noise.{i}"] = getattr(rng, kind)(size=(n, width)).astype(np.float32)
         return given
 
-    def outputs_of(self, obs: Array) -> Array:
-        """Return the outputs (n, …) of a critic for observations."""
-        return self.call(self.plan.read(obs, None, None), (), None, True, None)[0]
+    def worth(self, obs: Array) -> Array:
+        """Return the values (n, S + 1) of a critic for observations."""
+        return self.act(self.start(len(obs)), obs)[0]

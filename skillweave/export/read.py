@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
@@ -18,7 +19,7 @@ from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError, SkillweaveError
+from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
 from skillweave.export.network import ExportedNetwork, FileName, NetworkEntry, leaf_inputs
 from skillweave.export.parts import PartEntry, part_of, with_base
 from skillweave.export.write import FORMAT, MANIFEST
@@ -131,8 +132,17 @@ class HierarchyEntry(TypedDict):
 
     selector: dict[str, Any]
     guide: dict[str, Any] | None
-    skills: Annotated[list[SkillEntry], Check("a list of at least one skill", lambda x: bool(x))]
-    lengths: list[AtLeastOne]
+    skills: Annotated[
+        list[SkillEntry],
+        Check(
+            "a list of at least one skill, each of another name",
+            lambda skills: len({skill["name"] for skill in skills}) == len(skills) > 0,
+        ),
+    ]
+    lengths: Annotated[
+        list[AtLeastOne],
+        Check("steps that rise", lambda steps: all(a < b for a, b in pairwise(steps))),
+    ]
     reflexes: list[tuple[str, str | None, Any]]
     """The condition, the function of the action, or the action."""
     critic: NetworkEntry | None
@@ -247,17 +257,17 @@ class _Reading:
                 scripted = ScriptedPolicy(self._function(name, path), *self.spaces)
                 acts: Policy = self._bound(scripted, path, goals=goals)
                 return acts
-            case "Network":
+            case "Network" if goals is None:
                 return self._network(entry, path, self.spaces[1])
             case "Model":
                 return self._model(entry, path, goals)
-            case "Part":
+            case "Part" if path.endswith("].policy"):  # of a skill
                 return self._part(entry, path, goals)
             case "Hierarchy":
                 return self._hierarchy(entry, path, goals)
         raise RunError(
             f"{self.file}: {path}.kind is {short(entry.get('kind'))}; it must be one of Code, "
-            "Network, Model, Part, Hierarchy"
+            "Network, Model, Hierarchy, and Part of a skill"
         )
 
     def _fit(self, kind: Any, entry: Any, path: str) -> Any:
@@ -280,11 +290,14 @@ class _Reading:
     ) -> Any:
         """Return a policy for the spaces; errors name its place in the file."""
         space = self.spaces[1] if action_space is None else action_space
-        spaces = self.spaces[0], space, f"{self.file}: {path}"
+        to = self.spaces[0], space, f"{self.file}: {path}"
         try:
-            return policy.bind(*spaces) if goals is None else policy.bind_with_goals(*spaces, goals)
+            bound = policy.bind(*to) if goals is None else policy.bind_with_goals(*to, goals)
+            if isinstance(bound, OnnxPolicy):
+                bound.try_out()
         except SkillweaveError as error:
             raise RunError(str(error)) from error
+        return bound
 
     def _model(self, entry: dict[str, Any], path: str, goals: Goals | None = None) -> MappedPolicy:
         fitted: ModelEntry = self._fit(ModelEntry, entry, path)
@@ -313,11 +326,11 @@ class _Reading:
         except PolicyError as error:
             raise RunError(f"{self.file}: {path}: {error}") from error
         bound: MappedPolicy = self._bound(policy, path, goals=goals)
-        for given, (shape, _) in zip(fitted["state"], bound.states(), strict=True):
-            if int(np.prod(given["shape"])) != int(np.prod(shape)):
+        for given, (name, _, shape) in zip(fitted["state"], policy.single_states(), strict=True):
+            if tuple(given["shape"]) != shape:
                 raise RunError(
                     f"{self.file}: {path}.state has the shape {given['shape']}, but the input "
-                    f"{given['input']!r} of {file} has {shape}"
+                    f"{name!r} of {file} has {shape}"
                 )
         return bound
 
@@ -340,13 +353,13 @@ class _Reading:
         return policy
 
     def _network(
-        self, entry: dict[str, Any], path: str, action_space: gym.Space[Any]
+        self, entry: Any, path: str, action_space: gym.Space[Any], output: str = "action"
     ) -> ExportedNetwork:
         fitted: NetworkEntry = self._fit(NetworkEntry, entry, path)
         file, content = self._content(fitted["file"], path)
         try:
-            policy = ExportedNetwork(content, file, fitted, self.spaces[0], action_space)
-        except PolicyError as error:
+            policy = ExportedNetwork(content, file, fitted, self.spaces[0], action_space, output)
+        except SkillweaveError as error:
             raise RunError(f"{self.file}: {path}: {error}") from error
         bound: ExportedNetwork = self._bound(policy, path, action_space)
         return bound
@@ -363,7 +376,6 @@ class _Reading:
                 f"{file} has another checksum than {self.file} records in files: it is damaged, or "
                 "another version. Get both from one source"
             )
-        _check_data_inside(content, file)
         return file, content
 
     def _hierarchy(
@@ -387,13 +399,17 @@ class _Reading:
         choices = choice_space(int(plain.n), with_goals, names)
         interruption = None
         if fitted["critic"] is not None:
-            count, before = gym.spaces.Discrete(len(skills)), self.spaces
+            before = self.spaces  # its values: of each skill, and of a new decision
+            worth = gym.spaces.Box(-np.inf, np.inf, (len(skills) + 1,))
             if with_goals:
                 self.spaces = with_goal(before[0], goals_space(with_goals)), before[1]
-            critic = self._network(dict(fitted["critic"]), f"{path}.critic", count)
+            critic = self._network(fitted["critic"], f"{path}.critic", worth, "worth")
             self.spaces = before
-            interruption = Interruption(critic.outputs_of, fitted["margin"] or 0.0, critic)
+            interruption = Interruption(critic.worth, fitted["margin"] or 0.0, critic)
         sampled = [_samples(one["policy"]) for one in fitted["skills"]]
+        selector = self._selector(fitted["selector"], f"{path}.selector", names, choices)
+        if fitted["lengths"] and isinstance(selector, ReadySelector):
+            raise RunError(f"{self.file}: {path}.lengths are given, but its selector chooses none")
         kept = tuple(self.parts.get(f"{path}.skills[{i}].policy") for i in range(len(skills)))
         skill_set = SkillSet(
             tuple(skills),
@@ -407,9 +423,12 @@ class _Reading:
         )
         guide = None
         if fitted["guide"] is not None:
-            ready: Any = self._selector(fitted["guide"], f"{path}.guide", names, plain)
+            ready = self._selector(fitted["guide"], f"{path}.guide", names, plain)
+            if not isinstance(ready, ReadySelector):
+                raise RunError(
+                    f"{self.file}: {path}.guide is a Network; it must be a Function or an Automaton"
+                )
             guide = ActiveGuide(ready)
-        selector = self._selector(fitted["selector"], f"{path}.selector", names, choices)
         self.spaces = whole
         return HierarchyPolicy(selector, skill_set, guide, own)
 
@@ -508,17 +527,3 @@ def _samples(entry: dict[str, Any]) -> bool:
     skills = entry["skills"] if entry.get("kind") == "Hierarchy" else ()
     below = any(_samples(skill["policy"]) for skill in skills)
     return bool(entry.get("noise")) or entry.get("sampled") is True or below
-
-
-def _check_data_inside(content: bytes, file: Path) -> None:
-    """Raise a RunError where an ONNX file is damaged, or has weights in other files."""
-    try:
-        import onnx
-    except ImportError as error:
-        raise MissingExtra("an ONNX file", "onnx") from error
-    try:
-        model = onnx.load_from_string(content)
-    except Exception as error:  # protobuf's own errors have no common class
-        raise RunError(f"{file} is no ONNX model: {str(error)[:300]}") from error
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in model.graph.initializer):
-        raise RunError(f"{file} has weights in other files, which no checksum covers")

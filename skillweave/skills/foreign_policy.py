@@ -108,9 +108,12 @@ class Foreign(Memoryless):
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
-            raise PolicyError(
-                f"{self._who} fails on {self.given}: {error_text(error)}{self._advice_on(error)}"
-            ) from error
+            raise self.failure(error) from error
+
+    def failure(self, error: BaseException) -> PolicyError:
+        """Return the error of a call that failed; it names the policy and its inputs."""
+        text = f"{error_text(error)}{self._advice_on(error)}"
+        return PolicyError(f"{self._who} fails on {self.given}: {text}")
 
     @property
     def given(self) -> str:

@@ -427,8 +427,11 @@ def is_places(value: Any) -> bool:
 
 def checked_count(value: Any, name: str) -> int:
     """Return a whole number of at least 1; a DeclarationError names it where it is none."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise DeclarationError(f"{name} is {short(value)}; it must be a whole number, at least 1")
+    whole = isinstance(value, int | np.integer) and value is not True
+    if not whole or not 1 <= value <= 10**5:  # all actions of a chunk are stored
+        raise DeclarationError(
+            f"{name} is {short(value)}; it must be a whole number, at least 1 and at most 100,000"
+        )
     return int(value)
 
 

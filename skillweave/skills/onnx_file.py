@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -214,7 +214,7 @@ class OnnxPolicy(MappedPolicy):
             x: Any = inputs.get("", inputs.get(free[0])) if isinstance(inputs, dict) else inputs
             if self._axes is not None or len(x) == 1:
                 rows = {free[0]: np.ascontiguousarray(x, self._dtype)}
-                return self._session.run([self.output], rows)[0], ()
+                return self._outputs([self.output], rows)[0], ()
         given = (
             inputs
             if isinstance(inputs, dict) and "" not in inputs
@@ -254,8 +254,15 @@ class OnnxPolicy(MappedPolicy):
         for (name, after), value in zip(self.mapping.state, state, strict=True):
             rows = rows | {name: np.ascontiguousarray(value)}
             outputs.append(after)
-        output, *states = self._session.run(outputs, rows)
+        output, *states = self._outputs(outputs, rows)
         return np.asarray(output), states
+
+    def _outputs(self, names: Sequence[str], rows: dict[str, Array]) -> Any:
+        """Return the outputs of the model; a PolicyError names the policy where it fails."""
+        try:
+            return self._session.run(names, rows)
+        except Exception as error:  # onnxruntime's own errors have no common class
+            raise self.failure(error) from error
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""
@@ -387,11 +394,32 @@ def _numbers(tensor: Any, path: str | Path) -> Array:
     return array if np.issubdtype(array.dtype, np.floating) else np.zeros(0)
 
 
+def _tensors(message: Any) -> Iterator[Any]:
+    """Yield every tensor in an ONNX message: of all graphs, functions and attributes."""
+    if hasattr(message, "data_location"):
+        yield message
+        return
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                yield from _tensors(part)
+
+
 def _session(data: bytes, file: Path) -> Any:
+    """Return a session of a model; a PolicyError where it would read other files, or is damaged."""
     try:
+        import onnx
         import onnxruntime
     except ImportError as error:
         raise MissingExtra("an ONNX file", "onnx") from error
+    try:
+        model = onnx.load_from_string(data)
+    except Exception as error:  # protobuf's own errors have no common class
+        raise PolicyError(f"{file} is no ONNX model: {str(error)[:300]}") from error
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(model)):
+        raise PolicyError(
+            f"{file} has weights in other files, which no checksum covers: save it as one file"
+        )
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # small nets; and exact
     options.log_severity_level = 3

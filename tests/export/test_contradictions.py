@@ -1,0 +1,110 @@
+"""Folders whose files contradict one another are refused when they are read, not when they act."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skills.foreign_models import onnx_file
+from test_state_machine import Free, Remembers, critic_of, skill_set, traced_once, trained
+
+import skillweave as sw
+from skillweave.errors import PolicyError, RunError
+from skillweave.export.write import write_export
+from skillweave.hierarchy.policy import with_interruption
+from skillweave.skills.onnx_file import OnnxPolicy
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+_ = traced_once  # of all tests here, too
+
+
+def export(path: Path, **critic: Any) -> Path:
+    skills = skill_set(Free, Remembers, call_steps=sw.Lengths(1, 3))
+    write_export(path, trained(with_interruption(skills, critic_of(2, **critic), 0.1)), "walk")
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = export(tmp_path_factory.mktemp("export"), deciding=True)
+    assert sw.load_policy(path)
+    return path
+
+
+FREE = {"kind": "Network", "file": "free.onnx", "choices": 3, "memory": {}, "noise": []}
+WRONG: list[tuple[str, Any]] = [
+    ("policy.kind", "Part"),
+    ("policy.skills[0].policy.choices", 9),
+    ("policy.skills[0].policy.choices", 0),
+    ("policy.skills[0].policy.noise", [["gumbel", 10**8]]),
+    ("policy.skills[0].policy.file", "critic.onnx"),
+    ("policy.skills[1].policy.memory", {"memory": 10**8}),
+    ("policy.skills[1].policy.memory", {"state": 4}),
+    ("policy.skills[1].policy.memory", {}),
+    ("policy.skills[1].name", "free"),
+    ("policy.critic", FREE),
+    ("policy.guide", FREE | {"file": "selector.onnx", "choices": 2}),
+    ("policy.selector.kind", "Hierarchy"),
+    ("policy.selector", {"kind": "Automaton", "start": 0, "skills": [[0]], "transitions": []}),
+    ("policy.lengths", [3, 3]),
+    ("policy.lengths", [3, 1]),
+    ("policy.lengths", list(range(1, 200_000))),
+    ("observation_space.dtype", "float64"),
+    ("action_space.n", 4),
+]
+
+
+@pytest.mark.parametrize(("path", "value"), WRONG, ids=[f"{p}={v}"[:60] for p, v in WRONG])
+def test_a_manifest_that_contradicts_its_files_is_refused(
+    path: str, value: Any, exported: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(exported, tmp_path / "copy")
+    file = tmp_path / "copy/policy.json"
+    part = manifest = json.loads(file.read_text())
+    *above, last = [int(key) if key.isdigit() else key for key in re.findall(r"\w+", path)]
+    for key in above:
+        part = part[key]
+    part[last] = value
+    file.write_text(json.dumps(manifest))
+    place = re.match(r"policy(\.skills)?", path)
+    with pytest.raises(RunError, match=rf"policy\.json: {place[0] if place else 'policy'}"):
+        sw.load_policy(file)
+
+
+def test_a_critic_without_the_value_of_a_new_decision_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"policy\.critic: .*\(2, 2\).*\(2, 3\)"):
+        sw.load_policy(export(tmp_path))
+
+
+def places(kind: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield the fields that lead to each tensor of an ONNX message, by the format's schema."""
+    for field in kind.fields:
+        inner = field.message_type
+        if inner is not None and inner.name == "TensorProto":
+            yield (field.name,)
+        elif inner is not None and inner not in above:
+            yield from ((field.name, *rest) for rest in places(inner, (*above, inner)))
+
+
+@pytest.mark.parametrize("place", places(onnx.ModelProto.DESCRIPTOR), ids=".".join)
+def test_a_model_that_would_read_another_file_is_refused(place: tuple[str, ...]) -> None:
+    model = part = onnx.ModelProto()
+    for name in place:
+        part = getattr(part, name)
+        part = part.add() if hasattr(part, "add") else part
+    part.data_location = onnx.TensorProto.EXTERNAL
+    with pytest.raises(PolicyError, match="other files"):
+        OnnxPolicy(model.SerializeToString(), Path("model.onnx"))
+
+
+def test_an_error_of_a_running_model_names_the_policy(tmp_path: Path) -> None:
+    policy = sw.from_onnx(onnx_file(tmp_path / "lean.onnx"))
+    with pytest.raises(PolicyError, match=r"lean\.onnx fails"):
+        policy.bind(*sw.EnvSpec("CartPole-v1").spaces, "it").act({}, np.zeros((1, 9), np.float32))
