@@ -95,8 +95,8 @@ class ExportedNetwork(OnnxPolicy):
         for name in given | taken:
             if given.get(name) != taken.get(name):
                 raise PolicyError(
-                    f"{self.file} takes {taken.get(name, 'nothing')} as {short(name)}, not "
-                    f"{given.get(name, 'nothing')}"
+                    f"{self.file} takes {taken.get(name, 'nothing')} as {short(name)}, but "
+                    f"is given {given.get(name, 'nothing')}"
                 )
 
     def fit_mapping(self) -> None:

@@ -345,7 +345,7 @@ class _Reading:
                 self.spaces = part.observation_space, part.action_space
                 base = self._policy(fitted["base"], f"{path}.base", goals, joined["base"])
                 part = with_base(part, base, fitted.get("residual"))
-        except DeclarationError as error:
+        except SkillweaveError as error:
             raise RunError(str(error)) from error
         self.spaces = part.observation_space, part.action_space
         policy = self._policy(fitted["policy"], f"{path}.policy", goals, joined["policy"])

@@ -303,8 +303,9 @@ class PolicyMapping:
         code = code or {}
         sees = data.get("sees")
         goal = data.get("goal")
-        if sees is not None and not isinstance(sees, Mapping):
-            raise DeclarationError(f"sees is {short(sees)}; it must be an object with each input")
+        for name in ("sees", "scaling"):
+            if not isinstance(value := data.get(name), Mapping | None):
+                raise DeclarationError(f"{name} is {short(value)}; it must be an object of inputs")
         if isinstance(goal, Mapping):
             goal = _function(goal.get("function"), code, "goal")
         acts = data.get("acts")
@@ -649,7 +650,7 @@ def _to_json(settings: Any) -> dict[str, Any]:
 
 def _source_from_json(data: Any, code: Mapping[str, Any], where: str) -> Source:
     kind = data.get("source") if isinstance(data, Mapping) else None
-    if kind not in KINDS:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise DeclarationError(
             f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
         )

@@ -50,7 +50,7 @@ WRONG: list[tuple[str, Any]] = [
     ("policy.skills[1].policy.memory", {}),
     ("policy.skills[1].name", "free"),
     ("policy.critic", FREE),
-    ("policy.guide", FREE | {"file": "selector.onnx", "choices": 2}),
+    ("policy.guide", FREE | {"file": "selector.onnx", "choices": 4}),
     ("policy.selector.kind", "Hierarchy"),
     ("policy.selector", {"kind": "Automaton", "start": 0, "skills": [[0]], "transitions": []}),
     ("policy.lengths", [3, 3]),

@@ -246,6 +246,8 @@ def changed(folder: Path, change: Callable[[Any], Any]) -> None:
         (lambda x: x["policy"].update(every=0), "policy.every is 0; it must be a whole number"),
         (lambda x: x["policy"].update(chunk=4), r"chunk=4 needs \(n, 4, ...\)"),
         (lambda x: x["policy"].update(chunk=10**8), "policy.chunk is 100000000; .* at most"),
+        (lambda x: x["policy"].update(scaling=1.5), "policy.scaling is 1.5"),
+        (lambda x: x["policy"]["sees"]["obs"][0].update(source=[]), "sees.*field source must be"),
         (lambda x: x["policy"]["acts"].update(scale="x"), "policy.acts: Acts.scale is 'x'"),
         (lambda x: x["policy"]["acts"].update(to=[0, 9]), "acts.to is .* does not exist"),
         (lambda x: x["policy"].update(goal=[2.0]), "policy.goal is .2.0.*out of the range"),
