@@ -68,7 +68,7 @@ ROOMS: dict[str, set[str]] = {
     "collecting": BASE | {"spaces", "skills", "envs", "algorithms"},
     "selectors": BASE | {"spaces", "skills", "collecting"},
     "runs": BASE | {"algorithms", "skills"},
-    "planning": BASE | {"spaces", "skills", "envs", "collecting", "selectors", "runs"},
+    "planning": BASE | {"ops", "spaces", "skills", "envs", "collecting", "selectors", "runs"},
     "training": LEARNING,
     "hierarchy": LEARNING | {"training"},
     "evolution": LEARNING | {"training"},

@@ -18,7 +18,7 @@ from skillweave.experience import Report
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
-from skillweave.ops.moments import merge_moments
+from skillweave.ops.moments import merge_moments, scale_of
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import (
@@ -60,7 +60,7 @@ class AgentState:
     @property
     def return_scale(self) -> Tensor:
         """Return the deviation of returns, (P, 1)."""
-        return (self.return_var + 1e-8).sqrt()
+        return scale_of(self.return_mean, self.return_var)
 
 
 def state_to(state: S, device: Device) -> S:
@@ -258,10 +258,10 @@ class Algorithm:
             "count": torch.zeros(members, **INT),
             "obs_mean": torch.zeros(members, self.obs.size, **FLOAT),
             "obs_var": torch.ones(members, self.obs.size, **FLOAT),
-            "obs_count": torch.full((members,), 1e-4, **FLOAT),
+            "obs_count": torch.zeros(members, **FLOAT),
             "return_mean": torch.zeros(members, 1, **FLOAT),
             "return_var": torch.ones(members, 1, **FLOAT),
-            "return_count": torch.full((members,), 1e-4, **FLOAT),
+            "return_count": torch.zeros(members, **FLOAT),
             **{
                 k: torch.full((members,), member_setting(self.config, k), **FLOAT)
                 for k in self.member_hyperparameters
@@ -389,4 +389,4 @@ REQUIRED = ("fresh_state", "parameter_groups", "act", "value", "update")
 
 def _scaling(mean: Tensor, var: Tensor) -> tuple[Tensor, Tensor]:
     """Compute shift and scale (P, 1, O) from moments (P, O); both are copies."""
-    return mean[:, None].clone(), (var + 1e-8).rsqrt()[:, None]
+    return mean[:, None].clone(), scale_of(mean, var).reciprocal()[:, None]

@@ -23,6 +23,7 @@ from skillweave.networks.stacked import Inputs, Layout, Views
 from skillweave.ops.device import FLOAT, Constant
 from skillweave.ops.distributions import mask_logits
 from skillweave.ops.losses import categorical_projection, td_loss, weighted_mean
+from skillweave.ops.moments import scale_of
 from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
 
@@ -79,7 +80,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             return super().reward_scale(state)
         # The root of the mean square: the deviation of equal returns would be 0.
         square = state.return_var + state.return_mean.square()
-        return (square + 1e-8).rsqrt()
+        return scale_of(torch.zeros_like(square), square).reciprocal()
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Create the state of fresh members, one for each seed."""

@@ -106,8 +106,8 @@ class OffPolicyAlgorithm(Algorithm):
         """Return the factor of rewards before critics learn from them, (P, 1); None: 1."""
         if not self.config.normalize_rewards:
             return None
-        scale: Tensor = (state.return_var + 1e-8).rsqrt()
-        return scale
+        scale: Tensor = state.return_scale
+        return scale.reciprocal()
 
     def rewards(self, state: Any, sample: Sample) -> Tensor:
         """Return rewards (P, B) in the units that critics learn in."""

@@ -113,7 +113,7 @@ class NumpyPPOActor(NumpyActor):
 
     def __init__(self, algorithm: Any, state: Any) -> None:
         super().__init__(algorithm, state)
-        self._scale = np.float32((state.return_var[0, 0] + 1e-8).sqrt())
+        self._scale = np.float32(state.return_scale[0, 0])
         self._mean = np.float32(state.return_mean[0, 0])
         self._log_std = self._views.get("actor.log_std")
         self._choices = algorithm.head.discrete and not algorithm.codec.multi

@@ -732,7 +732,8 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
             raw = raw if code else raw.astype("f4")[:, part["places"]]
             raw = np.asarray(raw, "f8").ravel()
             varies = part["varies"]
-            each.append(np.asarray((raw[varies] - part["mean"][varies]) * part["scale"], "f4"))
+            standard = (raw - part["mean"]) * part["scale"]
+            each.append(np.asarray(standard[varies].clip(-100, 100), "f4"))  # neighbours.FAR
         return each
 
     def near(self, features: list[Any]) -> Any:

@@ -8,6 +8,26 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+CONSTANT = 1e-6
+"""A number whose deviation is less, relative to its size if that is above 1, is constant."""
+
+
+def is_constant(mean: Tensor, var: Tensor) -> Tensor:
+    """Return whether numbers with these means and variances were constant but for rounding."""
+    return var.sqrt() <= CONSTANT * mean.abs().clamp_min(1.0)
+
+
+def scale_of(mean: Tensor, var: Tensor, eps: float = 1e-8) -> Tensor:
+    """Return what numbers are divided by: their deviation, or 1 where they were constant.
+
+    A deviation of nearly 0 would make the first change of a number a huge one.
+
+    Args:
+        mean, var: of each number, of one shape.
+        eps: added to the variance.
+    """
+    return torch.where(is_constant(mean, var), 1.0, (var + eps).sqrt())
+
 
 def masked_mean(x: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return the mean of the valid samples of each member.
@@ -50,7 +70,7 @@ def normalise(
         (P, ...).
     """
     variance, mean = (m.view(-1, *[1] * (x.ndim - 1)) for m in masked_var_mean(x, valid))
-    return (x - mean) / (variance.sqrt().clamp_min(min_std) + eps)
+    return (x - mean) / (scale_of(mean, variance, 0.0).clamp_min(min_std) + eps)
 
 
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -59,8 +79,8 @@ def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = Non
     0 where the target is constant.
     """
     residual, _ = masked_var_mean(target - value, valid)
-    whole, _ = masked_var_mean(target, valid)
-    return torch.where(whole > 1e-12, 1.0 - residual / whole.clamp_min(1e-12), 0.0)
+    whole, mean = masked_var_mean(target, valid)
+    return torch.where(is_constant(mean, whole), 0.0, 1.0 - residual / whole)
 
 
 def merge_moments(
@@ -85,7 +105,7 @@ def merge_moments(
         batch_mean = torch.where(counts, batch, 0.0).sum(1) / rows
         away = (batch - batch_mean[:, None]).square()
         batch_var = torch.where(counts, away, 0.0).sum(1) / rows
-    total = count + n
+    total = (count + n).clamp_min(1.0)
     old, new = (count / total)[:, None], (n / total)[:, None]
     delta = batch_mean - mean
     return mean + delta * new, var * old + batch_var * new + delta.square() * old * new, total

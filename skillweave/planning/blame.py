@@ -13,7 +13,7 @@ from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import compared_places
 from skillweave.planning.hand_over import START, before_each, calls_done, wilson
-from skillweave.planning.neighbours import feature_maps, nearest
+from skillweave.planning.neighbours import Standard, feature_maps, nearest
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
@@ -187,7 +187,6 @@ def _largest_difference(
     if not vector.shape[1]:
         return None, (float("nan"), float("nan"))
     one, other = vector[best].mean(0), vector[~best].mean(0)
-    spread = np.sqrt((vector[best].var(0) + vector[~best].var(0)) / 2)
-    size = np.abs(one - other) / (spread + 1e-6)
-    place = int(size.argmax())
+    standard = Standard(vector)
+    place = int(np.abs(standard(one) - standard(other)).argmax())
     return place, (float(one[place]), float(other[place]))

@@ -10,7 +10,7 @@ import numpy as np
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import CONSTANT, nearest
+from skillweave.planning.neighbours import Standard, nearest
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
@@ -50,7 +50,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
         codec.split(to_tensor(x))[0].reshape(len(x), -1).numpy() for x in (log.before, log.next_obs)
     )
     changes = (before != after).mean(0)
-    varies = before.std(0) > CONSTANT * np.maximum(1.0, np.abs(before.mean(0)))
+    varies = Standard(before).varies
     fixed = np.flatnonzero((changes == 0) & varies).tolist()
     moves = np.flatnonzero(changes > MOST_STEPS).tolist()
     if fixed and task is not None:
@@ -116,24 +116,16 @@ def _pays_by(
 
 def _predict(few: Array, many: Array, values: Array) -> bool:
     """Return whether points ``many`` (n, F) predict values (n, D) better than ``few``."""
-    wanted = _standard(values.astype(np.float64))
+    wanted = Standard(values)(values)
 
     def error(seen: Array) -> float:
-        points = _standard(seen.astype(np.float64)).astype(np.float32)
+        points = Standard(seen)(seen).astype(np.float32)
         near, _ = nearest(points, points, NEIGHBOURS + 1, np.arange(len(points)))
         others = near != np.arange(len(points))[:, None]
         mean = (wanted[near] * others[..., None]).sum(1) / others.sum(1)[:, None]
         return float(np.square(mean - wanted).mean())
 
     return error(many) < BETTER * error(few)
-
-
-def _standard(values: Array) -> Array:
-    """Return values (n, F) with deviation 1; constant ones are 0."""
-    mean, deviation = values.mean(0), values.std(0)
-    varies = deviation > CONSTANT * np.maximum(1.0, np.abs(mean))
-    scaled: Array = np.where(varies, (values - mean) / np.where(varies, deviation, 1.0), 0.0)
-    return scaled
 
 
 def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:

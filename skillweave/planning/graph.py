@@ -27,8 +27,8 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import Readings, RewardMachine
 from skillweave.planning.neighbours import (
     BLOCK,
-    CONSTANT,
     SOFT,
+    Standard,
     feature_maps,
     nearest,
     tie_order,
@@ -602,10 +602,7 @@ def _standard_goals(log: CallLog, skill: str) -> Array | None:
         return None
     if not mine.any():
         return np.zeros(goals.shape, np.float32)
-    mean, deviation = goals[mine].mean(0), goals[mine].std(0)
-    varies = deviation > CONSTANT * np.maximum(1.0, np.abs(mean))
-    scaled = np.where(varies, (goals - mean) / np.where(varies, deviation, 1.0), 0.0)
-    return np.where(mine[:, None], scaled, 0.0).astype(np.float32)
+    return np.where(mine[:, None], Standard(goals[mine])(goals), 0.0).astype(np.float32)
 
 
 def _pieces(log: CallLog, skills: SkillSet | None) -> Pieces:

@@ -10,6 +10,7 @@ from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.messages import observed
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.machine import Counter, Readings, RewardMachine
+from skillweave.planning.neighbours import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.types import Array
 
@@ -92,10 +93,11 @@ def _nearest(predicate: Predicate, log: CallColumns) -> str:
     wanted = _example(predicate, obs)
     if wanted is None:
         return ""
-    scale = np.maximum(obs.std(0), 1e-9)
+    standard = Standard(obs)
+    wanted = standard(wanted)
     step, least = 0, np.inf
     for first in range(0, len(obs), 4_096):  # so that no large array is made
-        part = (obs[first : first + 4_096, None] - wanted[None]) / scale
+        part = standard(obs[first : first + 4_096, None]) - wanted
         far = np.square(part).mean(2).min(1)
         if far.min() < least:
             least, step = float(far.min()), first + int(far.argmin())

@@ -12,6 +12,7 @@ import torch
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, error_text, short
+from skillweave.ops.moments import is_constant, scale_of
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
@@ -22,8 +23,12 @@ SOFT = 0.01
 AHEAD = 8
 """Points that are looked at for each one that is wanted: several may be of one group, or equally
 near."""
-CONSTANT = 1e-6
-"""A feature whose deviation is less, relative to its size, is constant."""
+MOST_DISTINCT = 0.9
+"""The share of a number's distinct values that are looked for in the shortest interval."""
+OUTSIDE = 3.0
+"""Lengths of that interval, beside it, beyond which values do not count to the deviation."""
+FAR = 100.0
+"""Deviations beyond which all values are equally far."""
 
 Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
@@ -46,6 +51,38 @@ def check_number(name: str, value: Any, low: float, high: float) -> None:
     real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
     if not real or not low <= value <= high:
         raise DeclarationError(f"{name} is {short(value)}; it must be from {low:g} to {high:g}")
+
+
+class Standard:
+    """Values standardised by the mean and deviation of most of the known ones; constants are 0.
+
+    A few values far away do not rule the scale, such as -999 for "not measured".
+
+    Args:
+        known: (n, F).
+    """
+
+    def __init__(self, known: Array) -> None:
+        known = np.asarray(known, np.float64)
+        counts = np.ones(known.shape, bool)
+        for number, typical in zip(known.T, counts.T, strict=True):
+            distinct = np.unique(number)
+            most = max(2, int(MOST_DISTINCT * len(distinct)))
+            lengths = distinct[most - 1 :] - distinct[: 1 - most]
+            if len(lengths):
+                at = lengths.argmin()
+                away = OUTSIDE * lengths[at]
+                typical &= number >= distinct[at] - away
+                typical &= number <= distinct[at + most - 1] + away
+        self.mean, var = known.mean(0, where=counts), known.var(0, where=counts)
+        moments = torch.from_numpy(self.mean), torch.from_numpy(var)
+        self.varies = ~is_constant(*moments).numpy()
+        self.scale: Array = self.varies / scale_of(*moments, eps=0.0).numpy()
+
+    def __call__(self, values: Array) -> Array:
+        """Return standardised values (..., F), float64."""
+        standard: Array = (values - self.mean) * self.scale
+        return standard.clip(-FAR, FAR)
 
 
 class FeatureMap:
@@ -76,15 +113,13 @@ class FeatureMap:
             raise DeclarationError(
                 f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
             )
-        self.mean, deviation = raw.mean(0), raw.std(0)
-        varies = deviation > CONSTANT * np.maximum(1.0, np.abs(self.mean))
-        if not varies.any():
+        self._standard = Standard(raw)
+        if not self._standard.varies.any():
             raise DeclarationError(
                 f"all features of {who} are constant in the log, so no call is nearer than "
                 "another; give features= that change, or record calls from other states"
             )
-        self._varies = np.flatnonzero(varies)
-        self.scale = 1.0 / deviation[varies]
+        self._varies = np.flatnonzero(self._standard.varies)
         self.size = len(self._varies)
         """F, the number of features."""
 
@@ -95,8 +130,7 @@ class FeatureMap:
             raise DeclarationError(
                 f"a feature of {self._who} is not finite in an observation; clip it"
             )
-        standard = (raw[:, self._varies] - self.mean[self._varies]) * self.scale
-        return np.asarray(standard, np.float32)
+        return np.asarray(self._standard(raw)[:, self._varies], np.float32)
 
     @property
     def places(self) -> list[int] | None:
@@ -106,7 +140,8 @@ class FeatureMap:
     @property
     def arrays(self) -> dict[str, Array]:
         """The numbers by which raw features are standardised, and those that are left out."""
-        return {"mean": self.mean, "scale": self.scale, "varies": self._varies}
+        standard = self._standard
+        return {"mean": standard.mean, "scale": standard.scale, "varies": self._varies}
 
     def raw(self, obs: Array) -> Array:
         """Return the features of observations (n, …) as they are, (n, F) float64."""

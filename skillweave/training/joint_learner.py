@@ -16,6 +16,7 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Batch
 from skillweave.ops.device import FLOAT
+from skillweave.ops.moments import normalise
 from skillweave.paths import CRITIC, SELECTOR, decides, join, name_of, relative
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.types import Array, prefixed, unprefixed
@@ -98,11 +99,9 @@ class JointLearner:
         store.add(rows)
         rollout = store.rollout(stack.state.gamma)
         assert rollout is not None
-        advantage: Array = stack.algorithm.advantage(stack.state, rollout)[0].cpu().numpy()
+        advantage = stack.algorithm.advantage(stack.state, rollout)
         min_std = stack.algorithm.config.min_advantage_std / stack.state.return_scale.item()
-        scaled: Array = (advantage - advantage.mean()) / (
-            max(advantage.std(), min_std) + np.float32(1e-3)
-        )
+        scaled: Array = normalise(advantage, eps=1e-3, min_std=min_std)[0].cpu().numpy()
         return scaled
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:
