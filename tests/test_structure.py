@@ -59,7 +59,7 @@ ROOMS: dict[str, set[str]] = {
     "experience": {"types", "paths"},
     "ops": BASE,
     "spaces": BASE,
-    "skills": BASE | {"spaces"},
+    "skills": BASE | {"ops", "spaces"},
     "networks": BASE | {"ops", "spaces"},
     "toys": set(),
     "envs": BASE | {"spaces", "skills", "toys"},

@@ -18,7 +18,7 @@ from skillweave.experience import Report
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.networks.stacked import Inputs, Layout
 from skillweave.ops.device import FLOAT, INT
-from skillweave.ops.moments import merge_moments, scale_of
+from skillweave.ops.moments import CLIP, merge_moments, scale_of
 from skillweave.ops.threads import torch_threads
 from skillweave.seeding import Seeds
 from skillweave.spaces import (
@@ -35,6 +35,8 @@ from skillweave.types import Array, prefixed
 
 S = TypeVar("S")
 Device = torch.device | str
+OBS_STATS = ("obs_mean", "obs_var", "obs_low", "obs_high")
+"""The fields of a state that its policy's weights also hold, where observations are normalised."""
 
 
 @dataclass
@@ -50,6 +52,8 @@ class AgentState:
     count: Tensor  # (P,) int64, Adam's steps; (P, D) where parameters differ in age
     obs_mean: Tensor  # (P, O)
     obs_var: Tensor  # (P, O)
+    obs_low: Tensor  # (P, O), the lowest number seen
+    obs_high: Tensor  # (P, O)
     obs_count: Tensor  # (P,)
     return_mean: Tensor  # (P, 1)
     return_var: Tensor  # (P, 1)
@@ -251,6 +255,7 @@ class Algorithm:
     def fresh_fields(self, params: Tensor) -> dict[str, Tensor]:
         """Return the fields that every state has, for fresh ``params`` (P, D)."""
         members = len(params)
+        largest = torch.finfo(torch.float32).max
         return {
             "params": params,
             "mu": torch.zeros_like(params),
@@ -258,6 +263,8 @@ class Algorithm:
             "count": torch.zeros(members, **INT),
             "obs_mean": torch.zeros(members, self.obs.size, **FLOAT),
             "obs_var": torch.ones(members, self.obs.size, **FLOAT),
+            "obs_low": torch.full((members, self.obs.size), largest, **FLOAT),
+            "obs_high": torch.full((members, self.obs.size), -largest, **FLOAT),
             "obs_count": torch.zeros(members, **FLOAT),
             "return_mean": torch.zeros(members, 1, **FLOAT),
             "return_var": torch.ones(members, 1, **FLOAT),
@@ -299,14 +306,14 @@ class Algorithm:
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of one member's ``weights``."""
-        scaling = {"obs_mean": (self.obs.size,), "obs_var": (self.obs.size,)}
+        scaling = dict.fromkeys(OBS_STATS, (self.obs.size,))
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:
         """Copy the policy of a ``member`` of a ``state``: parameters (*shape), scaling (O,)."""
         named = {k: v[member] for k, v in self.layout.views(state.params).items()}
         if self.normalize_obs:
-            named |= {k: getattr(state, k)[member] for k in ("obs_mean", "obs_var")}
+            named |= {k: getattr(state, k)[member] for k in OBS_STATS}
         return {k: v.detach().to("cpu", copy=True) for k, v in named.items()}
 
     def set_weights(self, state: Any, weights: Mapping[str, Tensor]) -> None:
@@ -315,7 +322,7 @@ class Algorithm:
             for k, view in self.layout.views(getattr(state, name)).items():
                 view[0].copy_(weights[k])
         if self.normalize_obs:
-            for k in ("obs_mean", "obs_var"):
+            for k in OBS_STATS:
                 getattr(state, k)[0].copy_(weights[k])
 
     def acting_params_of(self, weights: Mapping[str, Tensor]) -> ActingParams:
@@ -334,7 +341,7 @@ class Algorithm:
         inputs = {f"image.{i}": image for i, image in enumerate(images)}
         if self.obs.size:
             if params.shift is not None and params.scale is not None:
-                vector = ((vector - params.shift) * params.scale).clamp(-10.0, 10.0)
+                vector = ((vector - params.shift) * params.scale).clamp(-CLIP, CLIP)
             inputs["vector"] = vector
         return inputs
 
@@ -357,6 +364,10 @@ class Algorithm:
             moments = state.obs_mean, state.obs_var, state.obs_count
             vector, _ = self.obs.split(obs)
             state.obs_mean, state.obs_var, state.obs_count = merge_moments(*moments, vector, valid)
+            if valid is not None:
+                vector = torch.where(valid[..., None], vector, state.obs_mean[:, None])
+            state.obs_low = state.obs_low.minimum(vector.amin(1))
+            state.obs_high = state.obs_high.maximum(vector.amax(1))
 
     def update_return_stats(self, state: Any, returns: Tensor, valid: Tensor | None = None) -> None:
         """Update the moments in ``state`` with ``returns`` (P, B) where ``valid`` (P, B)."""

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from skillweave.algorithms.base import Algorithm
+from skillweave.algorithms.base import OBS_STATS, Algorithm
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.parameters import ParameterGroup
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
+from skillweave.ops.seen import Seen
 from skillweave.reading import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless
@@ -27,6 +28,9 @@ S = TypeVar("S")
 
 class AgentPolicy(Memoryless):
     """A trained agent that acts; a copy, independent of further learning."""
+
+    seen: Seen | None = None
+    """The range of observations that it learnt from, if it is from a file."""
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm = algorithm
@@ -73,6 +77,8 @@ class AgentPolicy(Memoryless):
         mask = self.algorithm.widened(mask)
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
+        if self.seen is not None:
+            self.seen.look(self.algorithm.obs.split(rows)[0])
         before = torch.from_numpy(memory["rnn"])[None] if memory else None
         action, _, after = self.algorithm.act(self.params, rows, allowed, noise, before)
         memory = {} if after is None else {"rnn": after[0].numpy()}
@@ -133,7 +139,10 @@ class AgentPolicy(Memoryless):
                     f"{where}: tensor {name} holds NaN or infinity: the training had diverged, "
                     "or the file was altered"
                 )
-        return cls(algorithm, weights)
+        policy = cls(algorithm, weights)
+        if algorithm.normalize_obs:
+            policy.seen = Seen(where, algorithm.obs.name, *(weights[k] for k in OBS_STATS))
+        return policy
 
 
 class AgentHeader(TypedDict):

@@ -11,6 +11,9 @@ from torch import Tensor
 CONSTANT = 1e-6
 """A number whose deviation is less, relative to its size if that is above 1, is constant."""
 
+CLIP = 10.0
+"""Deviations from the mean at which networks see observations clipped."""
+
 
 def is_constant(mean: Tensor, var: Tensor) -> Tensor:
     """Return whether numbers with these means and variances were constant but for rounding."""
@@ -105,7 +108,8 @@ def merge_moments(
         batch_mean = torch.where(counts, batch, 0.0).sum(1) / rows
         away = (batch - batch_mean[:, None]).square()
         batch_var = torch.where(counts, away, 0.0).sum(1) / rows
-    total = (count + n).clamp_min(1.0)
-    old, new = (count / total)[:, None], (n / total)[:, None]
+    total = count + n
+    new = (n / total.clamp_min(1.0))[:, None]
+    old = 1.0 - new
     delta = batch_mean - mean
     return mean + delta * new, var * old + batch_var * new + delta.square() * old * new, total

@@ -13,6 +13,7 @@ import torch
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, error_text, short
 from skillweave.ops.moments import is_constant, scale_of
+from skillweave.ops.seen import Seen
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
@@ -74,10 +75,10 @@ class Standard:
                 away = OUTSIDE * lengths[at]
                 typical &= number >= distinct[at] - away
                 typical &= number <= distinct[at + most - 1] + away
-        self.mean, var = known.mean(0, where=counts), known.var(0, where=counts)
-        moments = torch.from_numpy(self.mean), torch.from_numpy(var)
-        self.varies = ~is_constant(*moments).numpy()
-        self.scale: Array = self.varies / scale_of(*moments, eps=0.0).numpy()
+        self.mean = known.mean(0, where=counts)
+        self.moments = torch.from_numpy(self.mean), torch.from_numpy(known.var(0, where=counts))
+        self.varies = ~is_constant(*self.moments).numpy()
+        self.scale: Array = self.varies / scale_of(*self.moments, eps=0.0).numpy()
 
     def __call__(self, values: Array) -> Array:
         """Return standardised values (..., F), float64."""
@@ -119,17 +120,24 @@ class FeatureMap:
                 f"all features of {who} are constant in the log, so no call is nearer than "
                 "another; give features= that change, or record calls from other states"
             )
+        ends = map(torch.from_numpy, (raw.min(0), raw.max(0)))
+        self._seen = Seen(f"the plan with {who}", self._name, *self._standard.moments, *ends)
         self._varies = np.flatnonzero(self._standard.varies)
         self.size = len(self._varies)
         """F, the number of features."""
 
-    def __call__(self, obs: Array) -> Array:
-        """Return standardised features, (n, F) float32; constant ones are left out."""
+    def __call__(self, obs: Array, *, acts: bool = False) -> Array:
+        """Return standardised features, (n, F) float32; constant ones are left out.
+
+        If the plan ``acts`` by them, a feature far beyond the log is named once.
+        """
         raw = self.raw(obs)
         if not np.isfinite(raw).all():
             raise DeclarationError(
                 f"a feature of {self._who} is not finite in an observation; clip it"
             )
+        if acts:
+            self._seen.look(torch.from_numpy(raw))
         return np.asarray(self._standard(raw)[:, self._varies], np.float32)
 
     @property
@@ -164,6 +172,11 @@ class FeatureMap:
                 "expected: a row for each observation"
             )
         return value
+
+    def _name(self, number: int) -> str:
+        if self._codec is None:
+            return f"feature {number}"
+        return self._codec.name(self._places[number])
 
     def _checked_places(self, places: Any, size: int) -> list[int]:
         if places is None:

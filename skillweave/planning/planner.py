@@ -351,7 +351,7 @@ class Planner(ReadySelector):
         Where it was bound to choices with goals, they have goals.
         """
         may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
-        features = [each(obs) for each in self.graph.maps]
+        features = [each(obs, acts=True) for each in self.graph.maps]
         near, state = self.graph.near_features(features), _state(memory)
         logged, place = self._values(near, obs, state), self.states.place(state)
         seen, goals = self._tried.padded(features), self._tried.goals_of(near)

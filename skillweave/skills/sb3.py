@@ -12,13 +12,16 @@ from pathlib import Path
 from typing import Any, Literal, Self, overload
 
 import numpy as np
+import torch
 from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict, MultiBinary
+from torch import Tensor
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
+from skillweave.ops.moments import is_constant, scale_of
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of
@@ -380,7 +383,18 @@ def _moments(
             f"from_sb3(learn=True): normalize scales parts of {short(space, 200)}, and only "
             "observations of a Box can be scaled further"
         )
-    return np.ravel(rms.mean), np.ravel(rms.var), float(rms.count)
+    mean, var = _mean_and_variance(rms)
+    return mean.numpy(), var.numpy(), float(rms.count)
+
+
+def _mean_and_variance(rms: Any) -> tuple[Tensor, Tensor]:
+    """Return the means and variances in a ``RunningMeanStd``; constants have the variance 0.
+
+    It begins as if 1e-4 samples with mean 0 and variance 1 had been seen.
+    """
+    mean, var = (torch.from_numpy(np.ravel(x).astype(np.float64)) for x in (rms.mean, rms.var))
+    made_up = 1e-4 * (1.0 + mean.square()) / rms.count
+    return mean, var.where(~is_constant(mean, (var - made_up).clamp_min(0.0)), 0.0)
 
 
 def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
@@ -447,11 +461,11 @@ def _statistics(
     limit = float(normalize.clip_obs)
     return {
         name: Scaling(
-            offset=np.ravel(one.mean),
-            scale=1.0 / np.sqrt(np.ravel(one.var) + normalize.epsilon),
+            offset=mean.numpy(),
+            scale=1.0 / scale_of(mean, var, normalize.epsilon).numpy(),
             clip=(-limit, limit),
         )
-        for name, one in by_name.items()
+        for name, (mean, var) in zip(by_name, map(_mean_and_variance, by_name.values()), strict=True)
     }
 
 

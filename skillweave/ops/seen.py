@@ -1,0 +1,52 @@
+"""A notice of a number far beyond all that were seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+from torch import Tensor
+
+from skillweave.notices import notice
+from skillweave.ops.moments import CLIP, scale_of
+
+
+@dataclass
+class Seen:
+    """The range of numbers that were seen; the first one far beyond it is named, once.
+
+    It is far beyond where it is outside by more than the width of the range, and more than
+    ``CLIP`` deviations from the mean.
+    """
+
+    who: str
+    """The start of the message."""
+    name: Callable[[int], str]
+    """Returns the name of the number at a place."""
+    mean: Tensor  # (O,)
+    var: Tensor  # (O,)
+    low: Tensor  # (O,), of a fresh ``AgentState``: the range is unknown, and nothing is far
+    high: Tensor  # (O,)
+    said: bool = False
+
+    @cached_property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        width = (self.high - self.low).abs()  # infinite where it is unknown
+        away = CLIP * scale_of(self.mean, self.var)
+        low, high = self.low - width, self.high + width
+        return low.minimum(self.mean - away), high.maximum(self.mean + away)
+
+    def look(self, numbers: Tensor) -> None:
+        """Give the notice if one of ``numbers`` (..., O) is far beyond, unless it was given."""
+        if self.said or (near := numbers.clamp(*self._ends)).equal(numbers):
+            return
+        self.said = True
+        worst = int(((numbers - near).abs() / scale_of(self.mean, self.var)).argmax())
+        place = worst % len(self.low)
+        notice(
+            f"{self.who}: {self.name(place)} is {numbers.flatten()[worst]:g}, far beyond the "
+            f"{self.low[place]:g} to {self.high[place]:g} that it has seen, so it acts by guess. "
+            "Check the number's unit and whether the value means something else; or let it see "
+            "such values"
+        )
