@@ -80,7 +80,7 @@ class DQNAlgorithm(OffPolicyAlgorithm):
             return super().reward_scale(state)
         # The root of the mean square: the deviation of equal returns would be 0.
         square = state.return_var + state.return_mean.square()
-        return scale_of(torch.zeros_like(square), square).reciprocal()
+        return scale_of(state.return_mean, square).reciprocal()
 
     def fresh_state(self, seeds: Sequence[Seeds]) -> State:
         """Create the state of fresh members, one for each seed."""

@@ -141,7 +141,7 @@ class AgentPolicy(Memoryless):
                 )
         policy = cls(algorithm, weights)
         if algorithm.normalize_obs:
-            policy.seen = Seen(where, algorithm.obs.name, *(weights[k] for k in OBS_STATS))
+            policy.seen = Seen(f"{where}: observation number", *(weights[k] for k in OBS_STATS))
         return policy
 
 

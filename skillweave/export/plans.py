@@ -15,7 +15,7 @@ import numpy as np
 from skillweave.errors import PolicyError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import FURTHER, CallGraph
-from skillweave.planning.neighbours import AHEAD, SOFT
+from skillweave.planning.neighbours import AHEAD, FAR, SOFT
 from skillweave.planning.planner import Planner
 from skillweave.planning.tried import LATEST, SLACK, TRUST
 from skillweave.selectors.base import function_name
@@ -88,7 +88,7 @@ def plan_entry(planner: Planner, name: str, asks: Asks) -> tuple[dict[str, Any],
         "temperature": planner.temperature,
     }
     constants = {"ahead": AHEAD, "soft": SOFT, "latest": LATEST, "trust": TRUST, "slack": SLACK}
-    constants["further"] = FURTHER
+    constants |= {"further": FURTHER, "far": FAR}
     entry = {"kind": "Plan", "features": features, "events": events, "rewards": rewards}
     return entry | settings | constants, buffer.getvalue()
 

@@ -731,9 +731,8 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
             raw: Any = self.runner.code[code](obs) if code else np.reshape(obs, (1, -1))
             raw = raw if code else raw.astype("f4")[:, part["places"]]
             raw = np.asarray(raw, "f8").ravel()
-            varies = part["varies"]
-            standard = (raw - part["mean"]) * part["scale"]
-            each.append(np.asarray(standard[varies].clip(-100, 100), "f4"))  # neighbours.FAR
+            standard = ((raw - part["mean"]) * part["scale"])[part["varies"]]
+            each.append(np.asarray(standard.clip(-self.entry["far"], self.entry["far"]), "f4"))
         return each
 
     def near(self, features: list[Any]) -> Any:

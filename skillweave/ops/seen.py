@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,9 +20,7 @@ class Seen:
     """
 
     who: str
-    """The start of the message."""
-    name: Callable[[int], str]
-    """Returns the name of the number at a place."""
+    """The start of the message, before the place of the number."""
     mean: Tensor  # (O,)
     var: Tensor  # (O,)
     low: Tensor  # (O,), of a fresh ``AgentState``: the range is unknown, and nothing is far
@@ -45,7 +42,7 @@ class Seen:
         worst = int(((numbers - near).abs() / scale_of(self.mean, self.var)).argmax())
         place = worst % len(self.low)
         notice(
-            f"{self.who}: {self.name(place)} is {numbers.flatten()[worst]:g}, far beyond the "
+            f"{self.who} {place} is {numbers.flatten()[worst]:g}, far beyond the "
             f"{self.low[place]:g} to {self.high[place]:g} that it has seen, so it acts by guess. "
             "Check the number's unit and whether the value means something else; or let it see "
             "such values"

@@ -71,12 +71,11 @@ class Standard:
             most = max(2, int(MOST_DISTINCT * len(distinct)))
             lengths = distinct[most - 1 :] - distinct[: 1 - most]
             if len(lengths):
-                at = lengths.argmin()
-                away = OUTSIDE * lengths[at]
-                typical &= number >= distinct[at] - away
-                typical &= number <= distinct[at + most - 1] + away
-        self.mean = known.mean(0, where=counts)
-        self.moments = torch.from_numpy(self.mean), torch.from_numpy(known.var(0, where=counts))
+                half = lengths.min() / 2
+                middle = distinct[lengths.argmin()] + half
+                typical[:] = np.abs(number - middle) <= (1 + 2 * OUTSIDE) * half
+        self.mean, var = known.mean(0, where=counts), known.var(0, where=counts)
+        self.moments = torch.from_numpy(self.mean), torch.from_numpy(var)
         self.varies = ~is_constant(*self.moments).numpy()
         self.scale: Array = self.varies / scale_of(*self.moments, eps=0.0).numpy()
 
@@ -86,7 +85,7 @@ class Standard:
         return standard.clip(-FAR, FAR)
 
 
-class FeatureMap:
+class FeatureMap(Standard):
     """Standardised features of observations for one skill.
 
     Args:
@@ -114,16 +113,15 @@ class FeatureMap:
             raise DeclarationError(
                 f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
             )
-        self._standard = Standard(raw)
-        if not self._standard.varies.any():
+        super().__init__(raw)
+        if not self.varies.any():
             raise DeclarationError(
                 f"all features of {who} are constant in the log, so no call is nearer than "
                 "another; give features= that change, or record calls from other states"
             )
         ends = map(torch.from_numpy, (raw.min(0), raw.max(0)))
-        self._seen = Seen(f"the plan with {who}", self._name, *self._standard.moments, *ends)
-        self._varies = np.flatnonzero(self._standard.varies)
-        self.size = len(self._varies)
+        self._seen = Seen(f"the plan with {who}: feature", *self.moments, *ends)
+        self.size = int(self.varies.sum())
         """F, the number of features."""
 
     def __call__(self, obs: Array, *, acts: bool = False) -> Array:
@@ -138,7 +136,7 @@ class FeatureMap:
             )
         if acts:
             self._seen.look(torch.from_numpy(raw))
-        return np.asarray(self._standard(raw)[:, self._varies], np.float32)
+        return np.asarray(super().__call__(raw)[:, self.varies], np.float32)
 
     @property
     def places(self) -> list[int] | None:
@@ -148,8 +146,7 @@ class FeatureMap:
     @property
     def arrays(self) -> dict[str, Array]:
         """The numbers by which raw features are standardised, and those that are left out."""
-        standard = self._standard
-        return {"mean": standard.mean, "scale": standard.scale, "varies": self._varies}
+        return {"mean": self.mean, "scale": self.scale, "varies": self.varies}
 
     def raw(self, obs: Array) -> Array:
         """Return the features of observations (n, …) as they are, (n, F) float64."""
@@ -172,11 +169,6 @@ class FeatureMap:
                 "expected: a row for each observation"
             )
         return value
-
-    def _name(self, number: int) -> str:
-        if self._codec is None:
-            return f"feature {number}"
-        return self._codec.name(self._places[number])
 
     def _checked_places(self, places: Any, size: int) -> list[int]:
         if places is None:

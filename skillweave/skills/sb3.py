@@ -15,13 +15,12 @@ import numpy as np
 import torch
 from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict, MultiBinary
-from torch import Tensor
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
-from skillweave.ops.moments import is_constant, scale_of
+from skillweave.ops.moments import is_constant
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of
@@ -383,18 +382,17 @@ def _moments(
             f"from_sb3(learn=True): normalize scales parts of {short(space, 200)}, and only "
             "observations of a Box can be scaled further"
         )
-    mean, var = _mean_and_variance(rms)
-    return mean.numpy(), var.numpy(), float(rms.count)
+    return np.ravel(rms.mean), _variance(rms), float(rms.count)
 
 
-def _mean_and_variance(rms: Any) -> tuple[Tensor, Tensor]:
-    """Return the means and variances in a ``RunningMeanStd``; constants have the variance 0.
+def _variance(rms: Any) -> Array:
+    """Return the variances in a ``RunningMeanStd``; 1 of constants, as in ``scale_of``.
 
     It begins as if 1e-4 samples with mean 0 and variance 1 had been seen.
     """
-    mean, var = (torch.from_numpy(np.ravel(x).astype(np.float64)) for x in (rms.mean, rms.var))
+    mean, var = (torch.as_tensor(np.ravel(x), dtype=torch.float64) for x in (rms.mean, rms.var))
     made_up = 1e-4 * (1.0 + mean.square()) / rms.count
-    return mean, var.where(~is_constant(mean, (var - made_up).clamp_min(0.0)), 0.0)
+    return torch.where(is_constant(mean, (var - made_up).abs()), 1.0, var).numpy()
 
 
 def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
@@ -461,11 +459,11 @@ def _statistics(
     limit = float(normalize.clip_obs)
     return {
         name: Scaling(
-            offset=mean.numpy(),
-            scale=1.0 / scale_of(mean, var, normalize.epsilon).numpy(),
+            offset=np.ravel(one.mean),
+            scale=1.0 / np.sqrt(_variance(one) + normalize.epsilon),
             clip=(-limit, limit),
         )
-        for name, (mean, var) in zip(by_name, map(_mean_and_variance, by_name.values()), strict=True)
+        for name, one in by_name.items()
     }
 
 

@@ -192,15 +192,6 @@ class ObsCodec:
         nothing = raw[0].new_empty((*lead, 0), dtype=torch.float32)
         return torch.cat(vectors, dim=-1) if vectors else nothing, tuple(images)
 
-    def name(self, place: int) -> str:
-        """Return the name of a number of the vector: ``number 3 of the observation``."""
-        for leaf in self.leaves:
-            if leaf.image is None:
-                if place < leaf.size:
-                    break
-                place -= leaf.size
-        return f"number {place} of the observation" + f"'s part {leaf.name}" * bool(leaf.name)
-
     @property
     def may_be_wrong(self) -> bool:
         """Return whether ``check`` can fail: any bytes of an image are valid, for example."""
