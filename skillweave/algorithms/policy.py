@@ -29,8 +29,7 @@ S = TypeVar("S")
 class AgentPolicy(Memoryless):
     """A trained agent that acts; a copy, independent of further learning."""
 
-    seen: Seen | None = None
-    """The range of observations that it learnt from, if it is from a file."""
+    _seen: Seen | None = None
 
     def __init__(self, algorithm: Algorithm, weights: dict[str, Tensor]) -> None:
         self.algorithm = algorithm
@@ -43,6 +42,12 @@ class AgentPolicy(Memoryless):
     def of(cls, algorithm: Algorithm, state: Any, member: int = 0) -> AgentPolicy:
         """Return the policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
+
+    def watch(self, who: str) -> None:
+        """Name observations far beyond those that it learnt from, from now on; see ``Seen``."""
+        if self.algorithm.normalize_obs:
+            stats = (self.weights[k] for k in OBS_STATS)
+            self._seen = Seen(f"{who}: observation number", *stats)
 
     @property
     def seen_places(self) -> tuple[int, ...] | None:
@@ -77,8 +82,8 @@ class AgentPolicy(Memoryless):
         mask = self.algorithm.widened(mask)
         allowed = None if mask is None else torch.from_numpy(mask)[None]
         rows = to_tensor(np.ascontiguousarray(pack(self.observation_space, obs)))[None]
-        if self.seen is not None:
-            self.seen.look(self.algorithm.obs.split(rows)[0])
+        if self._seen is not None:
+            self._seen.look(self.algorithm.obs.split(rows)[0])
         before = torch.from_numpy(memory["rnn"])[None] if memory else None
         action, _, after = self.algorithm.act(self.params, rows, allowed, noise, before)
         memory = {} if after is None else {"rnn": after[0].numpy()}
@@ -140,8 +145,7 @@ class AgentPolicy(Memoryless):
                     "or the file was altered"
                 )
         policy = cls(algorithm, weights)
-        if algorithm.normalize_obs:
-            policy.seen = Seen(f"{where}: observation number", *(weights[k] for k in OBS_STATS))
+        policy.watch(where)
         return policy
 
 

@@ -42,8 +42,7 @@ class Seen:
         worst = int(((numbers - near).abs() / scale_of(self.mean, self.var)).argmax())
         place = worst % len(self.low)
         notice(
-            f"{self.who} {place} is {numbers.flatten()[worst]:g}, far beyond the "
-            f"{self.low[place]:g} to {self.high[place]:g} that it has seen, so it acts by guess. "
-            "Check the number's unit and whether the value means something else; or let it see "
-            "such values"
+            f"{self.who} {place} is {numbers.flatten()[worst]:g}, but only {self.low[place]:g} to "
+            f"{self.high[place]:g} was seen before, so what is done there is a guess. Check the "
+            "unit, and whether the value means something else; or collect such values, too"
         )
