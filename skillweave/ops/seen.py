@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from torch import Tensor
@@ -25,7 +25,7 @@ class Seen:
     var: Tensor  # (O,)
     low: Tensor  # (O,), of a fresh ``AgentState``: the range is unknown, and nothing is far
     high: Tensor  # (O,)
-    said: bool = False
+    said: bool = field(default=False, init=False)
 
     @cached_property
     def _ends(self) -> tuple[Tensor, Tensor]:
