@@ -307,12 +307,30 @@ def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize(
     ("steps", "length", "episodes"),
-    [(1_000_000, 200.0, 100), (100_000, 200.0, 50), (100_000, 1_000.0, 20), (500, None, 20)],
+    [
+        (1_000_000, 200.0, 100),
+        (100_000, 200.0, 50),
+        (100_000, 500.0, 20),
+        (100_000, 600.0, 8),  # 4 candidates of 8 episodes are 20 % of the steps
+        (100_000, 1_100.0, 0),  # fewer than five
+        (500, None, 0),
+    ],
 )
 def test_fewer_episodes_are_played_where_they_are_long(monkeypatch, steps, length, episodes):
     monkeypatch.setattr(select_best, "MOST", 100)
+    monkeypatch.setattr(select_best, "SHORT_SHARE", 0.05)
     entry = {"steps": steps, "final": {"length": length}, "algorithm": {"num_envs": 4}}
     assert select_best._episodes(entry) == episodes
+
+
+def test_a_training_too_short_for_a_comparison_plays_no_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(select_best, "SHORT_SHARE", 0.05)
+    run = declare(learn="apart, then together").train(tmp_path / "run", quiet=True)
+    entry = run.info()["stages"][-1]
+    assert entry["kept"] == {"kept": "skills_sample"}
+    assert entry["evaluation_steps"] == 0
+    skills = declare().load(run.path).policy.skills
+    assert (skills.greedy, skills.greedy_selector) == (False, True)
 
 
 def test_a_sampling_selector_samples_also_where_greedy_actions_are_asked(tmp_path):

@@ -30,9 +30,13 @@ SEEDS = 1_000
 MOST = 100
 """Most episodes of each candidate."""
 LEAST = 20
-"""Fewest episodes of each candidate, whatever their share."""
+"""Fewest episodes of each candidate, where ``SHORT_SHARE`` allows them."""
+FEWEST = 5
+"""Episodes of each candidate below which a comparison says nothing, so none is played."""
 SHARE = 0.1
 """Share of the stage's steps that the episodes of a candidate may take."""
+SHORT_SHARE = 0.05
+"""The same share where it would not hold ``LEAST``: there are at most four candidates."""
 CLEARLY = 2.0
 """Standard errors by which a sampling selector must be better than a greedy one to replace it;
 users expect a greedy one."""
@@ -53,6 +57,10 @@ def select_best(
     entry = run.stage(join(level.path, TOGETHER))
     if "kept" not in entry and needs_comparison(entry):
         episodes = _episodes(entry)
+        if not episodes:
+            entry["kept"] = {"kept": "skills_sample"}  # as they did while they learnt
+            run.save()
+            return after
         for listener in listeners:
             listener.message(
                 f"{entry['name']}: playing {episodes} episodes of each kind, to decide whether "
@@ -71,9 +79,12 @@ def select_best(
 
 
 def _episodes(entry: Mapping[str, Any]) -> int:
-    """Return the number of episodes for each candidate: fewer where episodes are long."""
+    """Return the number of episodes for each candidate: fewer where episodes are long, or 0."""
     length = entry["final"].get("length") or entry["steps"] / entry["algorithm"]["num_envs"]
-    return int(np.clip(round(SHARE * entry["steps"] / length), min(LEAST, MOST), MOST))
+    episodes = round(SHARE * entry["steps"] / length)
+    if episodes < LEAST:
+        episodes = min(LEAST, int(SHORT_SHARE * entry["steps"] / length))
+    return min(episodes, MOST) if episodes >= FEWEST else 0
 
 
 def _scores(

@@ -66,7 +66,7 @@ class Selection:
     greedy_skills: bool | None = None
     """True: skills act greedily under the selector. False: they sample. None: greedy where they
     learn apart; where they learn together, episodes of both kinds are played at the end, and the
-    better kind is kept."""
+    better kind is kept. After a training too short for such episodes, they sample."""
     greedy_selector: bool | None = None
     """The same for the selector. None: greedy, unless skills and selector learn together and a
     sampling selector is clearly better at the end: a greedy one can call one skill forever."""

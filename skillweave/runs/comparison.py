@@ -37,7 +37,7 @@ class Comparison(TypedDict):
     selector_samples: NotRequired[float]
     both_sample: NotRequired[float]
     episodes: NotRequired[AtLeastOne]
-    """Episodes of each candidate."""
+    """Episodes of each candidate; absent: training was too short for a comparison."""
     sentence: NotRequired[str]
     """The result of a repair, which is compared by calls."""
     kept: Candidate
@@ -47,6 +47,11 @@ def comparison_words(kept: Mapping[str, Any]) -> str:
     """Return a sentence on the compared hierarchies and the kept one."""
     if "sentence" in kept:
         return str(kept["sentence"])
+    if "episodes" not in kept:
+        return (
+            "too few steps to compare greedy and sampling in episodes: unless Selection sets it, "
+            "skills sample, and the selector is greedy"
+        )
     returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
     return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
 
