@@ -75,6 +75,24 @@ STARTS_BY = (
     "documentation has its lines, under 'A curriculum', 'Start episodes elsewhere'"
 )
 
+RECORDINGS = (
+    "demonstrations",
+    "demos",
+    "dataset",
+    "expert",
+    "expert_data",
+    "trajectories",
+    "transitions",
+)
+"""Names under which users look for learning from recorded data."""
+RECORDINGS_BY = (
+    "Skillweave does not learn from demonstrations or other recorded data; learn a policy from "
+    "them with another library, and start from it: train(start_from=from_torch(policy, "
+    "learn=True)), or from_sb3"
+)
+ABSENT = dict.fromkeys(STARTS, STARTS_BY) | dict.fromkeys(RECORDINGS, RECORDINGS_BY)
+"""By a name that users look for, a sentence on what to do instead."""
+
 
 def checked_names(target: T) -> T:
     """Let a function, or a class, raise a DeclarationError where its arguments are wrong.
@@ -144,8 +162,8 @@ def _wrong_arguments(
         places = [_Place(k, "", "") for k in by_name]
         if owner is not None:
             places += _other_places(owner, makes)
-        if unknown[0] in STARTS and not (unknown[0] in ELSEWHERE and "skills" in by_name):
-            return f"{who} has no {what} {unknown[0]!r}: {STARTS_BY}"
+        if unknown[0] in ABSENT and not (unknown[0] in ELSEWHERE and "skills" in by_name):
+            return f"{who} has no {what} {unknown[0]!r}: {ABSENT[unknown[0]]}"
         end = meant(unknown[0], places, f"its {what}s are")
         return f"{who} has no {what} {unknown[0]!r}{end}"
     ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]

@@ -54,6 +54,26 @@ class Old(Boom):
         return np.zeros(2, np.float32), 0.0, False, {}
 
 
+class Room(Boom):
+    observation_space = gym.spaces.Dict(
+        {"place": gym.spaces.Box(-1, 1, (2,)), "held": gym.spaces.Discrete(3)}
+    )
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+KEYS = "Dict with the keys 'held', 'place'"
+
+
+def in_room(**attributes: Any) -> sw.Run:
+    """Train one skill with these attributes where observations are a Dict."""
+    return train(Room, [skill(**attributes)])
+
+
 def declare(env: Any = "CartPole-v1", skills: Any = None, **settings: Any) -> sw.Hierarchy:
     return sw.Hierarchy(env, skills or [Good()], **(FAST | settings))
 
@@ -369,9 +389,16 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: declare().train("runs/tr", track=["tensorbord"]),
         "no tracker 'tensorbord'; there are: tensorboard, wandb, mlflow",
     ),
-    "tracker as text": (
-        lambda: declare().train("runs/tr", track="tensorboard", quiet=True), "track=['wandb']"
+    "features as text": (lambda: declare(features="x"), "Hierarchy: features is 'x'"),
+    "demonstrations": (
+        lambda: declare().train("runs/de", demonstrations="demos.npz"), "recorded data"
     ),
+    "wrong key of a Dict": (
+        lambda: in_room(reward=lambda _, step: step.next_obs["hold"][:, 0]), KEYS
+    ),
+    "column of a Dict": (lambda: in_room(reward=lambda _, step: step.next_obs[:, 0]), KEYS),
+    "wrong key in initiation": (lambda: in_room(initiation=lambda _, obs: obs["hold"]), KEYS),
+    "wrong key in sees": (lambda: in_room(sees=("hold",)), "its parts are held, place"),
     "seed as text": (lambda: declare().train("runs/sd", seed="1"), "it must be a whole number"),
 }  # fmt: skip
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from skillweave.arguments import meant
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
@@ -191,8 +190,8 @@ def _part(key: str, obs: ObsCodec) -> list[int]:
         )
     if not places:
         known = [leaf.name for leaf in obs.leaves if leaf.name]
-        hint = meant(key, known, "its parts are") if known else "; it has no parts"
+        hint = f"its parts are {', '.join(known)}" if known else "it has no parts"
         raise DeclarationError(
-            f"Network.sees names {key!r}, a part of the observation that does not exist{hint}"
+            f"Network.sees names {key!r}, a part of the observation that does not exist; {hint}"
         )
     return places

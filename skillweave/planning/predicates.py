@@ -97,7 +97,7 @@ class Predicate:
         try:
             return answer(self.function, obs, len(obs), bool, "task", self.name)
         except SkillError as error:
-            if (hint := _hint(error, obs)) is None:
+            if (hint := _hint(error)) is None:
                 raise
             raise SkillError(f"{str(error).rstrip('.')}; {hint}") from error.__cause__
 
@@ -221,7 +221,7 @@ def _joined(
     return Predicate(lambda step: join(a.holds(step), b.holds(step)), name, "step")
 
 
-def _hint(error: SkillError, obs: Array) -> str | None:
+def _hint(error: SkillError) -> str | None:
     """Return what a function that failed on observations has perhaps mistaken them for."""
     cause = error.__cause__
     fields = {field.name for field in dataclasses.fields(Step)}
@@ -230,9 +230,6 @@ def _hint(error: SkillError, obs: Array) -> str | None:
             "it was given observations, (n, …), as its argument is not named 'step': write "
             "lambda step: ..., annotate it with Step, or write Predicate(function, reads='step')"
         )
-    if obs.dtype.names and cause is not None:
-        parts = ", ".join(f"obs[{name!r}] {obs[name].shape}" for name in obs.dtype.names)
-        return f"observations of a Dict have parts by key, each of n environments: {parts}"
     return None
 
 

@@ -153,7 +153,11 @@ class _Film:
 
 
 def frame_of(env: gym.Env[Any, Any]) -> Array:
-    """Return the environment's picture, reduced to at most ``MAX_WIDTH``."""
+    """Return the environment's picture, (H, W, 3) uint8, reduced to at most ``MAX_WIDTH``.
+
+    Raises:
+        EnvError: ``render`` failed, or gave no such picture.
+    """
     name = type(env.unwrapped).__name__
     try:
         frame: Any = env.render()
@@ -163,6 +167,11 @@ def frame_of(env: gym.Env[Any, Any]) -> Array:
         ) from error
     if not isinstance(frame, np.ndarray):
         raise EnvError(f"{name} cannot be filmed: render() gave {type(frame).__name__}")
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
+        raise EnvError(
+            f"{name} cannot be filmed: render() gave {frame.dtype} of shape {frame.shape}; let it "
+            "return uint8 of shape (height, width, 3): red, green and blue from 0 to 255"
+        )
     factor = -(-frame.shape[1] // MAX_WIDTH)
     return frame if factor == 1 else np.asarray(extra("PIL.Image").fromarray(frame).reduce(factor))
 

@@ -463,8 +463,10 @@ class Plan:
                 raise PolicyError(
                     f"{where} reads {key!r}, but the observation is no Dict: it is {self.spaces[0]}"
                 )
-            hint = meant(key, names, "its parts are")
-            raise PolicyError(f"{where} reads {key!r}, which the observation does not have{hint}")
+            raise PolicyError(
+                f"{where} reads {key!r}, which the observation does not have; its parts are "
+                f"{', '.join(names)}"
+            )
         if len(leaves) == 1 and part.places is None:
             leaf = leaves[0]
             whole = alone and (len(leaf.shape) > 1 or not part.one_hot)

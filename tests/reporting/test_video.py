@@ -355,6 +355,23 @@ def test_an_environment_without_frames(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("kind", "shape"),
+    [("f4", (64, 64, 3)), ("u1", (64, 64)), ("u1", (64, 64, 4)), ("u1", (0, 0, 3))],
+)
+def test_a_picture_that_is_not_rgb_is_refused_before_a_step(
+    tmp_path: Path, kind: str, shape: tuple[int, ...]
+) -> None:
+    class Odd(Corridor):
+        step: Any = None
+
+        def render(self) -> Any:
+            return np.ones(shape, kind)
+
+    with pytest.raises(EnvError, match=r"Odd cannot be filmed.*uint8"):
+        render_policy(EnvSpec(Odd), Walker(), tmp_path / "a.gif")
+
+
 def test_an_environment_that_fails_to_draw_is_named(tmp_path: Path) -> None:
     class NoScreen(Corridor):
         def render(self) -> Any:
