@@ -266,7 +266,7 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
     },
 }  # fmt: skip
 """By class and field, what is refused and what is taken."""
-IN_PARTS = {sw.Hierarchy: {"skills", "reflexes", "predicates", "rest"}}
+IN_PARTS = {sw.Hierarchy: {"skills", "reflexes", "predicates", "features", "rest"}}
 """Fields that have tests of their own."""
 
 

@@ -35,7 +35,14 @@ from skillweave.api.notebook_tables import (
     run_html,
     skills_table,
 )
-from skillweave.api.planning import mission_words, planned, start_of, to_train, untasked
+from skillweave.api.planning import (
+    lacking_features,
+    mission_words,
+    planned,
+    start_of,
+    to_train,
+    untasked,
+)
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.repairing import repair
@@ -62,6 +69,7 @@ from skillweave.hierarchy.weights import (
     write_weights,
 )
 from skillweave.messages import as_path, short, shown_path, whole_number
+from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner, record_calls
 from skillweave.planning.run_log import hand_over_json, hand_over_of
@@ -105,6 +113,7 @@ class Agent(PlainAgent):
         run_dir: str | Path | None = None,
         *,
         resume: bool = False,
+        overwrite: bool = False,
         seed: int = 0,
         eval_every: int | None = None,
         eval_episodes: int | None = None,
@@ -120,10 +129,9 @@ class Agent(PlainAgent):
     ) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
-        ``run_dir``, ``resume``, ``seed``, ``eval_every``, ``eval_episodes``, ``checkpoint_every``,
-        ``quiet``, ``track``, ``evolve``, ``cluster``, ``start_from``, ``callback``, ``keep`` and
-        ``log_info`` are as in
-        ``Hierarchy.train``.
+        ``run_dir``, ``resume``, ``overwrite``, ``seed``, ``eval_every``, ``eval_episodes``,
+        ``checkpoint_every``, ``quiet``, ``track``, ``evolve``, ``cluster``, ``start_from``,
+        ``callback``, ``keep`` and ``log_info`` are as in ``Hierarchy.train``.
         """
         self.validate()
         how = self.train_defaults.given(
@@ -145,6 +153,7 @@ class Agent(PlainAgent):
             _directories(start_from),
             callback=callback,
             resume=resume,
+            overwrite=overwrite,
         )
         return run_of(trained)
 
@@ -245,6 +254,7 @@ class Hierarchy(Declaration):
         run_dir: str | Path | None = None,
         *,
         resume: bool = False,
+        overwrite: bool = False,
         seed: int = 0,
         flat: bool | AlgorithmConfig = False,
         eval_every: int | None = None,
@@ -265,13 +275,14 @@ class Hierarchy(Declaration):
 
         Args:
             run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
-                recipe, the hierarchy or the environment. A run that has learnt something is never
-                replaced; one without a checkpoint is, unless a process trains it.
-
-            resume: continue the run in ``run_dir`` if it has learnt something, else start one. Its
-                settings count, and those that differ are named. If steps have grown, a finished run
-                continues: in new episodes, with schedules over the new budget. Steps of stages
-                whose learners learn again in a later one go to that stage.
+                recipe, the hierarchy or the environment. A run that has saved nothing yet is
+                replaced, unless a process trains it; any other only with ``overwrite``.
+            resume: continue the run in ``run_dir`` if it has learnt something, else start one. It
+                keeps its settings, and a message lists those that differ. If steps have grown, a
+                finished run continues: in new episodes, with schedules over the new budget. Steps
+                of stages whose learners learn again in a later one go to that stage.
+            overwrite: replace the run in ``run_dir``, also a finished one; not with ``resume``.
+                Files there that no run writes stay.
             seed: the root of every random stream.
             flat: train one plain agent for the same number of steps instead: the baseline. True:
                 with the settings of ``train_defaults``; or its settings.
@@ -280,7 +291,7 @@ class Hierarchy(Declaration):
             eval_episodes: episodes of each of these evaluations; None: 20.
             checkpoint_every: environment steps between checkpoints; None: 100,000.
             quiet: no progress.
-            track: any of "tensorboard", "wandb" and "mlflow".
+            track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
             evolve: a population for every stage, or for some by name (a skill's, "selector",
                 "agent"). Its budget is the stage's for each member, measuring fitness included.
                 Skills and selector of a population cannot learn together yet: they learn apart.
@@ -303,9 +314,9 @@ class Hierarchy(Declaration):
                 It needs ``eval_every``. A population ends with its best member in any case. None:
                 that of ``train_defaults``, by default "last".
             log_info: keys of ``info``: the mean of each over the latest 100 episodes is
-                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Of an episode the value in its
-                last step counts (in a skill's own stage: of its call). None, NaN and infinity are
-                left out.
+                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
+                value in its last step (in a skill's own stage, its call's). None, NaN and infinity
+                are left out.
             log_calls: steps: the calls in the latest so many steps in which the selector acted,
                 alone or together with skills, are the run's log of calls afterwards, as if
                 ``Run.log_calls`` had recorded them; so ``Run.plan`` needs no further steps. Calls
@@ -355,6 +366,7 @@ class Hierarchy(Declaration):
             note,
             callback,
             resume=resume,
+            overwrite=overwrite,
             own_start=self._starts if flat is False else None,
         )
         return run_of(trained)
@@ -372,7 +384,7 @@ class Hierarchy(Declaration):
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         The run's settings count, its steps too, and the code of this hierarchy: methods, functions,
-        conditions. Settings that differ are named, but for those of a population. To train for more
+        conditions. A message lists settings that differ, except a population's. To train for more
         steps: ``train(run_dir, resume=True)``.
 
         ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
@@ -845,6 +857,8 @@ class Run:
             RunError: the run's file of calls is damaged, or cannot be written.
         """
         spec = self._own_spec()
+        if words := lacking_features(self.hierarchy, self.policy):
+            notice(words)
         seed, info = self._calls.begin(self.policy, seed, info)
         log = record_calls(
             spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
@@ -883,8 +897,9 @@ class Run:
             task: a ``planning.Mission`` or its text, a ``RewardMachine``, a ``GoalTask``, a
                 predicate, or a function of a ``Step`` that returns the reward.
             log: calls of these skills; None: all that ``log_calls`` recorded in this run.
-            **settings: of ``planning.Planner``: ``features``, ``gamma``; ``predicates`` for a text,
-                beside the hierarchy's own and the names of its skills, which mean their success.
+            **settings: of ``planning.Planner``: ``gamma``; ``features``, by default the
+                hierarchy's; ``predicates`` for a text, beside the hierarchy's own and the names of
+                its skills, which mean their success.
 
         Raises:
             DeclarationError: this is a plain agent, or a setting is wrong.
@@ -899,6 +914,7 @@ class Run:
             words = settings.get("predicates") or {}
             if isinstance(words, Mapping):  # else the planner says what it is
                 settings["predicates"] = mission_words(declared, words)
+        settings.setdefault("features", declared.features)
         planner = Planner(log, task, skills=self.policy, **settings)
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)
@@ -921,13 +937,14 @@ class Run:
         """Train a skill on from where another one ends, and keep the result if it is better.
 
         Most episodes begin after a call of the other skill, the others as usual; half of them where
-        it does not rehearse. The skill is paid its own reward, and more while the event holds that
-        its calls are for: as much per step as calls that were done earned more than those that
-        failed. A skill of PPO without a memory also rehearses: the KL from its earlier policy has a
-        cost in the observations of its calls that were done after other skills (kickstarting,
-        Schmitt et al. 2018), so that it does not forget. Before and after, calls are recorded, and
-        the hand-overs counted: the new weights are kept if this one is clearly better and no other
-        one clearly worse. All other weights stay as they are. What was done is in ``Run.repairs``.
+        it does not rehearse. The skill is paid its own reward, and a bonus in each step in which
+        the event that its calls are for is true: as much per step as calls that were done earned
+        more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
+        earlier policy has a cost in the observations of its calls that were done after other skills
+        (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
+        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
+        and no other one clearly worse. All other weights stay as they are. What was done is in
+        ``Run.repairs``.
 
         Args:
             skill: the skill that fails, by its path.
@@ -1146,6 +1163,7 @@ def train_agent(
     run_dir: str | Path | None = None,
     *,
     resume: bool = False,
+    overwrite: bool = False,
     target_return: float | None = None,
     target_success: float | None = None,
     eval_every: int | None = None,
@@ -1176,9 +1194,10 @@ def train_agent(
         run_dir: a new directory; None: the next number of ``runs/<environment>-<n>``.
         resume: continue the run in ``run_dir`` if it has learnt something, for more ``steps`` if
             they have grown, else start; see ``Hierarchy.train``.
+        overwrite: replace the run in ``run_dir``; see ``Hierarchy.train``.
         seed: the root of every random stream.
         quiet: no progress.
-        track: any of "tensorboard", "wandb" and "mlflow".
+        track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
         evolve: an ``Evolution``: a population in place of one agent.
         cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
             where it pays.
@@ -1206,6 +1225,7 @@ def train_agent(
         return agent.train(
             run_dir,
             resume=resume,
+            overwrite=overwrite,
             seed=seed,
             eval_every=eval_every,
             eval_episodes=eval_episodes,

@@ -16,6 +16,7 @@ import numpy as np
 from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
 from skillweave.collecting.guide import as_logits
+from skillweave.collecting.skill_set import skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.declaration import Declaration
@@ -24,11 +25,14 @@ from skillweave.hierarchy.settings import Guide, Selection
 from skillweave.messages import short
 from skillweave.paths import SELECTOR
 from skillweave.planning import Planner, successes
+from skillweave.planning.calls import seen_places
 from skillweave.planning.mission_text import RESERVED
+from skillweave.planning.neighbours import FEATURES
 from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt
 from skillweave.seeding import Seeds
+from skillweave.spaces import obs_codec
 from skillweave.training.imitation import imitate
 from skillweave.types import Policy
 
@@ -156,6 +160,15 @@ def mission_words(declared: Declaration, given: Mapping[str, Any]) -> dict[str, 
         if name not in RESERVED and re.fullmatch(WORD, name)
     }
     return {**own, **declared.predicates, **given}
+
+
+def lacking_features(declared: Declaration, policy: Policy) -> str:
+    """Return a sentence if skills see images, which plans cannot compare; it may be empty."""
+    skills = skills_below(policy)
+    if skills is None or declared.features is not None or None not in seen_places(skills):
+        return ""
+    images = obs_codec(declared.spec.spaces.observation).images
+    return f"plans cannot compare calls by images; {FEATURES}" if images else ""
 
 
 def untasked(spec: EnvSpec) -> EnvSpec:

@@ -75,14 +75,16 @@ def begin(
     callback: Callback | None = None,
     *,
     resume: bool = False,
+    overwrite: bool = False,
     base: Base | None = None,
     done: Mapping[str, Any] | None = None,
     own_start: Callable[[], Directories] | None = None,
 ) -> Trained[D]:
     """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
 
-    With ``resume``, continue what is in ``run_dir`` instead, if there is something. With ``base``,
-    the stages of the manifest come after stages that are done. ``done``: as for ``training.train``.
+    With ``resume``, continue what is in ``run_dir`` instead, if there is something; with
+    ``overwrite``, replace it. With ``base``, the stages of the manifest come after stages that are
+    done. ``done``: as for ``training.train``.
     ``own_start`` makes what a new run starts from where ``start_from`` names nothing.
     """
     _may_train()
@@ -90,15 +92,20 @@ def begin(
     # An environment may change the working directory as it is made.
     place = absolute("." if run_dir is None else as_path(run_dir, "run_dir"))
     run_dir = None if run_dir is None else place
-    if not isinstance(resume, bool):
-        raise DeclarationError(f"resume is {short(resume)}; it must be True or False")
-    if resume and run_dir is None:
+    for word, value in (("resume", resume), ("overwrite", overwrite)):
+        if not isinstance(value, bool):
+            raise DeclarationError(f"{word} is {short(value)}; it must be True or False")
+        if value and run_dir is None:
+            raise DeclarationError(
+                f'{word}=True needs a run: name its directory, train("runs/a", {word}=True)'
+            )
+    if resume and overwrite:
         raise DeclarationError(
-            'resume=True continues a run, so name its directory: train("runs/a", resume=True)'
+            "resume continues the run in run_dir, and overwrite replaces it: leave out one of them"
         )
-    if isinstance(track, str) or not isinstance(track, Sequence):
+    if not isinstance(track, Sequence):
         raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
-    track = tuple(track)
+    track = (track,) if isinstance(track, str) else tuple(track)
     with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
         roles = _plan(declared, content, evolve, cluster)
@@ -128,7 +135,7 @@ def begin(
         if base is not None:
             content["stages"] = [*base.stages, *content["stages"]]
             first = base.write
-        run = RunDirectory.create(run_dir, content, first, hold=True)
+        run = RunDirectory.create(run_dir, content, first, hold=True, overwrite=overwrite)
         stack.callback(run.close)
         return go_on(declared, run, quiet, evolve, cluster, note, callback, done)
 

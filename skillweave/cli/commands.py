@@ -46,6 +46,8 @@ class Train(OnRay):
     resume: bool = False
     """Continue the run in --out if it has learnt something, else start one. Steps that have grown
     (--set steps=N, --scale) train a finished run for longer."""
+    overwrite: bool = False
+    """Replace the run in --out, also a finished one."""
     seed: int = 0
     """The root of every random stream."""
     flat: bool = False

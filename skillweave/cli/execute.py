@@ -16,7 +16,7 @@ from skillweave import recipes
 from skillweave.api import Agent, Hierarchy, Run
 from skillweave.api.hub import pull_run, push_run
 from skillweave.api.loading import ASK, declared_in, load_from
-from skillweave.api.planning import mission_words
+from skillweave.api.planning import lacking_features, mission_words
 from skillweave.cli import commands
 from skillweave.cli.demo import demo
 from skillweave.cli.output import print_result, run_words, save_score
@@ -159,7 +159,10 @@ def _plan(command: commands.Plan) -> None:
         run = _load_with_code(path, command.recipe)
     else:
         run = _load_target(command)
-    as_task(command.mission, mission_words(run.hierarchy, {}))  # errors come before the recording
+    # Errors come before the recording.
+    as_task(command.mission, mission_words(run.hierarchy, {}))
+    if words := lacking_features(run.hierarchy, run.policy):
+        raise DeclarationError(words)
     if not run.has_calls:
         if not command.quiet:
             say(f"there is no log of calls: recording {command.steps:,} steps")

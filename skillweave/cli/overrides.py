@@ -39,6 +39,8 @@ ALGORITHMS = ("algorithm", "selector", "flat")
 SELECTIONS: dict[str, Any] = {"tournament": Tournament, "truncation": Truncation}
 
 
+_PART = re.compile(r"(skills\.[^.]+|together)\.steps|apart\.(skill|selector)_steps")
+"""Names of the budgets of parts."""
 _LINEAR = re.compile(r"[lL]inear\(([^,()]*,[^,()]*)\)")
 
 
@@ -52,6 +54,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
     """
     configs: dict[tuple[str, ...], dict[str, str]] = {}
     kinds: dict[tuple[str, ...], str] = {}
+    steps = declaration.steps
     for setting in overrides:
         name, sign, text = (part.strip() for part in setting.partition("="))
         if not sign:
@@ -86,7 +89,31 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
         if not is_dataclass(config):
             raise DeclarationError(_without_settings(next(iter(changes)), owner))
         _set_config(declaration, owner, replaced(config, by_path))
+    names = [setting.partition("=")[0].strip() for setting in overrides]
+    if "steps" in names and declaration.steps:
+        _set_total(declaration, declaration.steps, steps, list(filter(_PART.fullmatch, names)))
     declaration.__post_init__()
+
+
+def _set_total(
+    declaration: Declaration, total: int, before: int | None, parts: Sequence[str]
+) -> None:
+    """Scale the budgets of a declaration that sets some itself, so that ``total`` is trained.
+
+    Args:
+        before: the declaration's own ``steps``.
+        parts: names of budgets that were set, too.
+    """
+    trained, stages = declaration.total_steps, len(declaration.budgets())
+    if not trained or abs(trained - total) <= stages:  # shares are rounded
+        return
+    if parts:
+        raise DeclarationError(
+            f"steps={total} is for all training, but with {', '.join(parts)} it would be "
+            f"{trained} steps: leave out one or the other"
+        )
+    declaration.steps = before
+    declaration.scale(total / declaration.total_steps)
 
 
 def list_settings(declaration: Declaration) -> dict[str, Any]:

@@ -32,10 +32,15 @@ def train(command: commands.Train) -> None:
     if command.versus_flat and not command.evaluate:
         raise DeclarationError("--versus-flat compares scores: let --evaluate be at least 1")
     flat_out = command.out and command.out.with_name(f"{command.out.name}-flat")
-    if command.versus_flat and flat_out and flat_out.exists() and not command.resume:
+    if (
+        command.versus_flat
+        and flat_out
+        and flat_out.exists()
+        and not (command.resume or command.overwrite)
+    ):
         raise RunError(f"{flat_out} is there already: the flat agent would be written there")
-    if command.resume and command.out is None:
-        raise DeclarationError("--resume continues a run: name its directory, --out DIR")
+    if (command.resume or command.overwrite) and command.out is None:
+        raise DeclarationError("--resume and --overwrite need a run: name its directory, --out DIR")
     hierarchy = recipes.load(command.recipe)
     apply_overrides(hierarchy, command.set)
     hierarchy.scale(command.scale)
@@ -81,6 +86,7 @@ def _trained(
         return hierarchy.train(
             out,
             resume=command.resume,
+            overwrite=command.overwrite,
             seed=command.seed,
             flat=flat,
             quiet=command.quiet,

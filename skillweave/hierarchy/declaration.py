@@ -25,6 +25,7 @@ from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
+from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
@@ -73,7 +74,8 @@ class Declaration(Nestable):
     """Steps of a skill before the selector decides again; None: until the skill ends by itself."""
     steps: AtLeastOne | None = None
     """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
-    or ``together`` sets replaces that part and leaves the others as they are."""
+    or ``together`` sets replaces that part and leaves the others as they are; where all parts are
+    set, leave this out."""
     learn: Literal["together", "apart", "apart, then together"] = "together"
     """Train skills and selector from the same steps ("together"); or skills one by one, then the
     selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
@@ -103,6 +105,9 @@ class Declaration(Nestable):
     predicates: Mapping[str, Any] = field(default_factory=dict)
     """Words for missions as texts (``Run.plan``): functions of observations or of a ``Step``, by
     name. The name of each skill is such a word already: its ``success``."""
+    features: Any = None
+    """By what plans compare observations, as for ``planning.Planner``: a function of observations
+    (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
     _caller: ClassVar[Caller] = "hierarchy"
@@ -129,12 +134,25 @@ class Declaration(Nestable):
                 f"predicates: {same[0]!r} is the name of a skill, too, so a mission could mean "
                 "either, the skill's success or the predicate: give the predicate another name"
             )
+        check_features(self.features, "Hierarchy")
         check_level(self._level("", None))
         hierarchies_of(self)  # raises where one contains itself
         for skill in self.skills:
             if isinstance(skill.policy, Declaration):
                 skill.policy.validate()
         check_nested(roles_of(self))  # last: messages then call every skill by its path
+        if self.steps not in (None, self.total_steps) and not self._splits_steps():
+            raise DeclarationError(
+                f"steps is {self.steps:,}, but all its parts have steps of their own, "
+                f"{self.total_steps:,} in all: leave out steps, or those of skills, "
+                "Apart(skill_steps, selector_steps) and Together(steps)"
+            )
+
+    def _splits_steps(self) -> bool:
+        """Return True if ``steps`` changes the budget of a stage, or no stage is trained."""
+        other = copy.copy(self)
+        other.steps = 2 * (self.steps or DEFAULT_STEPS)
+        return other.total_steps != self.total_steps or not self.total_steps
 
     def _level(self, path: str, as_skill: Skill | None) -> Level:
         """Return the settings of this hierarchy, without those of hierarchies below."""
@@ -199,7 +217,9 @@ class Declaration(Nestable):
                 if is_trained(skill):
                     skill.steps = _scaled(skill.steps, factor)
             # A hierarchy below without its own total shares the outer one.
-            steps = hierarchy.steps or (None if path else DEFAULT_STEPS)
+            steps = hierarchy.steps
+            if not path and steps is None and self._splits_steps():
+                steps = DEFAULT_STEPS
             hierarchy.steps = _scaled(steps, factor)
             hierarchy.apart = replace(
                 hierarchy.apart,

@@ -34,6 +34,12 @@ FAR = 100.0
 Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
 
+FEATURES = (
+    "declare Hierarchy(features=...), or give features= to plan(): a function from observations "
+    "(n, …) to numbers (n, F)"
+)
+"""Advice where images cannot be compared."""
+
 
 def check_features(features: Any, who: str) -> None:
     """Raise a DeclarationError where features have a wrong type; ``who`` begins the message."""
@@ -104,8 +110,8 @@ class FeatureMap(Standard):
         if self._codec is not None:
             if self._codec.images and features is None:
                 raise DeclarationError(
-                    f"{who} sees images, and images have no distance that means something; give "
-                    "features=, a function from observations to numbers"
+                    f"{who} sees images, and images have no distance that means something; "
+                    + FEATURES
                 )
             self._places = self._checked_places(features, self._codec.size)
         raw = self.raw(known)

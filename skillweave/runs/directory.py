@@ -90,6 +90,18 @@ FOLDERS = {
     "tensorboard": ("events.out.tfevents.*",),
 }
 """Folders of such files. ``policies`` holds copies of ready policies, too."""
+RESULTS = (
+    "checkpoint*.safetensors",
+    CALLS,
+    "evaluation*.json",
+    "report.html",
+    "film*.gif",
+    "hierarchy.gif",
+    "agent.gif",
+)
+"""Files that are added later."""
+IN_FOLDERS = ("*.safetensors", TEMPORARY, "events.out.tfevents.*", "*.png", "*.svg")
+"""Files in the folders of a run, beside copies of ready policies."""
 LEFT = ("wandb",)
 """Folders of a run's trackers; they stay, because they belong to the tracker."""
 LOCK_TEXT = re.compile(rb"(\d+ [^\n]*\n)?")
@@ -129,12 +141,14 @@ class RunDirectory:
         first: First | None = None,
         *,
         hold: bool = False,
+        overwrite: bool = False,
     ) -> RunDirectory:
         """Write a new run, in place of one that has not learnt anything.
 
         Args:
             first: writes files of the run before ``run.json`` exists.
             hold: keep the run locked, to train it; ``close`` releases it.
+            overwrite: replace any run; files in its directory that no run writes stay there.
 
         Raises:
             RunError: the directory holds a run that has learnt something or that another
@@ -152,12 +166,12 @@ class RunDirectory:
         before = cls.open(path) if os.path.lexists(path / "run.json") else None
         if before is not None:
             check_no_links(path)
-            _check_replaceable(before)
-        _check_ours(path, before)  # before the lock is written there
+        if before is None or not overwrite:
+            _check_replaceable(path, before)  # before the lock is written there
         lock = Lock(path)
         try:
             if before is not None:
-                cls._clear_dead(path, lock)
+                cls._clear_dead(path, lock, overwrite)
             created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
             content = {"versions": versions(), "created": created, "id": identity(manifest)}
             run = cls(path, content | manifest)
@@ -178,18 +192,17 @@ class RunDirectory:
         return run
 
     @classmethod
-    def _clear_dead(cls, path: Path, lock: Lock) -> None:
-        """Remove a run that has not learnt anything; it is locked."""
+    def _clear_dead(cls, path: Path, lock: Lock, overwrite: bool) -> None:
+        """Remove a run that has not learnt anything, or any run; it is locked."""
         if not lock.exclusive:
             raise RunError(
-                f"{path} holds a run that has not learnt anything yet, and this system has no "
-                "locks that show whether a process uses it. Delete it if none does, or choose "
-                "another directory"
+                f"{path} holds a run, and this system has no locks that show whether a process "
+                "uses it. Delete it if none does, or choose another directory"
             )
         run = cls.open(path)
-        _check_replaceable(run)  # another process may have trained it until now
-        _check_ours(path, run)
-        _clear_run(path)
+        if not overwrite:  # another process may have trained it until now
+            _check_replaceable(path, run)
+        _clear_run(run)
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
@@ -526,39 +539,38 @@ def file_name(path: str) -> str:
 # Directories that a new run may take: an empty one, or one whose run has not learnt anything
 
 
-def _check_replaceable(run: RunDirectory) -> None:
-    """Raise a RunError where a new run would replace results of training."""
-    if run.finished:
-        raise RunError(
-            f"{shown_path(run.path)} holds a finished run, which is never replaced. Load it: "
-            f"{load_words(run)}; or give more steps and continue it: {resume_words(run)}; or "
-            "choose another directory"
-        )
-    if run.has_learnt:
-        raise RunError(
-            f"{shown_path(run.path)} holds an unfinished run, {saved_words(run)}. Continue it: "
-            f"{resume_words(run)}; or choose another directory"
-        )
-
-
-def _check_ours(path: Path, run: RunDirectory | None = None) -> None:
-    """Raise a RunError where a directory holds files that training did not write.
+def _check_replaceable(path: Path, run: RunDirectory | None) -> None:
+    """Raise a RunError where a new run would replace results, or files that training did not write.
 
     Args:
         run: the run in it; None: it holds no run.
     """
-    skills = () if run is None else run.manifest.get("skills", ())
-    copies = tuple(f"{s['name'].replace('/', '.')}.*" for s in skills)
+    replace = "choose another directory; or replace it: overwrite=True, --overwrite"
+    if run is not None and run.finished:
+        raise RunError(
+            f"{shown_path(run.path)} holds a finished run. Load it: {load_words(run)}; or give "
+            f"more steps and continue it: {resume_words(run)}; or {replace}"
+        )
+    if run is not None and run.has_learnt:
+        raise RunError(
+            f"{shown_path(run.path)} holds an unfinished run, {saved_words(run)}. Continue it: "
+            f"{resume_words(run)}; or {replace}"
+        )
     if not (path / "run.json").is_file():
         lock = path / LOCK
         is_lock = lock.is_file() and not lock.is_symlink() and lock.stat().st_size < 300
         if any(path.iterdir()) and not (is_lock and LOCK_TEXT.fullmatch(lock.read_bytes())):
             raise RunError(f"{path} exists and is not an empty directory; choose another")
-    for foreign in _foreign(path, copies):
+    for foreign in _foreign(path, () if run is None else _copies(run)):
         raise RunError(
             f"{path} holds {foreign.relative_to(path)}, which is no file of a run that has just "
             "started, so nothing there is replaced; choose another directory"
         )
+
+
+def _copies(run: RunDirectory) -> tuple[str, ...]:
+    """Return patterns of the files of ready policies in a run."""
+    return tuple(f"{s['name'].replace('/', '.')}.*" for s in run.manifest.get("skills", ()))
 
 
 def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:
@@ -579,19 +591,21 @@ def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:
                     yield inner
 
 
-def _clear_run(path: Path) -> None:
-    """Remove the files of a run that has not learnt anything, after ``_check_ours``.
+def _clear_run(run: RunDirectory) -> None:
+    """Remove the files of a run; others stay.
 
     Raises:
         RunError: a file cannot be removed.
     """
-    remove(path / "run.json")  # first: without it, the other files have no meaning
-    for entry in list(path.iterdir()):
-        if entry.name in FOLDERS:
-            for inner in sorted(entry.rglob("*"), reverse=True):
-                inner.rmdir() if inner.is_dir() else remove(inner)
-            entry.rmdir()
-        elif entry.name != LOCK and entry.name not in LEFT:
+    remove(run.path / "run.json")  # first: without it, the other files have no meaning
+    for entry in list(run.path.iterdir()):
+        if entry.name in (*FOLDERS, "states", FINAL, "plots") and entry.is_dir():
+            for inner in (*sorted(entry.rglob("*"), reverse=True), entry):
+                if inner.is_file() and _fits(inner, (*IN_FOLDERS, *_copies(run))):
+                    remove(inner)
+                with suppress(OSError):  # other files, and folders that hold some, stay
+                    inner.rmdir()
+        elif entry.name != LOCK and entry.is_file() and _fits(entry, (*FILES, *RESULTS)):
             remove(entry)
 
 

@@ -462,6 +462,71 @@ def test_a_plan_without_a_log_records_one(call: Call, trained: Trained, tmp_path
     assert call("log", trained.flat_run, "--recipe", trained.coded).code == 1
 
 
+PICTURES = """
+import gymnasium as gym
+import numpy as np
+import skillweave as sw
+
+
+class Line(gym.Env):
+    observation_space = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.x = 0, int(self.np_random.integers(3, 6))
+        return self.picture(), {}
+
+    def step(self, action):
+        self.t, self.x = self.t + 1, min(7, max(0, self.x + 2 * int(action) - 1))
+        return self.picture(), 0.0, False, self.t >= 20, {}
+
+    def picture(self):
+        picture = np.zeros((8, 8, 1), np.uint8)
+        picture[:, self.x] = 255
+        return picture
+
+
+class Left(sw.Skill):
+    max_steps = 2
+
+    def policy(self, obs):
+        return np.zeros(len(obs), np.int64)
+
+
+class Right(Left):
+    def policy(self, obs):
+        return np.ones(len(obs), np.int64)
+
+
+hierarchy = sw.Hierarchy(
+    sw.EnvSpec(Line, engine="sync"),
+    [Left(), Right()],
+    selector=lambda obs: ["left"] * len(obs),
+    predicates={"end": lambda obs: obs[:, 0, 7, 0] > 0},
+)
+"""
+
+
+def test_a_world_of_images_is_planned_by_declared_features(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "blind.py").write_text(PICTURES)
+    seeing = PICTURES.replace(
+        "    predicates", "    features=lambda o: o[:, 0, :, 0].argmax(1),\n    predicates"
+    )
+    (tmp_path / "seeing.py").write_text(seeing)
+    run = tmp_path / "run"
+    assert call("train", tmp_path / "blind.py", "-o", run, "--evaluate", 0).code == 0
+    answer = call("plan", run, "end", "--recipe", tmp_path / "blind.py")
+    assert (answer.code, "features" in answer.err) == (1, True)
+    assert not (run / "calls.safetensors").exists(), "they are missed before recording"
+    with pytest.warns(UserWarning, match="features"):
+        call("log", run, "--recipe", tmp_path / "blind.py", "--steps", 400)
+    arguments = ("--recipe", tmp_path / "seeing.py", "--episodes", 5, "--json")
+    planned = call("plan", run, "end", *arguments)
+    assert planned.code == 0, planned.err
+    assert planned.json["success_rate"] == 1.0
+
+
 def test_info_tells_the_latest_evaluation_as_evaluate_did(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:

@@ -15,6 +15,7 @@ from skillweave import (
     SkillweaveError,
     Together,
 )
+from skillweave.cli.overrides import apply_overrides
 
 
 class One(Skill):
@@ -38,7 +39,7 @@ def declare(*skills, **how) -> Hierarchy:
 CASES = {
     "together": ({"steps": 900}, {"together": 900}),
     "by default, a million": ({}, {"together": 1_000_000}),
-    "a budget of its own": ({"steps": 900, "together": Together(steps=50)}, {"together": 50}),
+    "a budget of its own": ({"together": Together(steps=50)}, {"together": 50}),
     "apart: a share for each skill, two for the selector": (
         {"steps": 400, "learn": "apart"},
         {"one": 100, "two": 100, "selector": 200},
@@ -66,6 +67,37 @@ def test_steps_are_split_as_the_hierarchy_learns(case):
     assert found.total_steps == sum(budgets.values())
     assert {s.name: s.budget for s in found.stages()} == budgets
     assert found.plain_agent().steps == found.total_steps
+
+
+PARTS = [
+    {"together": Together(steps=50)},
+    {"learn": "apart", "apart": Apart(skill_steps=7, selector_steps=8)},
+]
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_a_total_beside_all_its_parts_is_refused(parts):
+    with pytest.raises(SkillweaveError, match="leave out steps"):
+        declare(steps=900, **parts)
+    found = declare(**parts)
+    declare(steps=found.total_steps, **parts)
+    found.scale(2.0)
+    found.validate()
+
+
+@pytest.mark.parametrize("parts", [{}, *PARTS, {"learn": "apart", "apart": Apart(skill_steps=7)}])
+def test_steps_set_by_name_are_the_total_and_keep_the_shares(parts):
+    before, found = declare(**parts), declare(**parts)
+    apply_overrides(found, ["steps=500_000"])
+    assert found.total_steps == pytest.approx(500_000, abs=3)
+    for name, steps in before.budgets().items():
+        assert found.budgets()[name] == pytest.approx(steps * 5e5 / before.total_steps, abs=3)
+
+
+def test_a_total_that_contradicts_a_part_by_name_is_refused():
+    with pytest.raises(SkillweaveError, match=r"apart\.skill_steps"):
+        apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=7"])
+    apply_overrides(declare(learn="apart"), ["steps=400", "apart.skill_steps=100"])
 
 
 def test_a_skills_own_steps_replace_its_part():

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -17,7 +18,7 @@ from small_runs import ON, Left, StopAt, Stopped, interrupt_at_checkpoint, new_r
 import skillweave as sw
 from skillweave import Agent, EnvSpec, Hierarchy
 from skillweave.cli.main import main
-from skillweave.errors import RunError
+from skillweave.errors import RunError, SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.lock import Lock
@@ -195,6 +196,69 @@ def test_a_system_without_locks_replaces_nothing(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("skillweave.runs.lock.fcntl", None)
     with pytest.raises(RunError, match="has no locks that show whether a process uses it"):
         declare().train("run", quiet=True)
+
+
+# Runs that are overwritten
+
+
+def entries(path: str) -> dict[str, bytes]:
+    """By file below a folder, its content; of files with times, nothing."""
+    files = {p.relative_to(path): p for p in Path(path).rglob("*") if p.is_file()}
+    return {
+        str(k): p.read_bytes() if p.parent.name == "policies" else b"" for k, p in files.items()
+    }
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_run_is_overwritten_where_that_is_asked(plain: bool) -> None:
+    def train(path: str, **how: Any) -> None:
+        if plain:
+            sw.train_agent(CARTPOLE, ON, 64, path, quiet=True, **how)
+        else:
+            declare().train(path, quiet=True, **how)
+
+    old = declare().train("run", quiet=True)
+    old.evaluate(2, save=True)
+    old.log_calls(100)
+    own = {"notes.txt": b"", "policies/mine.onnx": b"years of work"}
+    for name, content in own.items():
+        Path("run", name).write_bytes(content)
+    with pytest.raises(RunError, match="overwrite=True"):
+        train("run", seed=1)
+    for path in ("run", "other"):
+        train(path, seed=1, overwrite=True)
+    assert entries("run") == entries("other") | own
+
+
+def test_an_unfinished_run_is_overwritten_and_a_run_may_start_from_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with monkeypatch.context() as patched:
+        interrupt_at_checkpoint(patched, 1)
+        with pytest.raises(KeyboardInterrupt):
+            declare(640).train("run", checkpoint_every=64, quiet=True)
+    Path("plain.py").write_text(RECIPE)
+    assert main(["train", "plain.py", "-o", "run", "--overwrite", "--evaluate", "0"]) == 0
+    run = declare().train("run", overwrite=True, start_from="run", quiet=True)
+    assert sw.load(run.path, declare()).info()["seed"] == 0
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ({"run_dir": "locked", "resume": True}, "leave out one"),
+        ({}, "name its directory"),
+        ({"run_dir": "."}, "not an empty directory"),
+        ({"run_dir": "locked"}, "is being trained"),
+    ],
+)
+def test_other_directories_are_not_overwritten(how: dict[str, Any], says: str) -> None:
+    dead_run(Path("locked"))
+    before, lock = entries("."), Lock(Path("locked"))
+    with pytest.raises(SkillweaveError, match=says):
+        declare().train(overwrite=True, quiet=True, **how)
+    lock.release()
+    assert entries(".") == before
 
 
 # What is said of runs that are kept
