@@ -158,7 +158,7 @@ class Collector:
         return found | prefixed("engine", self.engine.state())
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says: play the open episodes again.
+        """Restore the open episodes of ``state``: play them again.
 
         Returns:
             (k,) environments that start again, as they did not repeat themselves.

@@ -50,14 +50,15 @@ class Collectors:
         return joined_states([part.state() for part in self.parts])
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; (k,) environments that start again."""
+        """Restore the open episodes of ``state``; return (k,) environments that start again."""
         states = split_states(state, len(self.parts))
         return self._columns([p.restore(s) for p, s in zip(self.parts, states, strict=True)])
 
     def differing(self) -> Array:
         """(k,) environments that are not where they were, since they were lost with a worker.
 
-        Learners have seen them elsewhere, so what was open there must not go on. Told once.
+        Learners have seen them elsewhere, so what was open there must not go on. Each is
+        returned once.
         """
         return np.empty(0, np.int64)
 

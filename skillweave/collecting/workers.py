@@ -181,7 +181,7 @@ class Workers:
         return states
 
     def stand(self, states: Sequence[dict[str, Array]]) -> list[Array]:
-        """Stand where ``states`` say; of each, environments that start again."""
+        """Restore the open episodes of each worker; return environments that start again."""
         self._past = []
         return self.ask("restore", states)
 
@@ -289,7 +289,7 @@ class WorkerCollectors(Workers, Collectors):
         return joined_states(self.states())
 
     def restore(self, state: dict[str, Array]) -> Array:
-        """Stand where ``state`` says; (k,) environments that start again."""
+        """Restore the open episodes of ``state``; return (k,) environments that start again."""
         return self._columns(self.stand(split_states(state, len(self._workers))))
 
     def _did_again(self, what: str, found: dict[int, Any]) -> None:

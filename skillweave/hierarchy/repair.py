@@ -137,7 +137,7 @@ def event_of(skill: Skill, done: Mapping[str, Any] | None) -> Callable[[Step], A
 
 
 def eager(skill: Skill, holds: Callable[[Step], Array], bonus: float, rest: float) -> Skill:
-    """Return a skill that is also paid for its event, so that it hurries.
+    """Return a skill that is also paid while its event holds, so that it gets there quickly.
 
     Its own reward may be content with a call that comes too late.
 

@@ -81,7 +81,7 @@ class Blame:
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
-            parts.append(f"So {self.skill!r} has to learn from there")
+            parts.append(f"So {self.skill!r} has to learn to start there")
         elif not np.isfinite(self.best):
             parts.append(
                 f"These are too few calls to say which skill is to blame (at least {LEAST})"
@@ -94,9 +94,9 @@ class Blame:
             )
         else:
             parts.append(
-                f"Other ends of {self.after!r} would not do: from the best third of them "
-                f"{self.skill!r} is done in {self.best:.0%}. So {self.skill!r} has to learn from "
-                "there"
+                f"It would not help if {self.after!r} ended elsewhere: from the best third of its "
+                f"ends {self.skill!r} is done in {self.best:.0%}. So {self.skill!r} has to learn "
+                "to start there"
             )
         return ". ".join(parts) + "."
 

@@ -22,7 +22,7 @@ PER_FEATURE = 0.25
 
 @checked_names
 class Explorer(Memoryless):
-    """A selector for ``record_calls`` that seeks calls unlike those of the log.
+    """A selector for ``record_calls`` that prefers calls which differ from the logged ones.
 
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the
     most that can be, 1; other calls are worth what they lead to (R-max: Brafman & Tennenholtz

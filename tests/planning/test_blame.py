@@ -41,8 +41,8 @@ def test_the_second_must_learn_where_no_end_would_do() -> None:
     found = log("never").blame("b", "a")
     assert not found.first
     assert (found.rate, found.calls) == (0.0, 120)
-    assert "Other ends of 'a' would not do" in str(found)
-    assert str(found).endswith("So 'b' has to learn from there.")
+    assert "It would not help if 'a' ended elsewhere" in str(found)
+    assert str(found).endswith("So 'b' has to learn to start there.")
 
 
 def test_none_is_to_blame_where_it_works() -> None:
