@@ -81,21 +81,6 @@ def test_every_public_name_stands_in_the_reference_once() -> None:
     assert sorted(found) == sorted(sw.__all__)
 
 
-def is_word(text: str) -> bool:
-    return any(character.isalnum() for character in text)
-
-
-def test_pages_for_users_are_short() -> None:
-    """Count the words of all pages but the reference and the pages for developers.
-
-    Code and commands count; bars and rules of tables are no words.
-    """
-    words = {name(page): sum(map(is_word, page.read_text().split())) for page in PAGES}
-    users = {page: n for page, n in words.items() if not page.startswith(FOR_OTHERS)}
-    assert len(users) > 40
-    assert sum(users.values()) <= 22_600, sorted(users.items(), key=lambda item: -item[1])[:5]
-
-
 @pytest.mark.parametrize("page", sorted((ROOT / "docs/suites").glob("*.md")), ids=name)
 def test_a_page_about_a_suite_is_short_and_names_its_command(page: Path) -> None:
     text = page.read_text()
