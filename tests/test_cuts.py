@@ -29,8 +29,8 @@ from skillweave import (
     Together,
     TrainDefaults,
 )
+from skillweave.collecting import interrupts
 from skillweave.runs.directory import RunDirectory
-from skillweave.training import interrupts
 from skillweave.training.loop import _Loop
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")

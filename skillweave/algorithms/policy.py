@@ -161,6 +161,7 @@ class AgentHeader(TypedDict):
     stage: NotRequired[str]
     env: NotRequired[str]
     env_kwargs: NotRequired[dict[str, Any]]
+    code: NotRequired[dict[str, str]]
     recipe: NotRequired[str | None]
     about: NotRequired[dict[str, Any]]
 

@@ -71,7 +71,8 @@ from skillweave.hierarchy.weights import (
 from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
-from skillweave.planning import CallLog, Planner, record_calls
+from skillweave.planning import CallLog, Planner
+from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -855,16 +856,14 @@ class Run:
         Raises:
             DeclarationError: this is a plain agent, or an argument is wrong.
             RunError: the run's file of calls is damaged, or cannot be written.
+            Interrupted: Ctrl-C has stopped it; what was recorded is kept.
         """
         spec = self._own_spec()
         if words := lacking_features(self.hierarchy, self.policy):
             notice(words)
         seed, info = self._calls.begin(self.policy, seed, info)
-        log = record_calls(
-            spec, self.policy, steps, choose=choose, num_envs=num_envs, seed=seed, info=info
-        )
-        self._calls.add(log)
-        return log
+        how: dict[str, Any] = {"own_rewards": False, "keep": self._calls.add}
+        return with_returns(spec, self.policy, steps, choose, num_envs, seed, info, **how)[0]
 
     @property
     def calls(self) -> CallLog:
@@ -875,7 +874,7 @@ class Run:
             RunError: none were recorded, or their file is damaged or of other skills.
         """
         _ = self.hierarchy
-        return self._calls.read(self.policy)
+        return self._calls.read(self.policy, self._own_spec())
 
     @property
     def has_calls(self) -> bool:
@@ -909,7 +908,10 @@ class Run:
         if "skills" in settings:
             raise DeclarationError("plan() takes no skills: they are the run's own")
         declared = self.hierarchy
-        log = self.calls if log is None else log
+        if log is None:
+            log = self.calls
+        elif isinstance(log, CallLog):
+            log.check_environment(self._own_spec())
         if isinstance(task, str):
             words = settings.get("predicates") or {}
             if isinstance(words, Mapping):  # else the planner says what it is

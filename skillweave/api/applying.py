@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from skillweave.collecting.user_code import environment_texts, notice_changes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy import training
@@ -126,13 +127,17 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
 
 
 def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
-    """Raise a RunError where a run is not one of this declaration."""
+    """Raise a RunError where a run is not one of this declaration; notice other code."""
+    code = environment_texts(declared.spec)
     if run.manifest["kind"] == "hierarchy":
         if isinstance(declared, PlainAgent):
             raise RunError(f"{run.path} is the run of a hierarchy, not of a plain agent")
-        _check_roles(roles_of(declared), run)
+        roles = roles_of(declared)
+        _check_roles(roles, run)
+        code = roles.code
     what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
     _check_place(declared.spec, what, run)
+    notice_changes(run.manifest.get("code", {}), code, f"{run.path} was trained")
 
 
 def _check_roles(roles: Roles, run: RunDirectory) -> None:

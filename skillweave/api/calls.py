@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.messages import shown_path, whole_number
 from skillweave.planning import CallLog
@@ -52,7 +53,7 @@ class RunCalls:
         """
         if self._is_own():
             must_be_own(self._path)  # an error comes before anything is played
-            so_far = log_so_far(RunDirectory.open(self._path))
+            so_far = self._with_memory(log_so_far(RunDirectory.open(self._path)))
         else:
             so_far = self._read()
         if so_far is not None and (skills := skills_below(policy)) is not None:
@@ -66,17 +67,12 @@ class RunCalls:
         """Keep recorded calls.
 
         Raises:
-            RunError: they cannot be written; they are kept in memory.
+            RunError: they cannot be written; they stay in memory until they can.
         """
+        self._memory = log if self._memory is None else joined(self._memory, log)
         if self._is_own():
-            try:
-                save_calls(RunDirectory.open(self._path), log)
-            except RunError:
-                self._memory = log
-                raise
-            return
-        so_far = self._read()
-        self._memory = log if so_far is None else joined(so_far, log)
+            save_calls(RunDirectory.open(self._path), self._memory)
+            self._memory = None
 
     def has_any(self) -> bool:
         """Return whether there are calls.
@@ -86,8 +82,8 @@ class RunCalls:
         """
         return self._read() is not None
 
-    def read(self, policy: Policy) -> CallLog:
-        """Return all calls of a policy's skills.
+    def read(self, policy: Policy, spec: EnvSpec) -> CallLog:
+        """Return all calls of a policy's skills; notice where they are of another environment.
 
         Raises:
             RunError: there are none, or they are of other skills.
@@ -97,12 +93,18 @@ class RunCalls:
             raise RunError(f"{shown_path(self._path)} has no log of calls; {RECORD}")
         if (skills := skills_below(policy)) is not None:
             log.check_skills(skills, learning=True)  # how often they succeeded may be counted
+        log.check_environment(spec)
         return log
 
     def _read(self) -> CallLog | None:
-        if self._memory is None and self._path.is_dir():
-            return load_calls(RunDirectory.open(self._path))
-        return self._memory
+        is_run = self._path.is_dir()
+        return self._with_memory(load_calls(RunDirectory.open(self._path)) if is_run else None)
+
+    def _with_memory(self, log: CallLog | None) -> CallLog | None:
+        """Return the calls of a file with those that are not in it."""
+        if log is None or self._memory is None:
+            return self._memory if log is None else log
+        return joined(log, self._memory)
 
     def _is_own(self) -> bool:
         """Return whether calls are kept in the run's directory."""

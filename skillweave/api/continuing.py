@@ -68,6 +68,7 @@ def prepared(
         sentences.append(f"the run continues as it began, with {log}")
     if not run.finished or max(_more(run.manifest["stages"], budgets).values()) > 0:
         run.begin(finished=True)
+        run.manifest["code"] = run.manifest.get("code", {}) | content["code"]  # as it goes on
     try:
         sentences += _grow(run, budgets)
     except BaseException:

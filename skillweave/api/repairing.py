@@ -110,7 +110,7 @@ def repair(
     reason += f" {found.shortage}" if found.shortage else ""
     entry["repair"]["blame"] = reason
     entry["repair"]["bonus"] = found.gain
-    content |= {"stages": [entry], "seed": seed}
+    content |= {"stages": [entry], "seed": seed, "code": roles.code}
     rehearsal = None
     role = roles[skill]
     assert role.skill is not None

@@ -13,6 +13,7 @@ from gymnasium import Space
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.collecting.user_code import notice_changes
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.paths import AGENT, decides
@@ -72,6 +73,12 @@ def starts(
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
     started = record_initial_policies(content["stages"], learnt, where)
+    for place in dict.fromkeys(places[name] for name in sorted(started)):
+        names = [name for name in started if places[name] == place]
+        skills = tuple(f"skill {name!r}" for name in names)
+        texts = content["code"].items()
+        now = {what: t for what, t in texts if " skill " not in what or what.endswith(skills)}
+        notice_changes(learnt[names[0]].code, now, f"{place} was trained")
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
             role = roles[name]

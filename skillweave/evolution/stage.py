@@ -18,6 +18,7 @@ from torch import Tensor
 
 from skillweave.algorithms.config import AlgorithmConfig, config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
+from skillweave.collecting import interrupts
 from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.fitness import FitnessEnvs
@@ -28,7 +29,6 @@ from skillweave.evolution.stacks import Member, Origin
 from skillweave.networks.config import Network
 from skillweave.runs.manifest import Generation
 from skillweave.seeding import Seeds
-from skillweave.training import interrupts
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
 from skillweave.types import Array, prefixed, unprefixed

@@ -18,6 +18,7 @@ from gymnasium import Space
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.user_code import Texts, environment_texts, skill_texts
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.settings import Apart, Guide, Selection
@@ -262,6 +263,12 @@ class Roles:
     def skills(self) -> dict[str, Skill]:
         """All skills by path; the skills of a hierarchy follow it."""
         return {role.path: role.skill for role in self.by_path.values() if role.skill is not None}
+
+    @property
+    def code(self) -> Texts:
+        """What the environment and the skills are made of, to be compared later."""
+        reflexes = [reflex for level in self.levels.values() for reflex in level.reflexes]
+        return environment_texts(self.spec) | skill_texts(self.skills, reflexes)
 
     def below(self, level: str) -> list[Role]:
         """Return the roles in a level, and in levels below it."""

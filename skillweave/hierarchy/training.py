@@ -19,6 +19,7 @@ from skillweave.hierarchy.select_best import resolve_greedy, select_best
 from skillweave.hierarchy.weights import check_parts
 from skillweave.ops.threads import torch_threads
 from skillweave.paths import SELECTOR, level_of
+from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
@@ -63,6 +64,7 @@ def manifest(
         "kind": "hierarchy",
         "env": roles.spec.name,
         "env_kwargs": roles.spec.json_kwargs,
+        "code": roles.code,
         "seed": seed,
         "checkpoint_every": how.checkpoint_every,
         "eval_every": how.eval_every,
@@ -208,6 +210,9 @@ def _ready(roles: Roles, run: RunDirectory) -> dict[str, Policy]:
         described = f"{run.path}: the selector" + ("" if path == SELECTOR else f" {path}")
         policies[path] = as_recorded(policy, entry.get(SELECTOR), lambda: None, described)
     for level in roles.levels.values():
+        for selector in (level.ready_selector, level.ready_guide):
+            if isinstance(selector, Planner):
+                selector.log.check_environment(level.spec)
         if (guide := level.restricting_guide) is not None:
             described = f"{run.path}: the guide" + (f" of {level.path}" if level.path else "")
             recorded = _entry_of(run, level.path).get("guide")

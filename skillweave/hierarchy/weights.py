@@ -14,6 +14,7 @@ from torch import Tensor
 
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.collecting.lengths import calls_from_json, calls_to_json
+from skillweave.collecting.user_code import Texts, environment_texts, notice_changes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy.assembly import assembled, own_parts_of, parts_of
@@ -36,7 +37,7 @@ from skillweave.types import Policy
 def write_agent(path: Path, spec: EnvSpec, policy: AgentPolicy) -> None:
     """Write the weights of a plain agent on the environment ``spec``."""
     weights, description = policy.to_file()
-    write_tensors(path, weights, description | _place(spec))
+    write_tensors(path, weights, description | _place(spec, environment_texts(spec)))
 
 
 def write_weights(
@@ -74,7 +75,7 @@ def write_weights(
     header = {
         "kind": "hierarchy",
         "recipe": recipe,
-        **_place(roles.spec),
+        **_place(roles.spec, roles.code),
         "skills": list(roles.skills),
         **levels.pop(""),
         "hierarchies": levels,
@@ -93,9 +94,9 @@ def _content_of(policy: Policy, name: str) -> dict[str, Tensor]:
     return {join(name, "content"): torch.tensor(numbers, device="cpu")}
 
 
-def _place(spec: EnvSpec) -> dict[str, Any]:
-    """Return the header entries of an environment."""
-    return {"env": spec.name, "env_kwargs": spec.json_kwargs}
+def _place(spec: EnvSpec, code: Texts) -> dict[str, Any]:
+    """Return the header entries of an environment, and of what it and the skills are made of."""
+    return {"env": spec.name, "env_kwargs": spec.json_kwargs, "code": code}
 
 
 def _calls_header(level: Level, policy: HierarchyPolicy) -> dict[str, Any]:
@@ -131,6 +132,7 @@ class HierarchyHeader(InnerHeader):
     kind: str
     env: str
     env_kwargs: dict[str, Any]
+    code: NotRequired[Texts]
     recipe: str | None
     skills: list[str]
     parts: dict[str, dict[str, Any]]
@@ -178,6 +180,7 @@ def read_agent(
         raise RunError(f"{path} holds something of kind {short(header['kind'])}, not a plain agent")
     if (env := header.get("env", spec.name)) != spec.name:
         raise RunError(f"{path} is of an agent on {shown(env)}, but this is on {spec.name}")
+    notice_changes(header.get("code", {}), environment_texts(spec), f"{path} was written")
     return AgentPolicy.from_file(tensors, header, str(path))
 
 
@@ -204,6 +207,7 @@ def read_weights(
             f"{path} is of skills {recorded_skills[:300]} on {header['env'][:100]}, but the "
             f"hierarchy has {', '.join(roles.skills)} on {roles.spec.name}"
         )
+    notice_changes(header.get("code", {}), roles.code, f"{path} was written")
     recorded_parts = header.get("own_parts", {})
     for name in roles.skills:
         check_same_part(roles, name, recorded_parts.get(name, {}), f"{path}: skill {name!r}")

@@ -5,7 +5,8 @@ Stands alone because it is a format of files, with its schema.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -14,6 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.user_code import Texts
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
 from skillweave.reading import fit
@@ -21,6 +23,7 @@ from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, Count
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
+    obs_codec,
     obs_dtype,
     obs_shape,
     space_from_json,
@@ -35,21 +38,6 @@ GOAL = "goal."
 PLAIN = ("checksums", "recurrent", "own_success")
 """Entries of the header with a value for each skill."""
 SPACES = ("observation", "action")
-TYPES = {
-    "choice": np.int64,
-    "end_reason": np.int8,
-    "succeeded": np.bool_,
-    "terminated": np.bool_,
-    "truncated": np.bool_,
-    "episode": np.int64,
-    "seed": np.int64,
-    "order": np.int64,
-    "age": np.int64,
-    "may_follow": np.bool_,
-    "offset": np.int64,
-    "reward": np.float32,
-}
-"""Types of all columns but observations and actions."""
 
 
 class LoggedRun(TypedDict):
@@ -75,6 +63,7 @@ class CallsHeader(TypedDict):
     info: list[str]
     goals: NotRequired[list[str]]
     """The skills that have goals."""
+    code: NotRequired[Texts]
     run: NotRequired[LoggedRun]
 
 
@@ -95,6 +84,7 @@ def write_calls(
     header = {
         "kind": KIND,
         **{name: list(about[name]) for name in ("skills", "lengths", *PLAIN)},
+        "code": about["code"],
         "sees": [None if places is None else list(places) for places in about["sees"]],
         **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
         "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
@@ -134,33 +124,16 @@ def _fields(
         raise ValueError("its lengths do not rise")
     if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
-    columns = {name: value.numpy() for name, value in tensors.items()}
+    places = obs_codec(spaces["observation_space"]).size
+    if any(place >= places for seen in header["sees"] for place in seen or ()):
+        raise ValueError(f"'sees' has places beyond the {places} of an observation")
     goals = tuple(header.get("goals", ()))
     if not set(goals) <= set(skills):
         raise ValueError("it has goals of other skills")
-    expected = {*TYPES, "start", "next_obs", "action", *(INFO + key for key in info)}
-    expected |= {GOAL + name for name in goals}
-    if columns.keys() != expected:
-        raise ValueError(f"it has the columns {', '.join(sorted(columns))}"[:300])
-    calls, steps = len(columns["choice"].reshape(-1)), len(columns["reward"].reshape(-1))
-    choices = len(skills) * max(1, len(lengths))
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(TYPES, (calls,))
-    shapes |= {"may_follow": (calls, choices), "offset": (calls + 1,), "reward": (steps,)}
-    for name, kind in TYPES.items():
-        _check(name, columns[name], shapes[name], np.dtype(kind))
-    for name, rows in (("start", calls), ("next_obs", steps)):
-        columns[name] = _packed(name, columns[name], spaces["observation_space"], rows)
-    acts = spaces["action_space"]
-    if obs_dtype(acts).fields is None:
-        _check("action", columns["action"], (steps, *(acts.shape or ())), None)
-    else:
-        columns["action"] = _packed("action", columns["action"], acts, steps)
-    for key in info:
-        _check(INFO + key, columns[INFO + key], (steps, *columns[INFO + key].shape[1:]), None)
-    for name in goals:
-        column = columns[GOAL + name]
-        _check(GOAL + name, column, (calls, *column.shape[1:2]), np.dtype(np.float64))
-    _check_values(columns, steps, choices)
+    columns = _columns(tensors, header | {"goals": goals}, spaces)
+    offset = columns["offset"]
+    if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
+        raise ValueError("'offset' is out of range")
     own = {name: value for name, value in columns.items() if not name.startswith((INFO, GOAL))}
     return (
         own
@@ -172,45 +145,73 @@ def _fields(
             "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
             "info": {key: columns[INFO + key] for key in info},
             "goals": {name: columns[GOAL + name] for name in goals},
+            "code": header.get("code", {}),
         }
     )
 
 
-def _check(name: str, x: Array, shape: tuple[int, ...], dtype: Any) -> None:
-    """Check a column's shape and type, and that its numbers are finite."""
-    if x.shape != shape or (dtype is not None and x.dtype != dtype):
+def _columns(
+    tensors: dict[str, Tensor], header: dict[str, Any], spaces: dict[str, gym.Space[Any]]
+) -> dict[str, Array]:
+    """Return the columns, each of the type, shape and range that it must have."""
+    of = {name: tuple(x.shape) for name, x in tensors.items()}
+    calls, steps = (math.prod(of.get(name, ())) for name in ("choice", "reward"))
+    choices = len(header["skills"]) * max(1, len(header["lengths"]))
+    obs, acts = obs_dtype(spaces["observation_space"]), obs_dtype(spaces["action_space"])
+    seen, acted = (obs_shape(space) for space in spaces.values())
+    free = -np.inf, np.inf
+    table: dict[str, tuple[Any, tuple[int, ...], float, float]] = {
+        "choice": (np.int64, (calls,), 0, choices - 1),
+        "end_reason": (np.int8, (calls,), 1, max(CallEnd)),
+        "succeeded": (np.bool_, (calls,), *free),
+        "terminated": (np.bool_, (calls,), *free),
+        "truncated": (np.bool_, (calls,), *free),
+        "episode": (np.int64, (calls,), 0, 2**62 - 1),
+        "seed": (np.int64, (calls,), -1, 2**31 - 1),
+        "order": (np.int64, (calls,), 0, 2**31 - 1),
+        "age": (np.int64, (calls,), 0, 2**31 - 1),
+        "may_follow": (np.bool_, (calls, choices), *free),
+        "offset": (np.int64, (calls + 1,), 0, steps),
+        "reward": (np.float32, (steps,), -LARGEST_REWARD, LARGEST_REWARD),
+        "start": (obs, (calls, *seen), *free),
+        "next_obs": (obs, (steps, *seen), *free),
+        "action": (acts if acts.fields else None, (steps, *acted), *free),
+    }
+    # Of these the number of columns is free, and the type of numbers that `info` holds.
+    table |= {k: (None, (steps, *of.get(k, ())[1:]), *free) for k in _named(INFO, header["info"])}
+    table |= {
+        k: (np.float64, (calls, *of.get(k, ())[-1:]), *free) for k in _named(GOAL, header["goals"])
+    }
+    if tensors.keys() != table.keys():
+        raise ValueError(f"it has the columns {', '.join(sorted(tensors))}"[:300])
+    return {name: _column(name, tensors[name], *row) for name, row in table.items()}
+
+
+def _named(prefix: str, names: Iterable[str]) -> list[str]:
+    return [prefix + name for name in names]
+
+
+def _column(
+    name: str, tensor: Tensor, dtype: Any, shape: tuple[int, ...], low: float, high: float
+) -> Array:
+    """Return a column; a ValueError says what is wrong.
+
+    Args:
+        dtype: None: any numbers. A structured one is read from the bytes of its rows.
+    """
+    try:
+        x = np.ascontiguousarray(tensor.numpy())
+    except TypeError:  # NumPy has no such type
+        raise ValueError(f"{name!r} is {tensor.dtype}") from None
+    fields = None if dtype is None else np.dtype(dtype).names
+    wanted = (np.uint8, (shape[0], dtype.itemsize)) if fields else (dtype or x.dtype, shape)
+    if (x.dtype, x.shape) != wanted or x.dtype.kind not in "biuf":
         raise ValueError(f"{name!r} is {x.dtype} {x.shape}")
-    if x.dtype.kind == "f" and not np.isfinite(x).all():
-        raise ValueError(f"{name!r} is not finite")
-
-
-def _packed(name: str, x: Array, space: gym.Space[Any], rows: int) -> Array:
-    """Return observations or actions as they were, structured ones from their bytes."""
-    dtype = obs_dtype(space)
-    if dtype.fields is None:
-        _check(name, x, (rows, *obs_shape(space)), dtype)
-        return x
-    _check(name, x, (rows, dtype.itemsize), np.dtype(np.uint8))
-    structured: Array = np.ascontiguousarray(x).view(dtype).reshape(rows)
-    for part in dtype.names or ():
-        numbers = structured[part]
+    if fields:
+        x = x.view(dtype).reshape(shape[0])
+    for numbers in [x[field] for field in fields] if fields else [x]:
         if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
             raise ValueError(f"{name!r} is not finite")
-    return structured
-
-
-def _check_values(columns: dict[str, Array], steps: int, choices: int) -> None:
-    """Check that numbers are in their ranges, and that columns agree."""
-    offset, choice = columns["offset"], columns["choice"]
-    in_range = {
-        "offset": offset[0] == 0 and offset[-1] == steps and bool((np.diff(offset) >= 1).all()),
-        "choice": bool(((choice >= 0) & (choice < choices)).all()),
-        "end_reason": bool(np.isin(columns["end_reason"], list(CallEnd)[1:]).all()),
-        "order": bool((columns["order"] >= 0).all()),
-        "age": bool(((columns["age"] >= 0) & (columns["age"] < 2**31)).all()),
-        "episode": bool(((columns["episode"] >= 0) & (columns["episode"] < 2**62)).all()),
-        "seed": bool(((columns["seed"] >= -1) & (columns["seed"] < 2**31)).all()),
-        "reward": bool((np.abs(columns["reward"]) <= LARGEST_REWARD).all()),
-    }
-    if wrong := [name for name, right in in_range.items() if not right]:
-        raise ValueError(f"{wrong[0]!r} is out of range")
+        if numbers.size and not (low <= numbers.min() and numbers.max() <= high):
+            raise ValueError(f"{name!r} is out of range")
+    return x

@@ -12,13 +12,19 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.user_code import (
+    Texts,
+    changes,
+    environment_texts,
+    notice_changes,
+    skill_texts,
+)
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.blame import Blame, blame
 from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
-from skillweave.planning.skill_code import code_of
-from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.spaces import obs_codec, same_space
@@ -60,6 +66,7 @@ class CallLog(CallColumns):
         info: by key, (T, …) values of the environment's ``info``.
         goals: by skill that has goals, (C, G) float64, the numbers of its calls' goals; in rows of
             other skills they mean nothing.
+        code: what the environment and the skills are made of (``collecting/user_code.py``).
     """
 
     @checked_names
@@ -172,12 +179,19 @@ class CallLog(CallColumns):
         if learning and LEARNING in self.checksums:
             return
         for name, now, then in zip(names, skill_checksums(skills), self.checksums, strict=True):
-            if not _alike(now, then):
+            if now != then:
                 raise RunError(
                     f"the skill {name!r} has changed since the log was recorded (it has learnt on, "
-                    "or its limits or its code are others), so its calls end elsewhere now; record "
-                    "a new log"
+                    "or its limits are others), so its calls end elsewhere now; record a new log"
                 )
+        if says := changes(self.code, skill_code(skills)):
+            raise RunError(
+                f"{says} since the log was recorded, so calls end elsewhere now; record a new log"
+            )
+
+    def check_environment(self, spec: EnvSpec) -> None:
+        """Give a notice where the log is of another environment, or the environment has changed."""
+        notice_changes(self.code, environment_texts(spec), "the log of calls was recorded")
 
     def check_spaces(self, observation: gym.Space[Any], action: gym.Space[Any]) -> None:
         """Raise a RunError where the log is of other spaces."""
@@ -230,11 +244,15 @@ def join(logs: Iterable[CallLog]) -> CallLog:
             )
         first.check_spaces(log.observation_space, log.action_space)
         for name, a, b in zip(first.skills, first.checksums, log.checksums, strict=True):
-            if not _alike(a, b):
+            if a != b:
                 raise RunError(
                     f"the skill {name!r} differs between the logs: it has learnt in between, or "
-                    "its limits or its code are others; join logs of the same skills"
+                    "its limits are others; join logs of the same skills"
                 )
+        if says := changes(first.code, log.code):
+            raise RunError(
+                f"between the logs, {says}; join logs of the same environment and skills"
+            )
         if log.own_success != first.own_success:
             raise RunError(
                 "of one log the skills' success() was known, of another not (its run was loaded "
@@ -275,8 +293,6 @@ def join(logs: Iterable[CallLog]) -> CallLog:
 def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[str, ...]:
     """Return a checksum of each skill: its policy, the limit of its calls, and the reflexes.
 
-    A second checksum is of the code of the user's classes and functions, if it is known.
-
     Args:
         learning: names of the skills that learn while their calls are recorded.
     """
@@ -295,16 +311,12 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
             own.append(str(part.to_json()))
         whole = repr([acts, skills.limit(i), skills.greedy, reflexes, *own])
         checksums.append(checksum(whole.encode()))
-        if not isinstance(skills.skills[i], RecordedSkill):
-            code = code_of(skills.skills[i], policy, skills.reflexes)
-            checksums[-1] += f" {checksum(repr(code).encode())}"
     return tuple(checksums)
 
 
-def _alike(now: str, then: str) -> bool:
-    """Return whether the checksums of a skill are equal, as far as both have them."""
-    shared = min(now.count(" "), then.count(" ")) + 1
-    return now.split(" ")[:shared] == then.split(" ")[:shared]
+def skill_code(skills: SkillSet) -> Texts:
+    """Return the code of skills that decides how their calls start and end."""
+    return skill_texts({s.name: s for s in skills.skills}, skills.reflexes, without="reward")
 
 
 def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, shortened
 from skillweave.types import Array, Step
@@ -64,6 +65,7 @@ class CallColumns:
     reward: Array
     info: dict[str, Array] = field(default_factory=dict)
     goals: dict[str, Array] = field(default_factory=dict)
+    code: Texts = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.choice)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -12,12 +12,13 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.collecting.call_end import CallEnd
+from skillweave.collecting.interrupts import deferred, requested
 from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, Interrupted
 from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
@@ -113,11 +114,16 @@ def with_returns(
     info: Sequence[str] = (),
     *,
     own_rewards: bool = True,
+    keep: Callable[[CallLog], None] | None = None,
 ) -> tuple[CallLog, Array]:
     """Return the log of ``record_calls``, and each call's ``Recorder.own_returns``, (C,).
 
     Args:
         own_rewards: compute them; else there are none, (0,).
+        keep: saves the log, also one that Ctrl-C has stopped.
+
+    Raises:
+        Interrupted: Ctrl-C has stopped the recording; the message says what was kept.
     """
     steps, num_envs = whole_number(steps, "steps", 1), whole_number(num_envs, "num_envs", 1)
     skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
@@ -136,17 +142,35 @@ def with_returns(
         selector = _selector(choose, skill_set, engine)
         spaces = engine.observation_space, engine.action_space
         check_size(steps, spaces)
-        recorder = Recorder(skill_set, spaces, num_envs, info=info, own_rewards=own_rewards)
+        recorder = Recorder(
+            skill_set, spaces, num_envs, info=info, own_rewards=own_rewards, spec=spec
+        )
         player = Player(skill_set, selector)
         rng = (seeds / "choices").numpy()
         sampled = isinstance(choose, RandomChoice) or (
             isinstance(choose, str) and choose == "random"
         )
         turn = Turn(not sampled, rng)
-        played = _play(recorder, engine, player, steps, turn, seeds.integer(), choose)
+        played: list[int] = []
+        # Without `keep` an interrupt may be one of the training around.
+        until, stops = (nullcontext(), bool) if keep is None else (deferred("now"), requested)
+        stopped = None
+        try:
+            with until:
+                _play(recorder, engine, player, steps, turn, seeds.integer(), choose, played, stops)
+        except KeyboardInterrupt as error:
+            stopped = error
         log = recorder.log()
-        returns = recorder.own_returns() if own_rewards else np.zeros(0)
-        return replace(log, seed=played[log.episode]), returns
+        log = replace(log, seed=np.array(played)[log.episode])
+        if keep is not None and len(log):
+            keep(log)
+        if stopped is not None:
+            if keep is None:
+                raise stopped
+            raise Interrupted(
+                f"stopped: {len(log):,} calls ({log.steps:,} steps) were recorded and are kept"
+            )
+        return log, recorder.own_returns() if own_rewards else np.zeros(0)
 
 
 class WithDrawnGoals(Memoryless):
@@ -236,14 +260,16 @@ def _play(
     turn: Turn,
     seed: int,
     choose: Any,
-) -> Array:
+    seeds: list[int],
+    stops: Callable[[], bool],
+) -> None:
     """Play until ``steps`` steps are recorded, then complete the open calls.
 
-    Returns:
-        The seeds of the episodes, in the order of their starts; −1: unknown, of EnvPool.
+    Args:
+        seeds: receives the seeds of episodes as they start; −1: unknown, of EnvPool.
+        stops: returns whether to stop at once.
     """
     n, feed, goals = engine.num_envs, TraceFeed([recorder]), goals_in(recorder.skills)
-    seeds: list[int] = []
     started = np.zeros(n, np.int64)  # episodes of each environment
 
     def begin(rows: Array) -> Array:
@@ -260,27 +286,28 @@ def _play(
     memory, obs = player.start(n), np.array(begin(np.arange(n)))
     turn.age = np.zeros(n, np.int64)
     rows, made, planned = np.arange(n), 0, 0
-    while len(rows):
-        here = obs[rows]
-        action = player.act(memory, rows, here, allowed_rows(engine.mask(), rows), turn)
-        raw = engine.step(action, rows)
-        turn.age[rows] += 1
-        step = raw.seen(here, action, turn.age[rows])
-        end = player.observe(memory, rows, step)
-        feed.add(rows, step, {"": {k: v[rows] for k, v in calls_in(memory, goals).items()}})
-        made += len(rows)
-        obs[rows] = raw.next_obs
-        over = rows[raw.terminated | raw.truncated]
-        if len(over):
-            obs[over] = begin(over)
-            player.restart(memory, over)
-            turn.age[over] = 0
-        if made >= steps:
-            rows = rows[end == CallEnd.RUNNING]
-        elif isinstance(choose, LearnsFromCalls) and made - planned >= choose.every:
-            planned = made
-            feed.flush()
-            if recorder.calls:
-                choose.learn(recorder.log())
-    feed.flush()
-    return np.array(seeds)
+    try:
+        while len(rows) and not stops():
+            here = obs[rows]
+            action = player.act(memory, rows, here, allowed_rows(engine.mask(), rows), turn)
+            raw = engine.step(action, rows)
+            turn.age[rows] += 1
+            step = raw.seen(here, action, turn.age[rows])
+            end = player.observe(memory, rows, step)
+            feed.add(rows, step, {"": {k: v[rows] for k, v in calls_in(memory, goals).items()}})
+            made += len(rows)
+            obs[rows] = raw.next_obs
+            over = rows[raw.terminated | raw.truncated]
+            if len(over):
+                obs[over] = begin(over)
+                player.restart(memory, over)
+                turn.age[over] = 0
+            if made >= steps:
+                rows = rows[end == CallEnd.RUNNING]
+            elif isinstance(choose, LearnsFromCalls) and made - planned >= choose.every:
+                planned = made
+                feed.flush()
+                if recorder.calls:
+                    choose.learn(recorder.log())
+    finally:
+        feed.flush()

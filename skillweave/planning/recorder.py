@@ -16,12 +16,14 @@ import numpy as np
 
 from skillweave.collecting.call_end import LIMIT, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.collecting.user_code import Texts, environment_texts
 from skillweave.collecting.views import call_successes, info_numbers_of, judged
 from skillweave.collecting.writer import kept_info
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import join
-from skillweave.planning.calls import CallLog, seen_places, skill_checksums
+from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype, obs_shape
@@ -74,6 +76,7 @@ class Recorder:
         latest: the number of latest steps to keep at least; None: keep all.
         own_rewards: compute each step by the skill's own reward, too, for ``own_returns``.
         inside: keep the observations inside of calls.
+        spec: the environment, for the log's ``code``; None: it is not recorded.
 
     Raises:
         DeclarationError: the latest steps would take more than 4 GiB.
@@ -91,11 +94,13 @@ class Recorder:
         latest: int | None = None,
         own_rewards: bool = False,
         inside: bool = True,
+        spec: EnvSpec | None = None,
     ) -> None:
         self.skills, self.spaces, self.info, self.latest = skills, spaces, tuple(info), latest
         self.path, self._above = path, dict(above or {})
         self._columns = f"{path}/" if path else ""
         self._own_rewards, self._inside = own_rewards, inside
+        self._environment = Texts() if spec is None else environment_texts(spec)
         self.goals: dict[str, Goals] = dict(goals_in(skills).values())
         """The goals of skills that have some, by name."""
         self.steps = 0
@@ -219,6 +224,7 @@ class Recorder:
             reward=reward,
             info=dict(zip(self.info, steps[4:], strict=False)),
             goals=dict(zip(self.goals, goals, strict=True)),
+            code=self._environment | skill_code(skills),
         )
         return log if self.latest is None else log.latest(self.latest)
 

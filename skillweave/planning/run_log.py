@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import zlib
+from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from skillweave.collecting.user_code import changes
 from skillweave.errors import RunError
 from skillweave.messages import shown_path
 from skillweave.notices import notice
@@ -19,11 +22,14 @@ from skillweave.planning.recorder import MOST_BYTES
 from skillweave.reading import check_file, fit
 from skillweave.runs.directory import CALLS, RunDirectory
 from skillweave.runs.files import read_header
+from skillweave.runs.lock import Lock
 
 MOST_STEPS = 1_000_000
 """The most steps of the log in a run; the latest stay."""
 LARGEST = MOST_BYTES + 64 * 2**20
 """The most bytes of its file."""
+LOCK = ".calls.lock"
+"""The file that a process locks while it adds calls."""
 RECORD = "record a new log: run.log_calls(20_000), or skillweave log"
 
 
@@ -88,21 +94,41 @@ def log_so_far(run: RunDirectory) -> CallLog | None:
 def save_calls(run: RunDirectory, log: CallLog) -> CallLog:
     """Write calls into a run, joined with those that are there, and return them all.
 
-    A log of other skills, weights or ``info`` keys is replaced, which a notice says. Calls that
-    were recorded again, with the same seeds and choices, are there once.
+    A log of other skills, weights or ``info`` keys is replaced. One of an environment or of skills
+    whose code has changed is put aside. A notice says so. Calls that were recorded again, with the
+    same seeds and choices, are there once.
 
     Raises:
         RunError: the file cannot be written, or the one that is there cannot be read.
     """
     path = run.path / CALLS
-    reason = _misfit(run) if path.exists() else None
-    if reason is not None:
-        notice(f"{path} {reason}. The new log replaces it")
-    elif path.exists():
-        log = joined(CallLog.load(path), log)
-    log = _bounded(log)
-    header = LoggedRun(id=run.manifest.get("id"), skills=_weights(run))
-    write_calls(path, columns_of(log), vars(log), header)
+    # A training holds the run's own lock for hours.
+    lock = Lock(run.path, LOCK, wait=True)
+    try:
+        if path.exists() and (reason := _misfit(run)) is not None:
+            notice(f"{path} {reason}. The new log replaces it")
+        elif path.exists():
+            log = _joined_or_aside(path, log)
+        log = _bounded(log)
+        header = LoggedRun(id=run.manifest.get("id"), skills=_weights(run))
+        write_calls(path, columns_of(log), vars(log), header)
+    finally:
+        lock.release()
+    return log
+
+
+def _joined_or_aside(path: Path, log: CallLog) -> CallLog:
+    """Return the log that is to be in a file; one of other code than before is put aside first."""
+    before = CallLog.load(path)
+    if not (says := changes(before.code, log.code)):
+        return joined(before, log)
+    names = (path.with_stem(f"{path.stem}-{n}") for n in count(1))
+    aside = next(name for name in names if not name.exists())
+    path.rename(aside)
+    notice(
+        f"{says} since the calls in {path} were recorded. They are now in {aside.name}, and the "
+        "run's log begins again"
+    )
     return log
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class Learnt:
     """The options that it chooses among, if it is a selector or a critic of skills."""
     part: Mapping[str, Any] | None = None
     """Of a skill of a run: its ``recorded_part``; else None."""
+    code: Mapping[str, Any] = field(default_factory=dict)
+    """What the other run's environment and skills are made of, as it records it."""
 
 
 Chooses = tuple[tuple[str, ...], tuple[int, ...]]
@@ -70,7 +72,8 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
             sha256 = sums[name]
             steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
             chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
-            learnt[name] = Learnt(policy, sha256, steps, run.manifest.get("id"), chooses, part)
+            of_run = run.manifest.get("id"), chooses, part, run.manifest.get("code", {})
+            learnt[name] = Learnt(policy, sha256, steps, *of_run)
     return learnt
 
 

@@ -25,14 +25,18 @@ _held: set[int] = set()
 class Lock:
     """A lock that is held from ``__init__`` to ``release``."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, name: str = NAME, *, wait: bool = False) -> None:
         """Acquire the lock.
+
+        Args:
+            name: of the locked file.
+            wait: wait while another process holds it.
 
         Raises:
             RunError: another process holds it, or the directory cannot be written.
         """
-        self._directory = directory
-        self._path = directory / NAME
+        self._directory, self._wait = directory, wait
+        self._path = directory / name
         self.exclusive = False
         """True if the system excludes other processes."""
         self._open()
@@ -59,7 +63,7 @@ class Lock:
         if fcntl is None:
             return
         try:
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._handle, fcntl.LOCK_EX | (0 if self._wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
             owner = self._owner()
             self.release()

@@ -229,6 +229,8 @@ class Manifest(TypedDict):
     kind: Literal["hierarchy", "agent"]
     env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
+    code: NotRequired[dict[str, str]]
+    """What the environment and the skills are made of (``collecting/user_code.py``)."""
     seed: Count
     checkpoint_every: AtLeastOne
     needs_recipe: bool
@@ -372,8 +374,8 @@ def read_manifest(run: Path) -> dict[str, Any]:
     return read_json(file, lambda data: check_manifest(data, str(file)))
 
 
-OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info")
-"""Entries that do not change what is learnt."""
+OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info", "code")
+"""Entries that do not change what is learnt, or are compared by themselves."""
 
 
 def identity(manifest: Mapping[str, Any]) -> str:

@@ -339,7 +339,7 @@ def _evaluate(
         )
         if limit is None and own_limit is None:
             moments = _with_notice(moments, spec.name, most)
-        calls = None if info is None else PlayedCalls(policy, spaces, info=info)
+        calls = None if info is None else PlayedCalls(policy, spaces, info=info, spec=spec)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
         if calls is not None:
             vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)

@@ -27,7 +27,7 @@ def begin_calls(
         return learning_task, None
     info, num_envs = tuple(run.manifest["log_calls_info"]), int(entry["algorithm"]["num_envs"])
     spaces = called.spec.spaces.observation, called.spec.spaces.action
-    recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps)
+    recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps, spec=called.spec)
     return replace(learning_task, log_calls=info), recorder
 
 

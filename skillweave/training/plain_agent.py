@@ -9,6 +9,7 @@ from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
+from skillweave.collecting.user_code import environment_texts
 from skillweave.envs.make import EnvSpec, Spaces, spec_of
 from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
@@ -106,6 +107,7 @@ class PlainAgent:
             "kind": "agent",
             "env": self.spec.name,
             "env_kwargs": self.spec.json_kwargs,
+            "code": environment_texts(self.spec),
             "seed": seed,
             "checkpoint_every": how.checkpoint_every,
             "eval_every": how.eval_every,

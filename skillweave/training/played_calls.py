@@ -11,6 +11,7 @@ import numpy as np
 
 from skillweave.collecting.call_end import EPISODE, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT
 from skillweave.planning.calls import CallLog
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
@@ -29,7 +30,7 @@ class PlayedCalls:
         policy: that plays.
         spaces: of the environments' observations and actions.
         info: keys of ``info`` to record.
-        own_rewards, inside: see ``Recorder``.
+        own_rewards, inside, spec: see ``Recorder``.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class PlayedCalls:
         info: Sequence[str] = (),
         own_rewards: bool = False,
         inside: bool = True,
+        spec: EnvSpec | None = None,
     ) -> None:
         skills = skills_below(policy)
         self.plain = skills is None
@@ -55,6 +57,7 @@ class PlayedCalls:
         self._goals = {path: goals_in(below) for path, (below, _) in self._levels.items()}
         self._spaces = spaces
         self._how: dict[str, Any] = {"info": info, "own_rewards": own_rewards, "inside": inside}
+        self._how["spec"] = spec
         self._feed: TraceFeed | None = None
 
     def add(self, played: Played) -> None:

@@ -16,6 +16,7 @@ from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector
+from skillweave.collecting.interrupts import deferred
 from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
@@ -25,7 +26,6 @@ from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
-from skillweave.training.interrupts import deferred
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from ready_selectors.chain import (
     DOOR,
     KEY,
@@ -228,22 +229,30 @@ DAMAGE = {
     "may_follow": (lambda x: x[:, :2].copy(), "'may_follow' is bool"),
     "info.door": (lambda x: x[:3], "'info.door' is"),
     "terminated": (lambda x: None, "it has the columns"),
+    # Differences that wrap around are positive.
+    "offset ": (lambda x: with_values(x, 2**63 - 1, -(2**63), -2), "'offset' is out of range"),
+    "info.door ": (lambda x: torch.from_numpy(x).bfloat16(), "'info.door' is torch.bfloat16"),
+    "action": (lambda x: x.astype(np.complex64), "'action' is complex64"),
 }
+
+
+def with_values(x: Any, *values: int) -> Any:
+    x[1 : len(values) + 1] = values
+    return x
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_damaged_file_is_refused(log: CallLog, tmp_path: Any, name: str) -> None:
-    import torch
-
     damage, message = DAMAGE[name]
+    name = name.strip()
     path = tmp_path / "log.safetensors"
     log.save(path)
     tensors, header = read_tensors(path)
     changed = damage(tensors[name].numpy())
     tensors = {k: v for k, v in tensors.items() if k != name}
     if changed is not None:
-        tensors[name] = torch.from_numpy(changed)
+        tensors[name] = torch.as_tensor(changed)
     write_tensors(path, tensors, header)
     with pytest.raises(RunError, match=f"log.safetensors is damaged: {message}"):
         CallLog.load(path)
@@ -261,10 +270,15 @@ def test_other_files_are_refused(log: CallLog, tmp_path: Any) -> None:
         CallLog.load(path)
     log.save(path)
     tensors, header = read_tensors(path)
-    for key, value in (("lengths", [0]), ("skills", ["a", "a", "b", "c"]), ("checksums", [])):
+    wrong = {"lengths": [0], "skills": ["a", "a", "b", "c"], "checksums": [], "sees": [[3]] * 4}
+    for key, value in wrong.items():
         write_tensors(path, tensors, header | {key: value})
         with pytest.raises(RunError, match=r"log\.safetensors"):
             CallLog.load(path)
+    goal = torch.zeros(len(log), dtype=torch.float64)
+    write_tensors(path, tensors | {"goal.wait": goal}, header | {"goals": ["wait"]})
+    with pytest.raises(RunError, match="goal"):
+        CallLog.load(path)
 
 
 def test_logs_are_joined(log: CallLog) -> None:

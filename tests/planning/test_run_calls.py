@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ import skillweave as sw
 from skillweave.api import Run
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning import CallLog, run_log
+from skillweave.planning import CallLog, record_calls, run_log
 from skillweave.runs.directory import CALLS, RunDirectory
 
 
@@ -170,16 +173,52 @@ def test_without_a_directory_calls_stay_in_memory(run: Run, tmp_path: Path) -> N
     loaded.plan(tilted)
 
 
-def test_calls_that_cannot_be_written_stay_in_memory(
+def test_calls_that_cannot_be_written_stay_in_memory_until_they_can(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: Any) -> Any:
         raise RunError("disk full")
 
-    monkeypatch.setattr("skillweave.planning.run_log.write_calls", full)
-    with pytest.raises(RunError, match="disk full"):
-        run.log_calls(100)
-    assert run.calls.steps >= 100
+    steps = run.log_calls(100).steps
+    with monkeypatch.context() as patched:
+        patched.setattr(run_log, "write_calls", full)
+        with pytest.raises(RunError, match="disk full"):
+            run.log_calls(100)
+    assert run.calls.steps >= steps + 100
+    run.log_calls(100)
+    assert run.calls.steps >= steps + 200
+    assert same(run.calls, declare(Left(), Right()).load(run.path).calls)
+
+
+def test_two_that_log_at_once_lose_no_calls(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*args: Any) -> None:
+        time.sleep(0.2)
+        write(*args)
+
+    write, directory = run_log.write_calls, RunDirectory.open(run.path)
+    logs = [record_calls(run.declaration.spec, run.policy, 100, seed=s) for s in (1, 2)]
+    monkeypatch.setattr(run_log, "write_calls", slow)
+    directory.begin(finished=True)  # a training holds its lock
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(lambda log: run_log.save_calls(directory, log), logs))
+    directory.close()
+    assert len(run.calls) == sum(map(len, logs))
+
+
+def test_an_interrupted_recording_keeps_its_calls(run: Run) -> None:
+    asked = 0
+
+    def choose(obs: Any) -> Any:
+        nonlocal asked
+        asked += 1
+        if asked == 100:
+            signal.raise_signal(signal.SIGINT)
+        return np.zeros(len(obs), int)
+
+    with pytest.raises(sw.Interrupted, match=r"calls .* were recorded and are kept"):
+        run.log_calls(1_000_000, choose=choose, num_envs=4)
+    assert 0 < run.calls.steps < 1_000_000
+    assert (run.calls.end_reason > 0).all()
 
 
 def test_a_plain_agent_has_no_calls(tmp_path: Path) -> None:
