@@ -36,6 +36,7 @@ def name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+@pytest.mark.filterwarnings("ignore:start from .* the dict kwargs")  # start-from.md says so
 @pytest.mark.fast_cases(4)
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name)
 def test_the_code_of_a_page_runs(

@@ -835,7 +835,9 @@ class Run:
 
         The run's directory keeps all recorded calls, the latest million steps, in
         ``calls.safetensors``; ``calls`` reads them. Calls of the skills before they learnt on, or
-        without a key of ``info`` that is asked for now, are replaced, which is said. A run without
+        without a key of ``info`` that is asked for now, are replaced. If the code of the
+        environment or of the skills has changed, earlier calls are put aside, in
+        ``calls-1.safetensors``. Both are said. A run without
         a directory of its own (a weights file, a copy of the hub's) keeps calls in memory.
 
         Args:

@@ -13,9 +13,10 @@ from gymnasium import Space
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.user_code import notice_changes
+from skillweave.collecting.user_code import changes
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import as_path, close_matches, short
+from skillweave.notices import notice
 from skillweave.paths import AGENT, decides
 from skillweave.reading import shown
 from skillweave.runs.initial_policies import (
@@ -73,12 +74,13 @@ def starts(
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(map(str, places.values())))
     started = record_initial_policies(content["stages"], learnt, where)
-    for place in dict.fromkeys(places[name] for name in sorted(started)):
-        names = [name for name in started if places[name] == place]
-        skills = tuple(f"skill {name!r}" for name in names)
-        texts = content["code"].items()
-        now = {what: t for what, t in texts if " skill " not in what or what.endswith(skills)}
-        notice_changes(learnt[names[0]].code, now, f"{place} was trained")
+    for origin in dict.fromkeys(places[name] for name in sorted(started)):
+        names = [name for name in started if places[name] == origin]
+        ends = tuple(f"skill {name!r}" for name in names)
+        code: dict[str, str] = content["code"]
+        now = {k: v for k, v in code.items() if " skill " not in k or k.endswith(ends)}
+        if says := changes(learnt[names[0]].code, now):
+            notice(f"start from {origin}: {says} since it was trained")
     for stage in content["stages"]:
         for name in stage.get("starts", {}):
             role = roles[name]

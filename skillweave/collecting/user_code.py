@@ -49,7 +49,7 @@ def environment_texts(spec: EnvSpec) -> Texts:
     names = ", ".join(getattr(kind, "__name__", type(kind).__name__) for kind in kinds) or "none"
     return {
         "the environment": spec.name,
-        "kwargs of the environment": json.dumps(_form(spec.kwargs, {})),
+        "the dict kwargs of the environment": _text(spec.kwargs),
         "the list of its wrappers": names,
         "the code of the environment": code_sum([_maker(spec.env), spec.pool]),
         f"the code of its wrappers ({names})": code_sum(wrappers),
@@ -95,11 +95,15 @@ def changes(then: Texts, now: Texts) -> str:
 
 def code_sum(thing: Any) -> str:
     """Return a checksum of code and of the values that it uses; empty: it has no source."""
+    text = _text(thing)
+    return text and SUM + checksum(text.encode())
+
+
+def _text(thing: Any) -> str:
     try:
-        form = json.dumps(_form(thing, {}), sort_keys=True)
-    except (ValueError, RecursionError):  # also a variable of a closure without a value
+        return json.dumps(_form(thing, {}), sort_keys=True)
+    except (ValueError, RecursionError):  # also where a variable of a closure has no value yet
         return ""
-    return SUM + checksum(form.encode())
 
 
 def _maker(env: Any) -> Any:
@@ -107,7 +111,7 @@ def _maker(env: Any) -> Any:
     entry = gym.registry.get(str(env).rpartition(":")[2])
     if entry is None:
         return env
-    made = entry.entry_point
+    made: Any = entry.entry_point
     if isinstance(made, str):
         if not _is_own(re.split("[.:]", made)[0]):
             return None
@@ -143,7 +147,8 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
             return {str(key): _form(value, seen) for key, value in x.items()}
         case functools.partial():
             return _form([x.func, x.args, x.keywords], seen)
-    x, owner = getattr(x, "__func__", x), getattr(x, "__self__", owner)  # of a method
+    owner = getattr(x, "__self__", owner)
+    x = getattr(x, "__func__", None) or getattr(x, "fget", x)  # of a method or a property
     code = x if isinstance(x, FunctionType | type) else type(x)
     if not _is_own(code.__module__):
         return code.__name__

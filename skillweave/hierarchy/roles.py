@@ -266,7 +266,7 @@ class Roles:
 
     @property
     def code(self) -> Texts:
-        """What the environment and the skills are made of, to be compared later."""
+        """The texts of the environment and of the skills, to be compared later."""
         reflexes = [reflex for level in self.levels.values() for reflex in level.reflexes]
         return environment_texts(self.spec) | skill_texts(self.skills, reflexes)
 

@@ -95,7 +95,7 @@ def _content_of(policy: Policy, name: str) -> dict[str, Tensor]:
 
 
 def _place(spec: EnvSpec, code: Texts) -> dict[str, Any]:
-    """Return the header entries of an environment, and of what it and the skills are made of."""
+    """Return the header entries of an environment, and the texts of it and of skills."""
     return {"env": spec.name, "env_kwargs": spec.json_kwargs, "code": code}
 
 

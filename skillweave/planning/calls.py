@@ -66,7 +66,7 @@ class CallLog(CallColumns):
         info: by key, (T, …) values of the environment's ``info``.
         goals: by skill that has goals, (C, G) float64, the numbers of its calls' goals; in rows of
             other skills they mean nothing.
-        code: what the environment and the skills are made of (``collecting/user_code.py``).
+        code: texts of the environment and the skills, to be compared later.
     """
 
     @checked_names

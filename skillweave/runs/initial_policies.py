@@ -42,8 +42,8 @@ class Learnt:
     """The options that it chooses among, if it is a selector or a critic of skills."""
     part: Mapping[str, Any] | None = None
     """Of a skill of a run: its ``recorded_part``; else None."""
-    code: Mapping[str, Any] = field(default_factory=dict)
-    """What the other run's environment and skills are made of, as it records it."""
+    code: dict[str, str] = field(default_factory=dict)
+    """The other run's texts of its environment and skills."""
 
 
 Chooses = tuple[tuple[str, ...], tuple[int, ...]]

@@ -35,7 +35,8 @@ class Lock:
         Raises:
             RunError: another process holds it, or the directory cannot be written.
         """
-        self._directory, self._wait = directory, wait
+        self._directory = directory
+        self._wait = wait
         self._path = directory / name
         self.exclusive = False
         """True if the system excludes other processes."""

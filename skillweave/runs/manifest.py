@@ -230,7 +230,7 @@ class Manifest(TypedDict):
     env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
     code: NotRequired[dict[str, str]]
-    """What the environment and the skills are made of (``collecting/user_code.py``)."""
+    """Texts of the environment and the skills, to be compared (``collecting/user_code.py``)."""
     seed: Count
     checkpoint_every: AtLeastOne
     needs_recipe: bool
