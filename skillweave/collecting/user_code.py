@@ -169,7 +169,7 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
         if attribute:
             known = first == "self" or (isinstance(value, ModuleType) and _is_own(value.__name__))
             value = inspect.getattr_static(value, attribute, None) if known else None
-        values[name] = _form(value, seen, owner)
+        values[name] = _form(value, seen, owner if first == "self" else None)
     rest = code.__bases__ if isinstance(code, type) else code.__defaults__
     more = None if code is x else getattr(x, "__dict__", None)
     return [text, values, _form([rest, more], seen)]
