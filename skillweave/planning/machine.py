@@ -20,12 +20,14 @@ from skillweave.planning.predicates import Event, Held, Predicate, as_event
 from skillweave.selectors import Automaton
 from skillweave.selectors.base import function_name, listed
 from skillweave.skills.answers import answer
-from skillweave.types import Array, Step
+from skillweave.types import LARGEST_REWARD, Array, Step
 
 MOST_STATES = 10_000
 """The most states of a machine."""
 MOST_AUTOMATON = 2_000
 """The most states of the automaton that is made of a machine, whose counters become states."""
+MOST_CELLS = 20_000_000
+"""The most places for predicates in a machine's arrays."""
 _NEVER = np.iinfo(np.int64).max
 
 Reward = float | Callable[[Step], Any]
@@ -172,6 +174,11 @@ class RewardMachine:
         self._by_state = by_state
         count, most = len(plan.names), max(1, *(len(a) for a in by_state))
         atoms = max([1, *(len(a.atoms) for a in plan.arrows)])
+        if count * most * atoms > MOST_CELLS:
+            raise DeclarationError(
+                f"the task has {count:,} states, of which one has {most:,} transitions; combine "
+                "fewer parts by 'and' or 'or', or repeat less often"
+            )
         for arrow in plan.arrows:
             for atom in arrow.atoms:
                 self._event(_predicate(atom))
@@ -554,13 +561,14 @@ def _event_and_reward(value: Any, where: str) -> tuple[Event, Reward]:
 
 def _checked_reward(reward: Any, where: str) -> Reward:
     number = isinstance(reward, int | float | np.integer | np.floating)
-    if number and not isinstance(reward, bool) and np.isfinite(reward):
+    if number and not isinstance(reward, bool) and abs(reward) <= LARGEST_REWARD:
         return float(reward)
     if callable(reward) and not isinstance(reward, type):
         function: Callable[[Step], Any] = reward
         return function
     raise DeclarationError(
-        f"{where}: its reward is {short(reward)}; give a finite number, or a function of a step"
+        f"{where}: its reward is {short(reward)}; give a number of at most {LARGEST_REWARD:g}, or a function of "
+        "a step"
     )
 
 

@@ -26,6 +26,8 @@ RESERVED = (*KEYWORDS, "forever", "steps", "step")
 LONGEST = 10_000
 """The most characters of a text."""
 MOST_REPEATS = 1_000
+DEEPEST = 50
+"""The most parentheses inside one another."""
 _TOKEN = re.compile(r"\s*(?:(?P<word>[^\W\d][\w-]*)|(?P<number>\d+)|(?P<sign>[(),]))")
 
 
@@ -60,7 +62,7 @@ class _Parser:
     def __init__(self, text: str, predicates: Mapping[str, Event]) -> None:
         self.text, self.predicates = text, predicates
         self.tokens = list(self._tokens())
-        self.place = 0
+        self.place = self.depth = 0
 
     def mission(self) -> tuple[Part, tuple[Predicate, ...], int | None]:
         """Parse the whole text."""
@@ -111,13 +113,17 @@ class _Parser:
 
     def item(self) -> Part:
         """Parse parentheses, or an event."""
+        first = self.now
         if self.takes("("):
+            self.depth += 1
+            if self.depth > DEEPEST:
+                self.fail(f"at most {DEEPEST} parentheses may be inside one another", first)
             inside = self.sequence()
+            self.depth -= 1
             self.expect(")", "')', 'then', 'or' or 'and'")
             if self.takes("repeat"):
                 return sequence([inside] * self.number(1, MOST_REPEATS))
             return inside
-        first = self.now
         event = self.event()
         if self.takes("for"):
             if isinstance(event, Held):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import prod
 from typing import Any
 
 from skillweave.errors import DeclarationError
@@ -15,6 +16,8 @@ DONE = "done"
 FAILED = "failed"
 MOST_TOGETHER = 6
 """The most parts of one choice, or of one group in any order."""
+MOST_ARROWS = 100_000
+"""The most transitions of a mission."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,15 @@ Part = Event | InOrder | Choice | AnyOrder
 
 
 def sequence(parts: Sequence[Part]) -> Part:
-    """Return parts one after another; sequences among them are joined."""
+    """Return parts one after another; sequences among them are joined.
+
+    Raises:
+        DeclarationError: they are too many.
+    """
     flat: list[Part] = []
     for part in parts:
         flat += part.parts if isinstance(part, InOrder) else [part]
+        _check_size(len(flat))
     return flat[0] if len(flat) == 1 else InOrder(tuple(flat))
 
 
@@ -97,18 +105,21 @@ def compile_mission(legs: Part, avoid: Sequence[Predicate], repeat: int | None) 
 
 def _unique(waits: Sequence[str]) -> tuple[str, ...]:
     """Return names of states: what each waits for, with a number where two wait for the same."""
-    names: list[str] = []
+    names, number = dict.fromkeys((DONE, FAILED)), dict.fromkeys(waits, 1)
     for wait in waits:
-        name, number = wait, 2
-        while name in names or name in (DONE, FAILED):
-            name, number = f"{wait} #{number}", number + 1
-        names.append(name)
-    return tuple(names)
+        name = wait
+        while name in names:
+            number[wait] += 1
+            name = f"{wait} #{number[wait]}"
+        names[name] = None
+    return tuple(names)[2:]
 
 
 def _fragment(part: Part) -> _Fragment:
     if isinstance(part, InOrder):
-        return _in_sequence([_fragment(p) for p in part.parts])
+        # A part that is repeated is one object, and has one fragment.
+        fragments = {id(p): _fragment(p) for p in {id(p): p for p in part.parts}.values()}
+        return _in_sequence([fragments[id(p)] for p in part.parts])
     if isinstance(part, Choice | AnyOrder):
         return _together([_fragment(p) for p in part.parts], isinstance(part, Choice))
     arrow = Arrow(0, 1, (atom_of(part, 0),))
@@ -117,7 +128,7 @@ def _fragment(part: Part) -> _Fragment:
 
 def _in_sequence(parts: Sequence[_Fragment]) -> _Fragment:
     """Join the end of each fragment to the start of the next; all use the same counters."""
-    _check_size(sum(p.end for p in parts))
+    _check_size(sum(p.end for p in parts), sum(len(a) for p in parts for a in p.arrows))
     arrows: list[tuple[Arrow, ...]] = []
     worth: list[float] = []
     for i, part in enumerate(parts):
@@ -146,6 +157,7 @@ def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
     start = (0,) * len(parts)
     numbers = {start: 0}
     queue, leaving = [start], list[list[tuple[tuple[int, ...], Arrow]]]()
+    count = 0
 
     def is_over(places: tuple[int, ...]) -> bool:
         at_end = [at == p.end for at, p in zip(places, parts, strict=True)]
@@ -153,12 +165,15 @@ def _together(parts: Sequence[_Fragment], first_ends: bool) -> _Fragment:
 
     while len(leaving) < len(queue):
         places = queue[len(leaving)]
+        count += prod(
+            1 + len(p.arrows[at]) if at < p.end else 1 for at, p in zip(places, parts, strict=True)
+        )
+        _check_size(len(queue), count)
         leaving.append(list(_joint_arrows(places, parts, offsets)))
         for target, _ in leaving[-1]:
             if not is_over(target) and target not in numbers:
                 numbers[target] = len(queue)
                 queue.append(target)
-                _check_size(len(queue))
     end = len(queue)
     arrows = tuple(
         tuple(
@@ -206,12 +221,16 @@ def _joint_arrows(
         yield tuple(target), Arrow(0, 0, tuple(atoms), 0.0, frozenset(keeps))
 
 
-def _check_size(states: int) -> None:
-    if states > MOST_STATES:
-        raise DeclarationError(
-            f"the mission has more than {MOST_STATES:,} states: repeat it less often, or combine "
-            "fewer sequences by 'and' or 'or'"
-        )
+def _check_size(states: int, arrows: int = 0) -> None:
+    """Raise a DeclarationError where a mission would be too large, before it is built."""
+    for count, most, what in (
+        (states, MOST_STATES, "states"), (arrows, MOST_ARROWS, "transitions"),
+    ):  # fmt: skip
+        if count > most:
+            raise DeclarationError(
+                f"the mission has more than {most:,} {what}: repeat it less often, or combine "
+                "fewer parts by 'and' or 'or'"
+            )
 
 
 def _check_successions(whole: Part, again: bool) -> None:

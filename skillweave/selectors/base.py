@@ -17,6 +17,7 @@ from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of, repeated
 from skillweave.skills.goals import as_goals
 from skillweave.skills.outputs import called
+from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step, read_only
 
 
@@ -176,7 +177,7 @@ def goal_as_json(goal: Any) -> Any:
 
 def listed(names: tuple[str, ...]) -> str:
     """Join names to a part of a sentence."""
-    return shortened(", ".join(names), 300)
+    return shortened(one_line(", ".join(names)), 300)
 
 
 def function_name(function: Any) -> str:

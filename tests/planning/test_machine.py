@@ -195,7 +195,15 @@ def wrong(make: Any, message: str) -> Any:
         wrong(lambda: RewardMachine({("a", 3): A}), "state is named 3"),
         wrong(lambda: RewardMachine({("a", "b"): "x"}), "'x' is no predicate"),
         wrong(lambda: RewardMachine({("a", "b"): (A, "x")}), "reward is 'x'"),
-        wrong(lambda: RewardMachine({("a", "b"): (A, np.nan)}), "reward is nan"),
+        *(
+            wrong(lambda x=x: RewardMachine({("a", "b"): (A, x)}), "reward is")
+            for x in (np.nan, np.inf, 1e300, 10**400)
+        ),
+        wrong(lambda: RewardMachine({("a", "b"): A}, each_step=-1e39), "each_step"),
+        wrong(
+            lambda: RewardMachine({("go", f"to {i}"): A for i in range(9_000)}),
+            "9,000 transitions",
+        ),
         wrong(lambda: RewardMachine({("a", "b"): (A, 1, 2)}), r"write an event, or \(event"),
         wrong(lambda: RewardMachine({("a", "b"): A}, start="c"), "start names the state 'c'"),
         wrong(lambda: RewardMachine({("a", "b"): A}, accepting={"c"}), "states are: a, b"),
@@ -235,6 +243,10 @@ def wrong(make: Any, message: str) -> Any:
 def test_a_wrong_machine_is_refused(make: Any, message: str) -> None:
     with pytest.raises(DeclarationError, match=message):
         make()
+
+
+def test_control_characters_in_names_of_states_are_escaped() -> None:
+    assert "\x1b" not in repr(RewardMachine({("a\x1b[2J", "b\n"): A}))
 
 
 def test_a_predicate_that_answers_wrongly_is_named() -> None:

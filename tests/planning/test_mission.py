@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -239,6 +240,27 @@ def test_an_error_points_at_the_word(text: str, reason: str, word: str) -> None:
     at = pointer.index("^")
     assert pointer.strip() == "^" * max(1, len(word))
     assert line[at : at + len(word)] == word[: len(line) - at]
+
+
+@pytest.mark.parametrize(
+    ("text", "noun"),
+    [
+        ("(" * 250 + "a" + ")" * 250, "parentheses"),
+        ("(((a then b) repeat 1000) repeat 1000)", "states"),
+        (" and ".join(["(a or b or a or b or a or b)"] * 4), "transitions"),
+        ("((a or b or c or d) and (a or b or c or d)) repeat 1000", "transitions"),
+    ],
+)
+def test_a_text_that_means_too_much_is_refused_before_it_is_built(text: str, noun: str) -> None:
+    with pytest.raises(DeclarationError, match=noun):
+        Mission.from_text(text, NAMES)
+
+
+def test_equal_names_are_numbered_in_linear_time() -> None:
+    start = time.process_time()
+    names = Mission.from_text("(a then b) repeat 1000", NAMES).state_names
+    assert time.process_time() - start < 2
+    assert names[:3] + names[-3:] == ("a", "b", "a #2", "a #1000", "b #1000", "done")
 
 
 def test_the_nearest_name_is_given_and_long_texts_are_cut() -> None:
