@@ -33,6 +33,7 @@ from skillweave.messages import as_path, short, shown_path
 from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
+from skillweave.skills.learnable import learn_on
 from skillweave.training.callback import Callback
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
@@ -201,7 +202,8 @@ def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
     if roles[skill].config is None:
         raise DeclarationError(
             f"{skill!r} is ready: its policy was given, so it does not learn, and cannot be "
-            f"repaired. Perhaps {name_of(after)!r} can end elsewhere"
+            f"repaired. To let it learn, {learn_on(skill)}. Or perhaps {name_of(after)!r} can end "
+            "elsewhere"
         )
     return skill, path
 

@@ -16,6 +16,7 @@ from skillweave.paths import name_of
 from skillweave.selectors import Automaton
 from skillweave.settings import fitted
 from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.skills.learnable import learn_on
 from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import Target, target_of
 
@@ -80,10 +81,8 @@ def _check_untrained(skill: Skill) -> None:
             advice += f" (or set them to None: {', '.join(f'skill.{f} = None' for f in ignored)})"
         raise DeclarationError(
             f"skill {skill.name!r} has a policy, so it is not trained, and its {fields} would be "
-            f"ignored: {advice}, or leave out policy to train it. To train a policy from "
-            "elsewhere further, write policy = from_sb3(..., learn=True), or from_torch's; a skill "
-            "of another run of Skillweave, leave out policy and call "
-            f"train(start_from={{{skill.name!r}: run}})"
+            f"ignored: {advice}, or leave out policy to train it. To let it learn on, "
+            f"{learn_on(skill.name)}"
         )
 
 

@@ -17,7 +17,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.paths import level_of, name_of
 from skillweave.planning import CallLog, HandOver, join
-from skillweave.planning.hand_over import before_each, calls_done
+from skillweave.planning.hand_over import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
 from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.runs.directory import RunDirectory
@@ -392,10 +392,8 @@ def verdict(before: HandOver, later: HandOver, skill: str, after: str) -> tuple[
 
 
 def _rates(before: HandOver, later: HandOver, place: tuple[int, int]) -> str:
-    return (
-        f"{before.rate[place]:.0%} of {before.calls[place]} calls before, "
-        f"{later.rate[place]:.0%} of {later.calls[place]} later"
-    )
+    one, other = (shown_rate(m.done[place], m.calls[place]) for m in (before, later))
+    return f"{one} before, {other} later"
 
 
 def repairs_of(run: RunDirectory) -> list[Repair]:

@@ -73,7 +73,9 @@ def select_best(
         run.save()
         for listener in listeners:
             listener.message(f"{entry['name']}: {comparison_words(entry['kept'])}")
-            for hint in useless_skills(scores[entry["kept"]["kept"]].skills, episodes):
+            best = scores[entry["kept"]["kept"]].skills
+            learns = level.ready_selector is None
+            for hint in useless_skills(best, episodes, selector_learns=learns):
                 listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,8 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import compared_places
-from skillweave.planning.hand_over import START, before_each, calls_done, wilson
+from skillweave.planning.hand_over import START, before_each, calls_done, shown_rate, wilson
 from skillweave.planning.neighbours import Standard, feature_maps, nearest
-from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
 LEAST = 20
@@ -37,10 +36,13 @@ class Blame:
         rate: share of the second skill's calls that are done after the first one.
         elsewhere: this share after all others, and at the start of an episode; NaN: no call.
         calls: the number of calls after the first skill.
+        calls_elsewhere: the number of all others.
         best: share that is done from the best third of the first skill's ends, as the other calls
-            near each end predict them; NaN where the calls are too few.
+            near each end predict them, beyond what follows from numbers that the first skill does
+            not change; NaN where the calls are too few.
         others: share from its other ends.
-        place: the number of the flat observation in which these ends differ most; None: images.
+        place: the number of the flat observation that the first skill changes and in which these
+            ends differ most; None: there is none, or images.
         means: its mean at the best ends, and at the others.
         reasons: how the calls that failed ended: own, limit, interrupted, episode.
         first: True if other ends of the first skill would do, so that it is to blame.
@@ -51,6 +53,7 @@ class Blame:
     rate: float
     elsewhere: float
     calls: int
+    calls_elsewhere: int
     best: float
     others: float
     place: int | None
@@ -68,9 +71,10 @@ class Blame:
     def __str__(self) -> str:
         """Return the reason in plain sentences."""
         where = "at the start of an episode" if self.after == START else f"after {self.after!r}"
-        parts = [f"{self.skill!r} is done in {self.rate:.0%} of {self.calls} calls {where}"]
-        if np.isfinite(self.elsewhere):
-            parts[0] += f", and in {self.elsewhere:.0%} elsewhere"
+        here = shown_rate(self.rate * self.calls, self.calls)
+        parts = [f"{self.skill!r} is done in {here} {where}"]
+        if others := self.calls_elsewhere:
+            parts[0] += f", and in {shown_rate(self.elsewhere * others, others)} elsewhere"
         if failed := sum(self.reasons.values()):
             words = ", ".join(
                 f"{count / failed:.0%} {_ENDS[reason]}"
@@ -81,22 +85,23 @@ class Blame:
         if self.fine:
             parts.append("That is no worse than elsewhere, so neither skill is to blame")
         elif self.after == START:
-            parts.append(f"So {self.skill!r} has to learn to start there")
+            parts.append(f"So {self.skill!r} itself has to work from there")
         elif not np.isfinite(self.best):
             parts.append(
                 f"These are too few calls to say which skill is to blame (at least {LEAST})"
             )
-        elif self.first:
+        else:
+            third = _third(self.calls)
+            best = shown_rate(self.best * third, third)
+            others = shown_rate(self.others * (self.calls - third), self.calls - third)
             parts.append(
                 f"{self.after!r} is to blame for where it ends: from the best third of its ends "
-                f"{self.skill!r} is done in {self.best:.0%}, from the others in {self.others:.0%}"
+                f"{self.skill!r} is done in {best}, from the others in {others}"
                 f"{self._difference()}"
-            )
-        else:
-            parts.append(
-                f"It would not help if {self.after!r} ended elsewhere: from the best third of its "
-                f"ends {self.skill!r} is done in {self.best:.0%}. So {self.skill!r} has to learn "
-                "to start there"
+                if self.first
+                else f"It would not help if {self.after!r} ended elsewhere, as far as it can: "
+                f"from the best third of its ends {self.skill!r} is done in {best}. So "
+                f"{self.skill!r} itself has to work from there"
             )
         return ". ".join(parts) + "."
 
@@ -145,16 +150,21 @@ def blame(
     reasons = {end.name.lower(): int((ends == end).sum()) for end in list(CallEnd)[1:]}
     rate, nan = float(won[rows].mean()), float("nan")
     unknown = Blame(
-        skill, after, rate, elsewhere, len(rows), nan, nan, None, (nan, nan), reasons, False
-    )
+        skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan), reasons,
+        False,
+    )  # fmt: skip
     if after == START or len(rows) < LEAST:
         return unknown
     places = compared_places(log)
     maps = feature_maps(log.observation_space, features, places, log.start, log.skills)
-    at = np.ascontiguousarray(maps[number](log.start[rows]))
-    score = _predicted(at, won[rows])
+    known = np.flatnonzero(counts & (~log.was_cut | won))
+    starts, of_first = log.flat(log.start), log.skill[log.owner] == log.number(after)
+    changes = (log.flat(log.before[of_first]) != log.flat(log.next_obs[of_first])).any(0)
+    # Where a number that the first skill does not change decides, none of its ends is better.
+    score = _predicted(maps[number](log.start), won, known, rows)
+    score = score - _predicted(Standard(starts[:, ~changes])(starts[:, ~changes]), won, known, rows)
     best = np.zeros(len(rows), bool)
-    best[np.argsort(-score, kind="stable")[: max(1, round(len(rows) * BEST))]] = True
+    best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
     good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
     as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
     low, high = (
@@ -162,31 +172,38 @@ def blame(
         wilson(won[rows[~best]].sum(), (~best).sum())[1],
     )
     first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
-    place, means = _largest_difference(log, log.start[rows], best)
-    return Blame(
-        skill, after, rate, elsewhere, len(rows), good, bad, place, means, reasons, bool(first)
-    )
+    place, means = _largest_difference(starts[rows], best, changes)
+    return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
 
 
-def _predicted(at: Array, won: Array) -> Array:
-    """Return for each start (n, F) the share of the nearest other starts that were done, (n,)."""
-    n = len(at)
-    count = min(n - 1, max(5, round(n**0.5)))
-    near, _ = nearest(at, at, count + 1, np.arange(n))
-    others = near != np.arange(n)[:, None]
-    score: Array = (won[near] * others).sum(1) / others.sum(1)
+def _third(calls: int) -> int:
+    return max(1, round(calls * BEST))
+
+
+def _predicted(at: Array, won: Array, known: Array, rows: Array) -> Array:
+    """Return for the starts ``rows`` the share of the nearest other ones that were done.
+
+    Args:
+        at: (C, F) features of the starts of all calls.
+        won: (C,) bool.
+        known: (k,) the calls that count.
+        rows: (n,) of these.
+    """
+    count = min(len(known) - 1, max(5, round(len(known) ** 0.5)))
+    near, _ = nearest(at[known], at[rows], count + 1, np.arange(len(known)))
+    others = known[near] != rows[:, None]
+    score: Array = (won[known[near]] * others).sum(1) / others.sum(1)
     return score
 
 
 def _largest_difference(
-    log: CallColumns, obs: Array, best: Array
+    vector: Array, best: Array, changes: Array
 ) -> tuple[int | None, tuple[float, float]]:
-    """Return the number of the observation whose means differ most between two groups of ends."""
-    codec = obs_codec(log.observation_space)
-    vector = codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
-    if not vector.shape[1]:
+    """Return the number that differs most between two groups of ends, of those that change."""
+    if not changes.any():
         return None, (float("nan"), float("nan"))
     one, other = vector[best].mean(0), vector[~best].mean(0)
     standard = Standard(vector)
-    place = int(np.abs(standard(one) - standard(other)).argmax())
+    size = np.abs(standard(one) - standard(other))
+    place = int(np.where(changes, size, -1).argmax())
     return place, (float(one[place]), float(other[place]))

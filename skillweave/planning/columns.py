@@ -16,6 +16,7 @@ from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, shortened
+from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Step
 
 PER_CALL = (
@@ -137,6 +138,12 @@ class CallColumns:
         joined &= self.age[a] + self.tau[a] == self.age[b]
         following[a[joined]] = b[joined]
         return following
+
+    def flat(self, obs: Array) -> Array:
+        """Return the numbers of observations (n, …) without images, (n, F)."""
+        vector = obs_codec(self.observation_space).split(to_tensor(obs))[0]
+        flat: Array = vector.reshape(len(obs), -1).numpy()
+        return flat
 
     def returns(self, gamma: float) -> Array:
         """Return Σ γᵏ rₖ of each call, (C,) float64."""

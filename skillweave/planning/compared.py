@@ -11,7 +11,7 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import Standard, nearest
-from skillweave.spaces import obs_codec, to_tensor
+from skillweave.spaces import obs_codec
 from skillweave.types import Array
 
 MOST_STEPS = 0.5
@@ -46,9 +46,7 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
     codec = obs_codec(space)
     if codec.images and all(seen is None for seen in log.sees):
         return tuple(log.sees)
-    before, after = (
-        codec.split(to_tensor(x))[0].reshape(len(x), -1).numpy() for x in (log.before, log.next_obs)
-    )
+    before, after = log.flat(log.before), log.flat(log.next_obs)
     changes = (before != after).mean(0)
     varies = Standard(before).varies
     fixed = np.flatnonzero((changes == 0) & varies).tolist()

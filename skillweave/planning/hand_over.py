@@ -19,7 +19,6 @@ from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbours import feature_maps, nearest, weights_of
 from skillweave.planning.predicates import as_event
-from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
 START = "start"
@@ -82,29 +81,43 @@ class HandOver:
         return float(self.rate[place]), int(self.calls[place])
 
     def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on skills that are done much less often after one skill than elsewhere.
+        """Return sentences on the skills that are never done, and on weak hand-overs.
+
+        A hand-over is weak where a skill is done much less often after one skill than elsewhere.
 
         Args:
-            least: the fewest calls after a skill that count.
+            least: the fewest calls that count.
         """
-        sentences = []
+        never = self._never(least)
+        sentences = [
+            f"{skill!r} succeeds in {shown_rate(0, calls)}, whatever came before"
+            for skill, calls in zip(self.skills, self.calls.sum(0), strict=True)
+            if skill in never
+        ]
         for i, j in self.weak(least):
             skill, others = self.skills[j], np.delete(np.arange(len(self.before)), i)
-            elsewhere = self.done[others, j].sum() / self.calls[others, j].sum()
+            if skill in never:
+                continue
+            elsewhere = shown_rate(self.done[others, j].sum(), self.calls[others, j].sum())
             where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             does = "ends by itself" if skill in self.by_itself else "succeeds"
-            sentences.append(
-                f"{skill!r} {does} in {self.rate[i, j]:.0%} of the calls {where}; "
-                f"{elsewhere:.0%} elsewhere"
-            )
+            here = shown_rate(self.done[i, j], self.calls[i, j])
+            sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
+
+    def _never(self, least: int) -> set[str]:
+        """Return the skills with a success that they never reach."""
+        columns = np.flatnonzero((self.calls.sum(0) >= least) & ~self.done.any(0))
+        return {self.skills[j] for j in columns} - set(self.by_itself)
 
     def weak(self, least: int = 20) -> list[tuple[int, int]]:
         """Return the places (row, column) that ``weakest`` is about."""
-        places = []
+        places, never = [], self._never(least)
         high = self.interval[1]
-        for j in range(len(self.skills)):
+        for j, skill in enumerate(self.skills):
             for i in range(len(self.before)):
+                if skill in never and self.calls[i, j]:
+                    places.append((i, j))
                 others = np.delete(np.arange(len(self.before)), i)
                 calls, done = self.calls[others, j].sum(), self.done[others, j].sum()
                 if self.calls[i, j] < least or calls < least:
@@ -136,23 +149,22 @@ class HandOver:
         }
 
     def rows(self) -> list[list[str]]:
-        """Return the rows of a table: the skill before, then rates and numbers of calls."""
+        """Return the rows of a table: the skill before, then rates, calls and intervals."""
         return [
             [
                 name,
                 *(
-                    f"{rate:.0%} ({calls:,})" if calls else "–"
-                    for rate, calls in zip(self.rate[i], self.calls[i], strict=True)
+                    shown_rate(done, calls, "") if calls else "–"
+                    for done, calls in zip(self.done[i], self.calls[i], strict=True)
                 ),
             ]
             for i, name in enumerate(self.before)
         ]
 
     def __str__(self) -> str:
-        """Return the matrix as a table of text: rates, the number of calls, what is done."""
-        width = max(map(len, self.before))
+        """Return the matrix as a table of text: rates, calls, intervals, what is done."""
         cells = [["after", *self.skills], *self.rows()]
-        widths = [max(width, 5), *(max(len(s), 12) for s in self.skills)]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = [
             "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
             for row in cells
@@ -183,7 +195,9 @@ class Chain:
         if 0 in self.calls:
             name = self.skills[self.calls.index(0)]
             return f"{text}no product, as no logged call of {name!r} came right after"
-        factors = " × ".join(f"{rate:.0%}" for rate in self.rates)
+        factors = " × ".join(
+            f"{rate:.0%} of {calls:,}" for rate, calls in zip(self.rates, self.calls, strict=True)
+        )
         return f"{text}{self.product:.0%} as the product {factors}"
 
 
@@ -306,7 +320,6 @@ def call_ends(log: CallColumns, skill: str) -> CallEnds:
         raise RunError(f"the log has no call of {skill!r}; record some")
     names = {end: end.name.lower() for end in list(CallEnd)[1:]}
     reasons = {name: int((some.end_reason == end).sum()) for end, name in names.items()}
-    vector = obs_codec(log.observation_space).split(to_tensor(some.end))[0].numpy()
     return CallEnds(
         skill,
         len(some),
@@ -314,7 +327,7 @@ def call_ends(log: CallColumns, skill: str) -> CallEnds:
         int(((some.end_reason == CallEnd.OWN) & (some.terminated | some.truncated)).sum()),
         float(some.tau.mean()),
         float(some.succeeded.mean()),
-        np.quantile(vector.reshape(len(some), -1), (0.1, 0.5, 0.9), axis=0),
+        np.quantile(log.flat(some.end), (0.1, 0.5, 0.9), axis=0),
     )
 
 
@@ -362,3 +375,9 @@ def wilson(successes: Any, trials: Any) -> tuple[Array, Array]:
     half = Z / (1 + Z * Z / safe) * np.sqrt(share * (1 - share) / safe + (Z / (2 * safe)) ** 2)
     low = np.where(n > 0, np.clip(middle - half, 0.0, 1.0), 0.0)
     return low, np.where(n > 0, np.clip(middle + half, 0.0, 1.0), 1.0)
+
+
+def shown_rate(done: float, calls: float, what: str = " calls") -> str:
+    """Return a share with its count and its 95 % interval, in words."""
+    low, high = wilson(done, calls)
+    return f"{done / calls:.0%} of {calls:,}{what} ({low:.0%} to {high:.0%})"

@@ -567,8 +567,8 @@ def _checked_reward(reward: Any, where: str) -> Reward:
         function: Callable[[Step], Any] = reward
         return function
     raise DeclarationError(
-        f"{where}: its reward is {short(reward)}; give a number of at most {LARGEST_REWARD:g}, or a function of "
-        "a step"
+        f"{where}: its reward is {short(reward)}; give a number of at most {LARGEST_REWARD:g}, "
+        "or a function of a step"
     )
 
 

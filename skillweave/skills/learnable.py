@@ -29,6 +29,24 @@ PLAIN_PPO = {"squash_actions": False, "action_std": "parameter"}
 """Settings of PPO whose actor is a plain network of means, or of logits."""
 
 
+def learn_on(skill: str) -> str:
+    """Return how a skill whose policy is given learns on, as a part of a sentence."""
+    return (
+        "write policy = from_sb3(..., learn=True), or from_torch's, if it is a network from "
+        "elsewhere; policy = Residual(policy) to learn a correction of its actions; if it is a "
+        f"skill of another run, leave out policy and call train(start_from={{{skill!r}: run}})"
+    )
+
+
+def no_mapping(who: str, given: str) -> str:
+    """Return the message for a policy that is to learn on, and has a mapping."""
+    return (
+        f"{who} learns on with the skill's observations and actions: leave out {given}. The parts "
+        "that it sees and writes are those of the skill's class, which learn on with it: write "
+        "sees = ... and acts = ... there"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Layers:
     """Linear layers with one nonlinearity between them."""

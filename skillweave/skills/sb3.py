@@ -23,7 +23,7 @@ from skillweave.notices import notice
 from skillweave.ops.moments import is_constant
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
-from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of
+from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
 from skillweave.skills.plan import Shapes
@@ -309,10 +309,7 @@ def _learnable(
     name = f"Stable-Baselines3's {kind}" + (f" of {file}" if file else "")
     given = [k for k, v in options.items() if v is not None and v != 1]
     if given:
-        raise DeclarationError(
-            f"from_sb3(learn=True): {name} learns on with the environment's own observations and "
-            f"actions: leave out {' and '.join(given)}"
-        )
+        raise DeclarationError(no_mapping(f"from_sb3(learn=True): {name}", " and ".join(given)))
     kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
     spaces = model.observation_space, model.action_space
     if kind not in kinds or hasattr(policy, "lstm_actor") or _has_gsde(policy):

@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import checksum, qualified
-from skillweave.skills.learnable import Learnable, of_module
+from skillweave.skills.learnable import Learnable, no_mapping, of_module
 from skillweave.skills.mapped import (
     MappedPolicy,
     invoke,
@@ -224,11 +224,12 @@ def from_torch(
     )
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_torch(): learn is {short(learn)}; it must be True or False")
-    if learn and (mapping != PolicyMapping() or isinstance(module, str | Path)):
+    if learn and mapping != PolicyMapping():
         raise DeclarationError(
-            "from_torch(learn=True) takes a module made of its class, which learns on with the "
-            "environment's own observations and actions: leave out sees, acts and the like"
+            no_mapping("from_torch(learn=True): the module", "sees, acts and the like")
         )
+    if learn and isinstance(module, str | Path):
+        raise DeclarationError("from_torch(learn=True) takes a module made of its class, no file")
     if isinstance(module, str | Path):
         file = Path(module)
         if trust is not True:

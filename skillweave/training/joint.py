@@ -257,10 +257,11 @@ class JointAgents(OneAgent):
             if decides(name):
                 continue
             if rows and not updates:
+                learns = self.first in self.stage.entry["learns"]
+                more = "raise together.epsilon, " if learns else ""
                 log.message(
                     f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
-                    "to learn from once: lower together.quota, raise together.epsilon, or give "
-                    "more steps"
+                    f"to learn from once: lower together.quota, {more}or give more steps"
                 )
             elif not rows:
                 log.message(

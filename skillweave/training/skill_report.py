@@ -14,7 +14,7 @@ from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import level_of
 from skillweave.planning.hand_over import HandOver
 from skillweave.settings import Count
-from skillweave.skills import Skill, asked
+from skillweave.skills import Skill, asked, is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import goals_of
 from skillweave.training.play import Played
@@ -63,6 +63,10 @@ class SkillReport:
     of a skill whose own reward was below 0 in the last of them."""
     own_with_episode: Count = field(default=0, compare=False)
     """Calls that ended by themselves in the episode's last step; ``ended`` has them as ``own``."""
+    learns: bool = field(default=True, compare=False)
+    """It was trained; False: its policy was given, so no reward changes what it does."""
+    has_goals: bool = field(default=False, compare=False)
+    """Its calls have goals, which initiation() does not see."""
 
     @property
     def length_mean(self) -> float | None:
@@ -276,6 +280,8 @@ class SkillTally:
                 late=int(self._late[i]),
                 hasty=int(self._hasty[i]),
                 own_with_episode=int(self._own_with_episode[i]),
+                learns=self.skills is None or is_trained(self.skills.skills[i]),
+                has_goals=self.skills is not None and self.skills.skills[i].goal_space is not None,
             )
             if i in self._below:
                 reports |= self._below[i].reports()

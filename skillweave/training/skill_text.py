@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from skillweave.paths import level_of
+from skillweave.skills.learnable import learn_on
 from skillweave.training.skill_report import ENDS, SkillReport, all_steps
 
 
@@ -77,11 +79,15 @@ def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
 def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
     """Return a sentence on each skill with mostly idle calls, while its others take time.
 
-    A skill whose calls all take a step or two, as a move does, is left out.
+    A skill whose calls all take a step or two, as a move does, is left out; so is one that could
+    not be kept from starting: it has goals, or is the only one.
     """
     sentences = []
+    levels = [level_of(name) for name in skills]
     for name, report in skills.items():
         others = report.calls - report.idle
+        if report.has_goals or levels.count(level_of(name)) == 1:
+            continue
         if report.idle > others and report.steps - report.idle > 2 * others:
             sentences.append(
                 f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
@@ -113,32 +119,55 @@ def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
             failed = "" if report.succeeded is None else ", without success"
             sentences.append(
                 f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its "
-                f"termination() within two steps{failed}, and their last reward was below 0. Where "
-                "a step costs and an end pays nothing, it is best to end at once: pay for success, "
-                "or let success alone end it. If it was called where its work was done, let its "
-                "initiation() be False there."
+                f"termination() within two steps{failed}, and their last reward was below 0. "
             )
+            if report.learns:
+                sentences[-1] += (
+                    "Where a step costs and an end pays nothing, it is best to end at once: pay "
+                    "for success, or let success alone end it."
+                )
+            else:
+                sentences[-1] += "Let success alone end it."
+            if not report.has_goals:
+                sentences[-1] += (
+                    " If it was called where its work was done, let its initiation() be False "
+                    "there."
+                )
     return sentences
 
 
-def useless_skills(skills: Mapping[str, SkillReport], episodes: int) -> list[str]:
+def useless_skills(
+    skills: Mapping[str, SkillReport], episodes: int, *, selector_learns: bool
+) -> list[str]:
     """Return a sentence on each skill that was never called, or whose calls never succeeded.
 
     Args:
         episodes: the number of episodes that were played.
+        selector_learns: False: it is ready, so no setting changes what it chooses.
     """
     sentences = []
     for name, report in skills.items():
         if not report.calls:
+            further = ", give it more steps" if report.learns else ""
+            further += (
+                ", or raise together.epsilon_final"
+                if selector_learns
+                else ", or let the selector choose it"
+            )
             sentences.append(
                 f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, "
-                "see that its initiation() is True where the other skills end, give it more "
-                "steps, or raise together.epsilon_final; else leave it out."
+                f"see that its initiation() is True where the other skills end{further}; else "
+                "leave it out."
             )
         elif report.succeeded == 0:
+            advice = (
+                "Give it more steps or longer calls (call_steps), or a reward that leads there"
+                if report.learns
+                else f"Give it longer calls (call_steps), or let it learn: {learn_on(name)}"
+            )
             sentences.append(
-                f"None of {report.calls:,} calls of skill {name!r} ended with success() true. Give "
-                "it more steps or longer calls (call_steps), or a reward that leads there."
+                f"None of {report.calls:,} calls of skill {name!r} ended with success() true. "
+                f"{advice}."
             )
     return sentences
 

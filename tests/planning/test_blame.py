@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from logs import log_of
@@ -42,7 +44,31 @@ def test_the_second_must_learn_where_no_end_would_do() -> None:
     assert not found.first
     assert (found.rate, found.calls) == (0.0, 120)
     assert "It would not help if 'a' ended elsewhere" in str(found)
-    assert str(found).endswith("So 'b' has to learn to start there.")
+    assert str(found).endswith("So 'b' itself has to work from there.")
+
+
+@pytest.mark.parametrize(
+    ("decides", "elsewhere", "first"),
+    [("end", False, True), ("key", False, False), ("place", True, True)],
+)
+def test_only_what_the_first_skill_changes_is_held_against_it(
+    decides: str, elsewhere: bool, first: bool
+) -> None:
+    """Number 1 is fixed in an episode; a ends anywhere ("end"), or at the place of that number.
+
+    Where b also starts elsewhere, its calls show that the place decides, not the number.
+    """
+    rng, episodes = np.random.default_rng(0), list[Any]()
+    for key in rng.random(120):
+        end = rng.random() if decides == "end" else key
+        won = bool(end < 0.4)
+        b = (B, [[end, key]], won, "own" if won else "limit")
+        episodes.append(([5.0, key], [(A, [[3.0, key], [end, key]], True, "own"), b]))
+        if elsewhere:
+            episodes.append(([end * 0.4, key], [(B, [[end, key]], True, "own")]))
+    found = log_of(["a", "b"], episodes, size=2).blame("b", "a")
+    assert (found.first, found.place) == (first, 0)
+    assert f"in {found.rate:.0%} of 120 calls (" in str(found)
 
 
 def test_none_is_to_blame_where_it_works() -> None:
@@ -71,5 +97,5 @@ def test_a_pair_without_a_call_is_said() -> None:
 @pytest.mark.parametrize("calls", [44, 45, 124])
 def test_a_skill_that_is_always_done_is_to_blame_for_nothing(calls: int) -> None:
     nan, reasons = float("nan"), {"own": 0, "limit": 0, "interrupted": 0, "episode": 0}
-    found = Blame("b", "a", 1.0, 1.0, calls, 1.0, 1.0, None, (nan, nan), reasons, False)
+    found = Blame("b", "a", 1.0, 1.0, calls, 9, 1.0, 1.0, None, (nan, nan), reasons, False)
     assert "neither skill is to blame" in str(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -183,8 +184,8 @@ def test_an_evaluation_says_what_seldom_succeeds_after_one_skill() -> None:
     )
     policy = hierarchy(turn, skills=skills)
     score = evaluate(policy, SPEC, episodes=30, log_calls=True)
-    sentence = "'look' succeeds in 0% of the calls after 'rest'; 100% elsewhere"
-    assert score.calls.hand_over().weakest() == [sentence]
+    (sentence,) = score.calls.hand_over().weakest()
+    assert re.match(r"'look' succeeds in 0% of \d+ calls .* after 'rest'; in 100% of", sentence)
     assert score.for_people().count(sentence) == 1
     assert sentence in score._repr_html_().replace("&#x27;", "'")
     few = evaluate(policy, SPEC, episodes=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from planning.logs import log_of
 
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning import CallLog, held
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.hand_over import HandOver, wilson
 
 A, B = 0, 1
 
@@ -64,7 +65,7 @@ def test_intervals() -> None:
 def test_it_is_shown_as_a_table(log: CallLog) -> None:
     lines = str(log.hand_over()).splitlines()
     assert lines[0].split() == ["after", "go", "stay"]
-    assert lines[2].split() == ["go", "100%", "(1)", "50%", "(2)"]
+    assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
     assert lines[3].split()[-1] == "–"
     assert "<table>" in log.hand_over()._repr_html_()
 
@@ -110,8 +111,25 @@ def test_a_chain_follows_where_calls_end() -> None:
 
 def test_the_broken_hand_over_is_named() -> None:
     sentences = walks(600, 1).hand_over().weakest()
-    assert any(s.startswith("'on' succeeds in 0% of the calls after 'back'; ") for s in sentences)
+    assert any(
+        re.match(r"'on' succeeds in 0% of \d+ calls \(.*\) after 'back'; in", s) for s in sentences
+    )
     assert not any(s.startswith("'there'") for s in sentences)
+
+
+def test_a_skill_that_is_never_done_is_the_weakest() -> None:
+    def never(calls: int, judged: bool = True) -> HandOver:
+        episode = (0, [(A, [1], True, "own"), (B, [2], False, "limit")])
+        return replace(
+            log_of(["go", "stay"], [episode] * calls), own_success=(True, judged)
+        ).hand_over()
+
+    assert never(20).weakest() == [
+        "'stay' succeeds in 0% of 20 calls (0% to 16%), whatever came before"
+    ]
+    assert never(20).weak() == [(1, 1)]
+    assert not never(19).weakest()  # too few
+    assert not never(20, judged=False).weakest()  # perhaps it only ends at its limit
 
 
 def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
@@ -127,7 +145,7 @@ def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
 
 
 def test_sentences_of_chains_and_ends(log: CallLog) -> None:
-    assert str(log.chain("go")) == ("go: 67% along the logged calls; 67% as the product 67%")
+    assert str(log.chain("go")) == ("go: 67% along the logged calls; 67% as the product 67% of 3")
     assert " then on: " in str(walks(60, 0).chain("back", "there", "on"))
     assert str(log.call_ends("stay")) == (
         "stay: 4 calls of 2.2 steps, of which 50% succeeded; ends: own 0%, limit 75%, "

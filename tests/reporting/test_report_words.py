@@ -15,7 +15,7 @@ from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
 from skillweave.reporting.report import calls
 from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.numbers import number, percent, share_interval
+from skillweave.reporting.report.numbers import number, percent
 from skillweave.reporting.report.single import score_words
 from skillweave.reporting.report.skills_table import about, reflex_rows
 from skillweave.reporting.report.verdict import no_verdict, verdict
@@ -62,12 +62,6 @@ def test_digits_fit_the_scale(value: float | None, scale: float | None, text: st
 def test_a_share_that_is_not_quite_all_or_nothing_does_not_look_like_it() -> None:
     shares = (0.0, 0.001, 0.42, 0.999, 1.0, None)
     assert [percent(share) for share in shares] == ["0 %", "<1 %", "42 %", ">99 %", "100 %", "–"]
-
-
-def test_the_interval_of_a_share_is_wilsons() -> None:
-    # Wilson's interval of 19 of 20, from its formula by hand.
-    assert share_interval(19, 20) == pytest.approx((0.764, 0.991), abs=1e-3)
-    assert share_interval(0, 10) == pytest.approx((0.0, 0.278), abs=1e-3)
 
 
 def test_returns_of_0_and_1_are_percent_and_others_are_not() -> None:

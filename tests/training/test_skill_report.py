@@ -29,7 +29,13 @@ from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED
 from skillweave.training.skill_report import SkillReport
-from skillweave.training.skill_text import skill_rows, skill_table
+from skillweave.training.skill_text import (
+    hints,
+    idle_calls,
+    skill_rows,
+    skill_table,
+    useless_skills,
+)
 
 # A walk shows the number of its episode.
 pytestmark = pytest.mark.filterwarnings("ignore:.*(starts another episode|two resets)")
@@ -498,19 +504,19 @@ def test_a_skill_for_which_it_is_best_to_end_at_once_is_told(kind):
     # In an episode's last step it has no choice.
     assert there.hasty == there.ended["own"] - there.own_with_episode > there.calls / 2
     failed = "" if kind is Silent else ", without success"
-    assert found.for_people().splitlines()[-1] == (
+    sentence = (
         f"{there.hasty:,} of {there.calls:,} calls of {name!r} ended by its termination() within "
-        f"two steps{failed}, and their last reward was below 0. Where a step costs and an end pays "
-        "nothing, it is best to end at once: pay for success, or let success alone end it. If it "
+        f"two steps{failed}, and their last reward was below 0. Let success alone end it. If it "
         "was called where its work was done, let its initiation() be False there."
     )
+    assert sentence in found.for_people().splitlines()
 
 
 def test_less_than_half_of_the_calls_is_not_told():
     found = told(by_turns, Sometimes, Left)[1]
     there = found.skills["sometimes"]
     assert 0 < 2 * there.hasty < there.calls
-    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+    assert "within two steps" not in found.for_people()
 
 
 def test_hasty_calls_within_a_hierarchy_are_counted():
@@ -525,7 +531,23 @@ def test_hasty_calls_within_a_hierarchy_are_counted():
 def test_calls_that_last_or_pay_are_not_hasty(kind):
     found = told(by_turns, kind, Left)[1]
     assert found.skills[kind.__name__.lower()].hasty == 0
-    assert found.for_people() == "\n".join([str(found), skill_table(found.skills)])
+    assert "within two steps" not in found.for_people()
+
+
+@pytest.mark.parametrize("selector_learns", [True, False])
+@pytest.mark.parametrize("learns", [True, False])
+@pytest.mark.parametrize("has_goals", [True, False])
+def test_only_remedies_that_the_declaration_has_are_named(selector_learns, learns, has_goals):
+    bad = SkillReport(9_000, 99, {}, 0, None, idle=90, hasty=90, learns=learns, has_goals=has_goals)
+    uncalled = SkillReport(0, 0, {}, 0, None, learns=learns, has_goals=has_goals)
+    text = " ".join(hints({"a": bad, "b": uncalled}))
+    assert ("initiation()" in text) == (not has_goals)
+    assert ("pay for success" in text) == learns
+    assert "initiation()" not in " ".join(idle_calls({"a": bad}))  # no other skill could start
+    text = " ".join(useless_skills({"a": bad, "b": uncalled}, 9, selector_learns=selector_learns))
+    assert ("give it more steps" in text) == ("a reward that" in text) == learns
+    assert ("Residual" in text) == ("learn=True" in text) == (not learns)
+    assert ("epsilon_final" in text) == selector_learns
 
 
 def test_moves_that_have_no_reward_of_their_own_are_not_hasty():

@@ -50,13 +50,3 @@ def percent(value: float | None) -> str:
     if 0.995 <= value < 1:
         return ">99 %"
     return f"{100 * value:.0f} %"
-
-
-def share_interval(count: int, total: int) -> tuple[float, float]:
-    """Return the 95 % interval of the share that ``count`` of ``total`` estimates (Wilson 1927)."""
-    z = 1.96
-    share = count / total
-    weight = z * z / total
-    middle = (share + weight / 2) / (1 + weight)
-    half = z / (1 + weight) * math.sqrt(share * (1 - share) / total + weight / (4 * total))
-    return max(middle - half, 0.0), min(middle + half, 1.0)

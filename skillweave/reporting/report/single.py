@@ -14,6 +14,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
 from skillweave.paths import AGENT, join
 from skillweave.planning import CallLog
+from skillweave.planning.hand_over import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
@@ -36,7 +37,7 @@ from skillweave.reporting.report.curves import (
 from skillweave.reporting.report.film import Film, make_film
 from skillweave.reporting.report.goals import goal_pictures
 from skillweave.reporting.report.hand_over import Section, hand_over_section
-from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
+from skillweave.reporting.report.numbers import number, percent, scale_of
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.skills_table import (
     WHY,
@@ -346,7 +347,7 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     }
     if count is None:
         return words
-    low, high = map(percent, share_interval(count, len(score.returns)))
+    low, high = map(percent, wilson(count, len(score.returns)))
     share = percent(count / len(score.returns))
     return words | {"solved": share, "solved_interval": f"{low} to {high}"}
 

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.paths import level_of
-from skillweave.reporting.report.numbers import number, percent, scale_of, share_interval
+from skillweave.planning.hand_over import wilson
+from skillweave.reporting.report.numbers import number, percent, scale_of
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
 
@@ -63,7 +64,7 @@ def _outcome(score: Evaluation) -> str:
     if count is not None:
         if n < FEW:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
-        least, most = map(percent, share_interval(count, n))
+        least, most = map(percent, wilson(count, n))
         return f"Solves {percent(count / n)} of {episodes}, so probably {least} to {most} of all"
     mean = number(score.mean, scale_of(score.returns))
     if n < FEW:
