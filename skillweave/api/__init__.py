@@ -72,6 +72,7 @@ from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
+from skillweave.planning.forecast import Forecast
 from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
@@ -888,7 +889,7 @@ class Run:
         return self._calls.has_any()
 
     @checked_names
-    def plan(self, task: Any, log: CallLog | None = None, **settings: Any) -> Run:
+    def plan(self, task: Any, log: CallLog | None = None, **settings: Any) -> PlannedRun:
         """Return the skills with a selector that plans a new task on logged calls; no training.
 
         Evaluations, films and players are about the task: its reward, its end, its success. Nothing
@@ -920,6 +921,8 @@ class Run:
                 settings["predicates"] = mission_words(declared, words)
         settings.setdefault("features", declared.features)
         planner = Planner(log, task, skills=self.policy, **settings)
+        if planner.plan.sweeps and (reason := planner.forecast.reason):  # goals differ elsewhere
+            notice(f"this plan has a chance of {planner.forecast.chance:.0%}: {reason}")
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)
 
@@ -1084,6 +1087,18 @@ class PlannedRun(Run):
         )
         declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
         return declared
+
+    def explain(self) -> Forecast:
+        """Return the calls that the plan intends, its chance and its steps, before it is played.
+
+        Printed, it is a line. Episodes are simulated along the logged calls.
+
+        Raises:
+            RunError: the log has no start of an episode.
+        """
+        planner = self.hierarchy.selector
+        assert isinstance(planner, Planner)
+        return planner.forecast
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

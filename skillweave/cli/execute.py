@@ -9,6 +9,7 @@ import ast
 import importlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -168,10 +169,11 @@ def _plan(command: commands.Plan) -> None:
             say(f"there is no log of calls: recording {command.steps:,} steps")
         run.log_calls(command.steps)
     planned = run.plan(command.mission)
+    forecast = planned.explain()
     score = planned.evaluate(command.episodes, seed=command.seed, quiet=command.quiet)
     result = {"target": command.target, "mission": command.mission, "seed": command.seed}
-    result |= score.to_json()
-    text = score.for_people()
+    result |= {"plan": asdict(forecast)} | score.to_json()
+    text = f"plan: {forecast}\n{score.for_people()}"
     if command.film is not None:
         film = planned.render(command.film, seed=command.seed, quiet=command.quiet)
         result["film"] = film["path"]

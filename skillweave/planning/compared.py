@@ -139,7 +139,7 @@ def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:
     other = few.next_obs[rng.permutation(few.steps)]
     for own, new in ((start, other[few.offset[:-1]]), (inside, other)):
         arrays = (log.before, log.next_obs, own, new)
-        for first, then, mine, others in zip(*map(_leaves, arrays), strict=True):
+        for first, then, mine, others in zip(*map(leaves, arrays), strict=True):
             np.copyto(mine, others, where=(first == then).all(0))
     changed = read_log(task, replace(few, start=start, next_obs=inside))
     known = read_log(task, few)
@@ -149,9 +149,9 @@ def _reads_fixed(task: RewardMachine, log: CallColumns) -> bool:
     )
 
 
-def _leaves(obs: Array) -> Iterator[Array]:
+def leaves(obs: Array) -> Iterator[Array]:
     """Yield the innermost parts of observations (n, …), which share their memory."""
     for name in obs.dtype.names or ():
-        yield from _leaves(obs[name])
+        yield from leaves(obs[name])
     if obs.dtype.names is None:
         yield obs

@@ -179,6 +179,8 @@ class CallGraph:
         last = pieces.then < 0
         steps, self._end_of = np.unique(pieces.stop[last] - 1, return_inverse=True)
         self._last = np.flatnonzero(last)
+        self.end_step = steps
+        """(E,) int64, the last step before each end."""
         self.end = log.next_obs[steps]
         """(E, *obs_shape), the observations at the ends of calls."""
         call = log.owner[steps]
@@ -254,6 +256,15 @@ class CallGraph:
         each = np.array([group.usual for _, group in self.groups], np.float32)
         each = np.where(np.isfinite(each), np.maximum(each, SOFT), np.float32(1.0))
         return each.repeat([group.options for _, group in self.groups])
+
+    @cached_property
+    def end_of(self) -> Array:
+        """The end of the call that each piece is of, (P,) int64."""
+        end = np.empty(len(self.pieces.call), np.int64)
+        end[self._last] = self._end_of
+        for rows in self._depths:
+            end[rows] = end[self.pieces.then[rows]]
+        return end
 
     def _options_of(self, choice: int) -> Options:
         """Return the options of a choice."""

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.messages import observed
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.machine import Counter, Readings, RewardMachine
+from skillweave.planning.machine import Arrow, Counter, Readings, RewardMachine
 from skillweave.planning.neighbours import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.types import Array
 
 TRIES = 20_000
 """Observations that are made up, to find one in which a predicate holds."""
+MOST_PLACES = 1_000_000
+"""The most pairs of a task's state and what holds, that are searched for a way."""
 
 
 def read_log(task: RewardMachine, log: CallColumns) -> Readings:
@@ -73,6 +75,58 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
     if (accepted and pays) or not missing:
         return
     raise RunError(_sentence(list(missing.values()), log))
+
+
+def obstacle(task: RewardMachine, log: CallColumns) -> str:
+    """Return why no order of logged steps does a task, in a sentence; empty: one does.
+
+    Steps in which the same events hold count as the same, and counters are one step short, so an
+    order that the log allows is never missed.
+    """
+    events = read_log(task, log)
+    _, first, of = np.unique(events.events, axis=0, return_index=True, return_inverse=True)
+    count, of = len(first), of.reshape(-1)
+    joined = np.flatnonzero(log.followed_by >= 0)
+    if not task.accepting.any() or not len(joined) or count * len(task.accepting) > MOST_PLACES:
+        return ""
+    # What may follow: from pattern to pattern; the last row is the start of an episode.
+    follows = np.zeros((count + 1, count), bool)
+    inside = np.flatnonzero(np.diff(log.owner) == 0)
+    follows[of[inside], of[inside + 1]] = True
+    follows[of[log.offset[joined + 1] - 1], of[log.offset[log.followed_by[joined]]]] = True
+    follows[count, of[log.offset[:-1][log.order == 0]]] = True
+    reached = np.zeros((len(task.accepting), count + 1), bool)
+    place, at = np.array([task.plan.start]), np.array([count])
+    while len(place):
+        reached[place, at] = True
+        rows, to = np.nonzero(follows[at])
+        state = task.start(len(rows))
+        state[:, 0] = place[rows]
+        state[:, 1:] = task.counter_steps[place[rows]] - 1
+        after = task.advance(state, events.take(first[to]))[0][:, 0]
+        place, at = np.unique(np.stack([after, to]), axis=1)
+        new = ~reached[place, at]
+        over = task.is_over(place[:, None])
+        reached[place[over], at[over]] = True
+        place, at = place[new & ~over], at[new & ~over]
+    states = reached.any(1)
+    if (states & task.accepting).any():
+        return ""
+    arrows = [a for a in task.plan.arrows if states[a.origin]]
+    wanted = _named(a for a in arrows if not (states | task.failing)[a.target])
+    text = f"no plan does this task by the log: {wanted} never holds"
+    if before := _named(a for a in arrows if states[a.target] and not task.failing[a.target]):
+        text += f" after {before}"
+    if avoided := _named(a for a in arrows if task.failing[a.target]):
+        text += f", unless {avoided} holds first, which is avoided"
+    return text
+
+
+def _named(arrows: Iterable[Arrow]) -> str:
+    """Return the names of arrows' events, each once."""
+    atoms = (atom for arrow in arrows for atom in arrow.atoms)
+    names = (a.predicate.name if isinstance(a, Counter) else a.name for a in atoms)
+    return " or ".join(map(repr, dict.fromkeys(names)))
 
 
 def _sentence(missing: Sequence[Predicate], log: CallColumns) -> str:

@@ -181,7 +181,7 @@ class RewardMachine:
             )
         for arrow in plan.arrows:
             for atom in arrow.atoms:
-                self._event(_predicate(atom))
+                self.number(_predicate(atom))
         # Two columns behind those of the events: one is never true, the other always.
         never, always = len(self.events), len(self.events) + 1
         self._counted = np.full((count, self.slots), never)
@@ -189,7 +189,7 @@ class RewardMachine:
         """Steps for which each counter must count, (Q, H); the largest number: it is not used."""
         for q, some in enumerate(counters):
             for slot, counter in some.items():
-                self._counted[q, slot] = self._event(counter.predicate)
+                self._counted[q, slot] = self.number(counter.predicate)
                 self.counter_steps[q, slot] = counter.steps
         self._atoms = np.full((count, most, atoms), always)
         self._atoms[:, :, 0] = never
@@ -199,7 +199,7 @@ class RewardMachine:
         for q, arrows in enumerate(by_state):
             for t, arrow in enumerate(arrows):
                 self._atoms[q, t, : len(arrow.atoms)] = [
-                    always + 1 + atom.slot if isinstance(atom, Counter) else self._event(atom)
+                    always + 1 + atom.slot if isinstance(atom, Counter) else self.number(atom)
                     for atom in arrow.atoms
                 ]
                 self._target[q, t] = arrow.target
@@ -232,7 +232,7 @@ class RewardMachine:
         """Return the transitions from a state, in the order in which they are checked."""
         return self._by_state[state]
 
-    def _event(self, predicate: Predicate) -> int:
+    def number(self, predicate: Predicate) -> int:
         """Return the number of a predicate among the events; the same function has one number."""
         for i, known in enumerate(self.events):
             same = known.function is predicate.function or known.function == predicate.function

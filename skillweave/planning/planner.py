@@ -6,6 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import gymnasium as gym
@@ -19,9 +20,10 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
+from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, Near
-from skillweave.planning.lacking import check_possible, read_log
+from skillweave.planning.lacking import check_possible, obstacle, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
@@ -155,8 +157,11 @@ class Planner(ReadySelector):
             )
         self.plan = Plan(np.zeros((0, 0), np.float32), 0)
         """The plan; empty where each observation has a goal of its own."""
+        self.obstacle = ""
+        """Why no order of logged steps does the task; empty: one does, or it has no end."""
         if isinstance(self.task, RewardMachine):
             self.plan = self._solve(self.task)
+            self.obstacle = obstacle(self.task, log)
         elif self.task.goal is not None:
             self.plan = self._plan_of(self.task.goal)
 
@@ -214,9 +219,25 @@ class Planner(ReadySelector):
         Returns:
             The choices (n,), and the calls of the graph whose goals they have, (n,); −1: none.
         """
-        near = self.graph.near(obs)
-        option = self._choose(self._values(near, obs, state), may, None)
+        option, near = self.options(obs, state, may)
         return self.graph.choice_of[option], near.goal[np.arange(len(obs)), option]
+
+    def options(
+        self, obs: Array, state: Array, may: Array, rng: np.random.Generator | None = None
+    ) -> tuple[Array, Near]:
+        """Return the best options of the graph, (n,), and the nearest calls; see ``choices``."""
+        near = self.graph.near(obs)
+        return self._choose(self._values(near, obs, state), may, rng), near
+
+    def over_at(self, end: Array) -> Array:
+        """Return where nothing follows the ends (n,) of calls."""
+        over: Array = (self.graph.terminated if self._own_end is None else self._own_end)[end]
+        return over
+
+    @cached_property
+    def forecast(self) -> Forecast:
+        """The calls that the plan intends, and its chance; see ``forecast.forecast``."""
+        return forecast(self)
 
     def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
         """Return goals of choices (n,) from calls (n,) in the graph, as of ``with_goals``."""
