@@ -43,7 +43,7 @@ class AgentPolicy(Memoryless):
         """Return the policy of one member of a state."""
         return cls(algorithm, algorithm.weights(state, member))
 
-    def watch(self, who: str) -> None:
+    def name_outliers(self, who: str) -> None:
         """Name observations far beyond those that it learnt from, from now on; see ``Seen``."""
         if self.algorithm.normalize_obs:
             stats = (self.weights[k] for k in OBS_STATS)
@@ -145,7 +145,7 @@ class AgentPolicy(Memoryless):
                     "or the file was altered"
                 )
         policy = cls(algorithm, weights)
-        policy.watch(where)
+        policy.name_outliers(where)
         return policy
 
 

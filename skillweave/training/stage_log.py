@@ -277,7 +277,7 @@ class StageLog:
                 save_state(self.run, entry["name"], name, state)
         self._save_policies(policies)
         for name, policy in policies.items():
-            policy.watch(repr(name))
+            policy.name_outliers(repr(name))
         if self._has_final:
             self.run.keep_final(entry["name"])
         entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
