@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 EPISODES = 200
 GOALS = 16
 """Episodes where each has a goal of its own, which needs a plan of its own."""
+EQUAL = 10
+"""Times K neighbours are looked at, as many calls may start in the same place."""
 MOST_CALLS = 100
 """The most calls of an episode."""
 UNLIKELY = 0.2
@@ -102,8 +104,12 @@ def forecast(planner: Planner) -> Forecast:
         here, before = np.flatnonzero(running), elapsed.copy()
         at, may_here = np.arange(len(here)), may[here] | ~may[here].any(1, keepdims=True)
         option, near = planner.options(obs[here], state[here], may_here, rng)
-        drawn = near.weights[at, option].cumsum(1) < rng.random((len(here), 1))
-        piece = near.pieces[at, option, np.minimum(drawn.sum(1), graph.neighbours - 1)]
+        wide = graph.near(obs[here], EQUAL * graph.neighbours)
+        weights = wide.weights[at, option]
+        # Beyond the plan's K neighbours those count that are as near as the last of these.
+        weights = weights * (weights >= 0.999 * weights[:, graph.neighbours - 1, None])
+        drawn = weights.cumsum(1) < rng.random((len(here), 1)) * weights.sum(1, keepdims=True)
+        piece = wide.pieces[at, option, np.minimum(drawn.sum(1), weights.shape[1] - 1)]
         far = near.distance[at, option] / graph.units[option]
         step, end = graph.pieces.first[piece], graph.end_of[piece]
         goes_on = np.isfinite(far)

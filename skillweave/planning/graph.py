@@ -212,22 +212,24 @@ class CallGraph:
             for group in options.groups(self.neighbours)
         ]
 
-    def near(self, obs: Array) -> Near:
-        """Return the nearest pieces of each choice to observations (n, …)."""
-        return self.near_features([each(obs) for each in self.maps])
+    def near(self, obs: Array, most: int = 0) -> Near:
+        """Return the nearest pieces of each choice to observations (n, …): K, or ``most``."""
+        features = [each(obs) for each in self.maps]
+        return self._near([features[skill] for skill in self.skill_of], most=most)
 
     def near_features(self, features: list[Array]) -> Near:
         """Return the nearest pieces to features of each skill, (n, F) each."""
         return self._near([features[skill] for skill in self.skill_of])
 
-    def _near(self, features: list[Array], without: Array | None = None) -> Near:
+    def _near(self, features: list[Array], without: Array | None = None, most: int = 0) -> Near:
         """Return the nearest pieces to features for each choice, (n, F) each.
 
         Args:
             without: (n,) calls whose pieces do not count.
+            most: how many, each of another call; 0: K.
         """
         found = [
-            options.near(to, self.neighbours, without)
+            options.near(to, most or self.neighbours, without)
             for options, to in zip(self._options, features, strict=True)
         ]
         pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))

@@ -1,0 +1,114 @@
+"""Chances of plans before they are played, on logs whose answer is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from planning.logs import log_of
+
+from skillweave.planning import CallLog, GoalTask, Mission, Planner, RewardMachine, held
+
+A, B = 0, 1
+
+
+def at(*places: float) -> Any:
+    def here(obs: Any) -> Any:
+        return np.isin(obs[:, 0], places)
+
+    here.__name__ = f"at {places[0]}"
+    return here
+
+
+def goes_right(share: float, episodes: int = 100) -> CallLog:
+    """From 0, "a" walks to 1 in two steps, or ends the episode; from there "b" to 2."""
+    way: list[Any] = [(A, [0.5, 1], True, "own"), (B, [2], True, "own")]
+    lost: list[Any] = [(A, [-1], False, "end")]
+    won = round(share * episodes)
+    return log_of(["a", "b"], [(0, way)] * won + [(0, lost)] * (episodes - won))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.6, 1.0])
+def test_the_chance_is_that_of_the_logged_calls(share: float) -> None:
+    expected = Planner(goes_right(share), Mission(at(1), at(2))).forecast
+    assert expected.chance == pytest.approx(share, abs=0.1)
+    assert expected.interval[0] < expected.chance <= expected.interval[1] + 1e-9
+    assert expected.calls == (("a", 2.0), ("b", 1.0))
+    assert expected.steps == 3
+    assert ("-1" in expected.reason or "state" in expected.reason) == (share < 0.2)
+    assert str(expected).startswith("a (2 steps) → b (1 steps): a chance of ")
+
+
+def test_few_starts_make_a_wide_interval_and_few_calls_are_unsure() -> None:
+    low, high = Planner(goes_right(0.5, 10), Mission(at(1))).forecast.interval
+    assert high - low > 0.4
+
+
+def test_what_never_changes_in_an_episode_stays() -> None:
+    """ "a" goes to the place that number 1 holds, "b" back to 0, in half of the episodes to 1."""
+    rng, episodes = np.random.default_rng(0), list[Any]()
+    for i in range(120):
+        key, here, calls = i % 2, 0.0, list[Any]()
+        for _ in range(4):
+            skill = int(rng.integers(2))
+            here = [key, 0.0][skill] + rng.normal(0, 0.01)
+            calls.append((skill, [[here, key]], True, "own"))
+        episodes.append(([rng.normal(0, 0.01), key], [*calls[:-1], (*calls[-1][:3], "cut")]))
+    log = log_of(["a", "b"], episodes, size=2)
+    planner = Planner(log, Mission(lambda obs: obs[:, 0] > 0.5))
+    assert planner.forecast.chance == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        (Mission(at(1), at(0)), ["at 0", "after", "at 1"]),
+        (Mission(at(2), avoid=at(0.5)), ["at 2", "unless", "at 0.5"]),
+        (Mission(at(1), at(2), held(at(0.5), 2)), ["at 0.5", "at 2"]),
+    ],
+)
+def test_an_order_that_never_comes_is_named(task: Any, words: list[str]) -> None:
+    steps = [(0, [(A, [0, 1], True, "own"), (B, [0.5, 2], True, "own")])]
+    planner = Planner(log_of(["a", "b"], steps * 5), task)
+    assert all(word in planner.obstacle for word in words)
+    assert (planner.forecast.chance, planner.forecast.reason) == (0.0, planner.obstacle)
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        Mission(at(1), at(2), at(3)),  # the log has it in two parts
+        Mission(held(at(1), 5), at(2)),  # calls may be repeated
+        Mission(at(3), at(2), repeat=None),
+        RewardMachine({("x", "y"): (at(3), 1.0)}),
+        GoalTask(lambda obs, goal: obs[:, 0] == goal[0], goal=[3]),
+    ],
+)
+def test_what_the_log_allows_is_not_named(task: Any) -> None:
+    episodes = [
+        (0, [(A, [1], True, "own"), (A, [1], True, "own"), (B, [2], True, "own")]),
+        (1, [(B, [2], True, "own"), (A, [3], True, "own")]),
+    ]
+    planner = Planner(log_of(["a", "b"], episodes * 5), task)
+    assert not planner.obstacle
+    assert planner.forecast.calls
+    can_succeed = planner.machine.accepting.any()
+    assert (planner.forecast.chance is None) == (not can_succeed)
+
+
+def test_goals_of_each_episode_are_judged_by_themselves() -> None:
+    ends = [(1, 1)] * 8 + [(2, 1)] * 7 + [(2, 2)]
+    calls = [(goal, [(A, [[end, goal]], True, "end")]) for goal, end in ends]
+    log = log_of(["a"], [([0, goal], call) for goal, call in calls], size=2)
+    task = GoalTask(lambda obs, goal: obs[:, 0] == goal[..., 0], columns=(1,))
+    assert Planner(log, task).forecast.chance == pytest.approx(9 / 16, abs=0.15)
+
+
+def test_what_is_avoided_and_holds_at_the_start_is_named() -> None:
+    slow: list[Any] = [(A, [0.5, 1], True, "own")]
+    log = log_of(["a"], [(0, slow)] * 18 + [(0, [(A, [1], True, "own")])] * 2)
+    expected = Planner(log, Mission(at(1), avoid=at(0.5))).forecast
+    assert expected.chance < 0.2
+    assert "'at 0.5'" in expected.reason
+    assert "first steps" in expected.reason
