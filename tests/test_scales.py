@@ -79,10 +79,12 @@ def test_a_sentinel_does_not_make_the_planner_blind(share, noise, digits):
 
 
 CASES = {  # what was seen, what comes later, and whether it is named
-    "a constant that changes": ([0.0] * 100, 1.0, False),
-    "a constant that is far away": ([0.0] * 100, 50.0, True),
+    "a constant that changes": ([0.0] * 1_000, 1.0, False),
+    "a constant that is far away": ([0.0] * 1_000, 50.0, True),
     "a rare flag": ([0.0] * 9_999 + [1.0], 1.0, False),
-    "a sentinel": ([-1.0, 1.0] * 50, -999.0, True),
+    "a sentinel": ([-1.0, 1.0] * 500, -999.0, True),
+    "a little outside": ([-1.0] + [0.0] * 1_000 + [1.0], 5.0, False),
+    "a short training": ([-1.0, 1.0] * 50, -999.0, False),
     "a sentinel that was seen": ([-1.0, 1.0] * 500 + [-999.0], -999.0, False),
 }
 

@@ -167,7 +167,7 @@ def test_the_scaling_of_observations_counts_for_as_much_as_was_seen(source, tmp_
     moments = {
         k: v for k, v in learners_of_run(source)["left"].policy.weights.items() if "obs_" in k
     }
-    assert set(moments) == {"obs_mean", "obs_var", "obs_low", "obs_high"}
+    assert set(moments) == {"obs_mean", "obs_var", "obs_low", "obs_high", "obs_count"}
     run = declare().train(tmp_path / "run", seed=6, quiet=True, start_from=source)
     (told,) = [s["starts"] for s in run.info()["stages"] if s["name"] == "left"]
     assert told["left"]["steps"] == 320  # of the source's stage: ten rollouts

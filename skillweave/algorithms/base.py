@@ -35,7 +35,7 @@ from skillweave.types import Array, prefixed
 
 S = TypeVar("S")
 Device = torch.device | str
-OBS_STATS = ("obs_mean", "obs_var", "obs_low", "obs_high")
+OBS_STATS = ("obs_mean", "obs_var", "obs_low", "obs_high", "obs_count")
 """The fields of a state that its policy's weights also hold, where observations are normalised."""
 
 
@@ -306,7 +306,7 @@ class Algorithm:
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of one member's ``weights``."""
-        scaling = dict.fromkeys(OBS_STATS, (self.obs.size,))
+        scaling = dict.fromkeys(OBS_STATS, (self.obs.size,)) | {"obs_count": ()}
         return self.layout.shapes | (scaling if self.normalize_obs else {})
 
     def weights(self, state: Any, member: int = 0) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 from torch import Tensor
@@ -10,35 +10,42 @@ from torch import Tensor
 from skillweave.notices import notice
 from skillweave.ops.moments import CLIP, scale_of
 
+FEWEST = 1_000
+"""The fewest observations whose range says what is usual."""
+
 
 @dataclass
 class Seen:
     """The range of numbers that were seen; the first one far beyond it is named, once.
 
-    It is far beyond where it is outside by more than the width of the range, and more than
-    ``CLIP`` deviations from the mean.
+    It is far beyond where it is outside by more than three times the width of the range, and more
+    than ``CLIP`` deviations from the mean.
     """
 
     who: str
     """The start of the message, before the place of the number."""
     mean: Tensor  # (O,)
     var: Tensor  # (O,)
-    low: Tensor  # (O,), of a fresh ``AgentState``: the range is unknown, and nothing is far
+    low: Tensor  # (O,)
     high: Tensor  # (O,)
-    said: bool = field(default=False, init=False)
+    count: Tensor | int
+    """How many were seen; of less than ``FEWEST`` nothing is named."""
+
+    def __post_init__(self) -> None:
+        self._quiet = bool(self.count < FEWEST)
 
     @cached_property
     def _ends(self) -> tuple[Tensor, Tensor]:
-        width = (self.high - self.low).abs()  # infinite where it is unknown
+        width = 3.0 * (self.high - self.low)
         away = CLIP * scale_of(self.mean, self.var)
         low, high = self.low - width, self.high + width
         return low.minimum(self.mean - away), high.maximum(self.mean + away)
 
     def look(self, numbers: Tensor) -> None:
         """Give the notice if one of ``numbers`` (..., O) is far beyond, unless it was given."""
-        if self.said or (near := numbers.clamp(*self._ends)).equal(numbers):
+        if self._quiet or (near := numbers.clamp(*self._ends)).equal(numbers):
             return
-        self.said = True
+        self._quiet = True
         worst = int(((numbers - near).abs() / scale_of(self.mean, self.var)).argmax())
         place = worst % len(self.low)
         notice(

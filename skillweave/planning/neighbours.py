@@ -126,7 +126,7 @@ class FeatureMap(Standard):
                 "another; give features= that change, or record calls from other states"
             )
         ends = map(torch.from_numpy, (raw.min(0), raw.max(0)))
-        self._seen = Seen(f"the plan with {who}: feature", *self.moments, *ends)
+        self._seen = Seen(f"the plan with {who}: feature", *self.moments, *ends, len(raw))
         self.size = int(self.varies.sum())
         """F, the number of features."""
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal, Self, overload
 
 import numpy as np
-import torch
 from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict, MultiBinary
 
@@ -20,7 +19,6 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
-from skillweave.ops.moments import is_constant
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
@@ -387,9 +385,14 @@ def _variance(rms: Any) -> Array:
 
     It begins as if 1e-4 samples with mean 0 and variance 1 had been seen.
     """
+    import torch
+
+    from skillweave.ops.moments import is_constant
+
     mean, var = (torch.as_tensor(np.ravel(x), dtype=torch.float64) for x in (rms.mean, rms.var))
     made_up = 1e-4 * (1.0 + mean.square()) / rms.count
-    return torch.where(is_constant(mean, (var - made_up).abs()), 1.0, var).numpy()
+    known: Array = torch.where(is_constant(mean, (var - made_up).abs()), 1.0, var).numpy()
+    return known
 
 
 def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
