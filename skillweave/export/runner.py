@@ -819,7 +819,7 @@ class _Plan(_Function):  # a selector: the option whose nearest logged calls are
             best = np.where(may[:-1], q[:-1], -np.inf).max(1)
             return np.where(np.isfinite(best), best, 0.0)
 
-        value, q = best(logged), logged
+        value, q = best(np.where(own > 0, -np.inf, logged)), logged
         for _ in range(entry["latest"]):
             y = paid[:, 0] + paid[:, 1] * value
             q = (base + np.einsum("eco,c->eo", weight, y)) / both

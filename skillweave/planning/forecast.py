@@ -17,9 +17,11 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.hand_over import wilson
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import Readings, RewardMachine
+from skillweave.planning.tried import SLACK
 from skillweave.types import Array
 
 if TYPE_CHECKING:
+    from skillweave.planning.graph import CallGraph
     from skillweave.planning.planner import Planner
 
 EPISODES = 200
@@ -89,8 +91,9 @@ def forecast(planner: Planner) -> Forecast:
     if not len(starts):
         raise RunError("the log has no start of an episode, so no plan can be judged by it")
     n = GOALS if isinstance(task, GoalTask) and task.columns is not None else EPISODES
+    before = log.before
     first = planner.log.start[starts[np.arange(n) * len(starts) // n]]
-    fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (log.before, log.next_obs)), strict=True)]
+    fixed = [(a == b).all(0) for a, b in zip(*map(leaves, (before, log.next_obs)), strict=True)]
     cut = planner.log.was_cut
     limit = (planner.log.age + planner.log.tau)[cut].max(initial=0) or np.inf
     known = None if isinstance(task, GoalTask) else read_log(task, log)
@@ -101,7 +104,7 @@ def forecast(planner: Planner) -> Forecast:
     # Of each call the skill (−1: none), its steps, and how far the nearest logged one was.
     history = np.full((MOST_CALLS, 3, n), -1.0)
     for calls in history:
-        here, before = np.flatnonzero(running), elapsed.copy()
+        here, until = np.flatnonzero(running), elapsed.copy()
         at, may_here = np.arange(len(here)), may[here] | ~may[here].any(1, keepdims=True)
         option, near = planner.options(obs[here], state[here], may_here, rng)
         wide = graph.near(obs[here], EQUAL * graph.neighbours)
@@ -125,11 +128,17 @@ def forecast(planner: Planner) -> Forecast:
             step += goes_on
             goes_on &= (step <= graph.end_step[end]) & (elapsed[here] < limit)
             goes_on &= ~machine.is_over(state[here])
-        calls[:, here] = graph.skill_of[graph.choice_of[option]], (elapsed - before)[here], far
+        calls[:, here] = graph.skill_of[graph.choice_of[option]], (elapsed - until)[here], far
         over = machine.is_over(state[here]) | (elapsed[here] >= limit) | ~np.isfinite(far)
         running[here[over | planner.over_at(end)]] = False
         if not running.any():
             break
+        # A call that led nowhere is not chosen again at once, as the episode's calls count, too.
+        begins = before[graph.pieces.first[piece]]
+        off = np.maximum(_shift(graph, option, begins, obs[here]), SLACK)
+        still = _shift(graph, option, begins, graph.end[end]) <= off
+        may[here[still], graph.choice_of[option[still]]] = False
+        here, end = here[~still], end[~still]
         obs[here], may[here] = graph.end[end], graph.may[end]
         for own, start, same in zip(leaves(obs), leaves(first), fixed, strict=True):
             np.copyto(own, start, where=same)
@@ -154,6 +163,15 @@ def forecast(planner: Planner) -> Forecast:
         ),
         reason or "",
     )
+
+
+def _shift(graph: CallGraph, option: Array, one: Array, other: Array) -> Array:
+    """Return the distances (n,) between observations, as the skills of options see them."""
+    shift, skill = np.zeros(len(option)), graph.skill_of[graph.choice_of[option]]
+    for i in np.unique(skill):
+        mine, features = skill == i, graph.maps[i]
+        shift[mine] = np.linalg.norm(features(one[mine]) - features(other[mine]), axis=1)
+    return shift
 
 
 def _usual_calls(history: Array, skills: tuple[str, ...]) -> tuple[tuple[str, float], ...]:

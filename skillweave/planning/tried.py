@@ -208,7 +208,8 @@ class Tried:
         both = np.where(known | (own > 0), np.maximum(total + own, 1e-12), np.inf)
         missing = ~known & (own <= 0)
         may = memory["tried.may"]
-        value = _best(logged[:, :-1], may)
+        # From what was not tried: a call that led back to its start would else be worth itself.
+        value = _best(np.where(own > 0, -np.inf, logged)[:, :-1], may)
         for _ in range(LATEST):
             y = memory["tried.reward"] + memory["tried.discount"] * value
             q_all = (base + np.einsum("neco,nc->neo", weight, y)) / both
