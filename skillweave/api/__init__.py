@@ -72,7 +72,7 @@ from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
-from skillweave.planning.forecast import Forecast
+from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
@@ -921,8 +921,9 @@ class Run:
                 settings["predicates"] = mission_words(declared, words)
         settings.setdefault("features", declared.features)
         planner = Planner(log, task, skills=self.policy, **settings)
-        if planner.plan.sweeps and (reason := planner.forecast.reason):  # goals differ elsewhere
-            notice(f"this plan has a chance of {planner.forecast.chance:.0%}: {reason}")
+        # Where each episode has a goal of its own, so has its plan.
+        if planner.plan.sweeps and (expected := forecast(planner)).reason:
+            notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         hierarchy, policy = planned(declared, self.policy, planner)
         return PlannedRun(hierarchy, self.path, policy)
 
@@ -1098,7 +1099,7 @@ class PlannedRun(Run):
         """
         planner = self.hierarchy.selector
         assert isinstance(planner, Planner)
-        return planner.forecast
+        return forecast(planner)
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

@@ -6,7 +6,6 @@ Stands alone because it judges a plan, and the planner makes it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,15 +13,13 @@ from skillweave.errors import RunError
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import leaves
 from skillweave.planning.goal import GoalTask
+from skillweave.planning.graph import CallGraph
 from skillweave.planning.hand_over import wilson
-from skillweave.planning.lacking import read_log
-from skillweave.planning.machine import Readings, RewardMachine
+from skillweave.planning.lacking import names_of, read_log
+from skillweave.planning.machine import Readings, RewardMachine, predicate_of
+from skillweave.planning.planner import Planner
 from skillweave.planning.tried import SLACK
 from skillweave.types import Array
-
-if TYPE_CHECKING:
-    from skillweave.planning.graph import CallGraph
-    from skillweave.planning.planner import Planner
 
 EPISODES = 200
 GOALS = 16
@@ -121,6 +118,7 @@ def forecast(planner: Planner) -> Forecast:
             if known is not None:
                 readings = known.take(steps)
             else:
+                assert isinstance(task, GoalTask)  # else its events are known
                 there = task.holds(log.next_obs[steps], task.of(first[some]))
                 readings = Readings(there[:, None], np.zeros((len(some), 0)))
             state[some] = machine.advance(state[some], readings)[0]
@@ -191,9 +189,10 @@ def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings 
     begins = log.offset[:-1][log.order == 0]
     for arrow in machine.arrows_from(machine.plan.start):
         if known is not None and machine.failing[arrow.target]:
-            (bad,) = arrow.atoms
-            holds = known.events[begins, machine.number(bad)].mean()
+            numbers = [machine.number(predicate_of(atom)) for atom in arrow.atoms]
+            holds = known.events[begins][:, numbers].all(1).mean()
             if holds > 0.5:
-                return f"{bad.name!r}, which is avoided, holds in {holds:.0%} of the first steps"
+                bad = names_of([arrow])
+                return f"{bad}, which is avoided, holds in {holds:.0%} of the first steps"
     stuck = machine.state_names[int(np.bincount(state).argmax())]
     return f"most episodes end in the state {stuck!r}"

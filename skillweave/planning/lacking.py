@@ -9,7 +9,7 @@ import numpy as np
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.messages import observed
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.machine import Arrow, Counter, Readings, RewardMachine
+from skillweave.planning.machine import Arrow, Readings, RewardMachine, predicate_of
 from skillweave.planning.neighbours import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.types import Array
@@ -62,7 +62,7 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
         for arrow in task.plan.arrows:
             if arrow.origin != state:
                 continue
-            atoms = [a.predicate if isinstance(a, Counter) else a for a in arrow.atoms]
+            atoms = [predicate_of(atom) for atom in arrow.atoms]
             absent = [a for a in atoms if not happens(a)]
             if absent and not task.failing[arrow.target]:
                 missing |= {a.name: a for a in absent}
@@ -109,23 +109,22 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
         over = task.is_over(place[:, None])
         reached[place[over], at[over]] = True
         place, at = place[new & ~over], at[new & ~over]
-    states = reached.any(1)
+    states: Array = reached.any(1)
     if (states & task.accepting).any():
         return ""
     arrows = [a for a in task.plan.arrows if states[a.origin]]
-    wanted = _named(a for a in arrows if not (states | task.failing)[a.target])
+    wanted = names_of(a for a in arrows if not (states | task.failing)[a.target])
     text = f"no plan does this task by the log: {wanted} never holds"
-    if before := _named(a for a in arrows if states[a.target] and not task.failing[a.target]):
+    if before := names_of(a for a in arrows if states[a.target] and not task.failing[a.target]):
         text += f" after {before}"
-    if avoided := _named(a for a in arrows if task.failing[a.target]):
+    if avoided := names_of(a for a in arrows if task.failing[a.target]):
         text += f", unless {avoided} holds first, which is avoided"
     return text
 
 
-def _named(arrows: Iterable[Arrow]) -> str:
+def names_of(arrows: Iterable[Arrow]) -> str:
     """Return the names of arrows' events, each once."""
-    atoms = (atom for arrow in arrows for atom in arrow.atoms)
-    names = (a.predicate.name if isinstance(a, Counter) else a.name for a in atoms)
+    names = (predicate_of(atom).name for arrow in arrows for atom in arrow.atoms)
     return " or ".join(map(repr, dict.fromkeys(names)))
 
 

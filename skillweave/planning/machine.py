@@ -181,7 +181,7 @@ class RewardMachine:
             )
         for arrow in plan.arrows:
             for atom in arrow.atoms:
-                self.number(_predicate(atom))
+                self.number(predicate_of(atom))
         # Two columns behind those of the events: one is never true, the other always.
         never, always = len(self.events), len(self.events) + 1
         self._counted = np.full((count, self.slots), never)
@@ -434,7 +434,7 @@ def _automaton_arrows(
         full = all(count + 1 >= a.steps for a in arrow.atoms if isinstance(a, Counter))
         if not full:
             continue
-        target, atoms = task.state_names[arrow.target], [_predicate(a) for a in arrow.atoms]
+        target, atoms = task.state_names[arrow.target], [predicate_of(a) for a in arrow.atoms]
         for counter in counters:
             goes_on = counter.slot in _counters(task.arrows_from(arrow.target))
             if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
@@ -468,7 +468,7 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
     """Return the skills of an arrow's events."""
     chosen: list[str] = []
     for atom in arrow.atoms:
-        name = _predicate(atom).name
+        name = predicate_of(atom).name
         if name not in skills:
             raise DeclarationError(
                 f"automaton(): the event {name!r} has no skill; give one: "
@@ -478,7 +478,8 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
     return chosen
 
 
-def _predicate(atom: Atom) -> Predicate:
+def predicate_of(atom: Atom) -> Predicate:
+    """Return the predicate that an atom reads."""
     return atom.predicate if isinstance(atom, Counter) else atom
 
 

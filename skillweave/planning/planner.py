@@ -6,7 +6,6 @@ import json
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Self
 
 import gymnasium as gym
@@ -20,7 +19,6 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
-from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.lacking import check_possible, obstacle, read_log
@@ -233,11 +231,6 @@ class Planner(ReadySelector):
         """Return where nothing follows the ends (n,) of calls."""
         over: Array = (self.graph.terminated if self._own_end is None else self._own_end)[end]
         return over
-
-    @cached_property
-    def forecast(self) -> Forecast:
-        """The calls that the plan intends, and its chance; see ``forecast.forecast``."""
-        return forecast(self)
 
     def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
         """Return goals of choices (n,) from calls (n,) in the graph, as of ``with_goals``."""
