@@ -125,8 +125,8 @@ class FeatureMap(Standard):
                 f"all features of {who} are constant in the log, so no call is nearer than "
                 "another; give features= that change, or record calls from other states"
             )
-        ends = map(torch.from_numpy, (raw.min(0), raw.max(0)))
-        self._seen = Seen(f"the plan with {who}: feature", *self.moments, *ends, len(raw))
+        low, high = torch.from_numpy(raw.min(0)), torch.from_numpy(raw.max(0))
+        self._seen = Seen(f"the plan with {who}: feature", *self.moments, low, high, len(raw))
         self.size = int(self.varies.sum())
         """F, the number of features."""
 
