@@ -20,6 +20,7 @@ import numpy as np
 
 import skillweave as sw
 from benchmarks.common import table
+from skillweave.planning import Planner
 from skillweave.toys import KeyDoor
 from skillweave.types import Array, Step
 
@@ -156,6 +157,7 @@ def judged(run: sw.Run, mission: str, words: Words, episodes: int) -> Row | None
     except sw.RunError:
         return Row(mission, 0.0, 0.0, True)
     chance, planner = planned.explain().chance, planned.hierarchy.selector
+    assert isinstance(planner, Planner)
     assert chance is not None
     succeeded = planned.evaluate(episodes, quiet=True).succeeded or 0
     return Row(mission, chance, succeeded / episodes, bool(planner.obstacle))

@@ -109,7 +109,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
         over = task.is_over(place[:, None])
         reached[place[over], at[over]] = True
         place, at = place[new & ~over], at[new & ~over]
-    states: Array = reached.any(1)
+    states: Array = np.asarray(reached.any(1))
     if (states & task.accepting).any():
         return ""
     arrows = [a for a in task.plan.arrows if states[a.origin]]
