@@ -159,6 +159,7 @@ def judged(run: sw.Run, mission: str, words: Words, episodes: int) -> Row | None
     chance, planner = planned.explain().chance, planned.hierarchy.selector
     assert isinstance(planner, Planner)
     assert chance is not None
+    assert isinstance(planner, Planner)
     succeeded = planned.evaluate(episodes, quiet=True).succeeded or 0
     return Row(mission, chance, succeeded / episodes, bool(planner.obstacle))
 

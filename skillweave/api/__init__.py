@@ -71,9 +71,8 @@ from skillweave.hierarchy.weights import (
 from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
-from skillweave.planning import CallLog, Planner
+from skillweave.planning import CallLog, Planner, record_calls
 from skillweave.planning.forecast import Forecast, forecast
-from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
@@ -921,11 +920,12 @@ class Run:
                 settings["predicates"] = mission_words(declared, words)
         settings.setdefault("features", declared.features)
         planner = Planner(log, task, skills=self.policy, **settings)
-        # Where each episode has a goal of its own, so has its plan.
-        if planner.plan.sweeps and (expected := forecast(planner)).reason:
-            notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         hierarchy, policy = planned(declared, self.policy, planner)
-        return PlannedRun(hierarchy, self.path, policy)
+        run = PlannedRun(hierarchy, self.path, policy)
+        # Each goal of its own would need a plan of its own now.
+        if planner.plan.sweeps and (reason := run.explain().reason):
+            notice(f"this plan has a chance of {run.explain().chance:.0%}: {reason}")
+        return run
 
     @checked_names
     def repair(
@@ -1045,6 +1045,7 @@ class PlannedRun(Run):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
     _mark = "-plan"
+    _forecast: Forecast | None = None
 
     def __repr__(self) -> str:
         return super().__repr__().replace("<Run", "<PlannedRun of", 1)
@@ -1099,7 +1100,9 @@ class PlannedRun(Run):
         """
         planner = self.hierarchy.selector
         assert isinstance(planner, Planner)
-        return forecast(planner)
+        if self._forecast is None:
+            self._forecast = forecast(planner)
+        return self._forecast
 
     def _own_spec(self) -> EnvSpec:
         return untasked(self.hierarchy.spec)

@@ -3,6 +3,7 @@
 from skillweave.planning.blame import Blame
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
+from skillweave.planning.forecast import Forecast
 from skillweave.planning.goal import GoalTask, reached
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver
 from skillweave.planning.machine import RewardMachine
@@ -18,6 +19,7 @@ __all__ = [
     "CallLog",
     "Chain",
     "Explorer",
+    "Forecast",
     "GoalTask",
     "HandOver",
     "Mission",

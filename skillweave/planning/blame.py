@@ -73,8 +73,8 @@ class Blame:
         where = "at the start of an episode" if self.after == START else f"after {self.after!r}"
         here = shown_rate(self.rate * self.calls, self.calls)
         parts = [f"{self.skill!r} is done in {here} {where}"]
-        if others := self.calls_elsewhere:
-            parts[0] += f", and in {shown_rate(self.elsewhere * others, others)} elsewhere"
+        if rest := self.calls_elsewhere:
+            parts[0] += f", and in {shown_rate(self.elsewhere * rest, rest)} elsewhere"
         if failed := sum(self.reasons.values()):
             words = ", ".join(
                 f"{count / failed:.0%} {_ENDS[reason]}"

@@ -105,11 +105,11 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
         state[:, 1:] = task.counter_steps[place[rows]] - 1
         after = task.advance(state, events.take(first[to]))[0][:, 0]
         place, at = np.unique(np.stack([after, to]), axis=1)
-        new = ~reached[place, at]
+        new: Array = ~reached[place, at]
         over = task.is_over(place[:, None])
         reached[place[over], at[over]] = True
         place, at = place[new & ~over], at[new & ~over]
-    states: Array = np.asarray(reached.any(1))
+    states: Array = reached.any(1)
     if (states & task.accepting).any():
         return ""
     arrows = [a for a in task.plan.arrows if states[a.origin]]

@@ -73,8 +73,7 @@ def test_an_order_that_never_comes_is_named(task: Any, words: list[str]) -> None
     steps = [(0, [(A, [0, 1], True, "own"), (B, [0.5, 2], True, "own")])]
     planner = Planner(log_of(["a", "b"], steps * 5), task)
     assert all(word in planner.obstacle for word in words)
-    expected = forecast(planner)
-    assert (expected.chance, expected.reason) == (0.0, planner.obstacle)
+    assert (forecast(planner).chance, forecast(planner).reason) == (0.0, planner.obstacle)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,9 @@ QUICK = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=2)
 GREEDY = sw.Selection(greedy_skills=True)
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:this plan has a chance")  # nothing has learnt
+
+
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: Any) -> None:
     monkeypatch.setattr("skillweave.training.imitation.GRADIENT_STEPS", 50)

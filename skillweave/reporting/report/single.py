@@ -347,7 +347,7 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     }
     if count is None:
         return words
-    low, high = (percent(float(end)) for end in wilson(count, len(score.returns)))
+    low, high = (percent(float(bound)) for bound in wilson(count, len(score.returns)))
     share = percent(count / len(score.returns))
     return words | {"solved": share, "solved_interval": f"{low} to {high}"}
 

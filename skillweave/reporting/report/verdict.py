@@ -64,7 +64,7 @@ def _outcome(score: Evaluation) -> str:
     if count is not None:
         if n < FEW:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
-        least, most = (percent(float(end)) for end in wilson(count, n))
+        least, most = (percent(float(bound)) for bound in wilson(count, n))
         return f"Solves {percent(count / n)} of {episodes}, so probably {least} to {most} of all"
     mean = number(score.mean, scale_of(score.returns))
     if n < FEW:
