@@ -71,8 +71,9 @@ from skillweave.hierarchy.weights import (
 from skillweave.messages import as_path, short, shown_path, whole_number
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
-from skillweave.planning import CallLog, Planner, record_calls
+from skillweave.planning import CallLog, Planner
 from skillweave.planning.forecast import Forecast, forecast
+from skillweave.planning.record import with_returns
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress

@@ -15,10 +15,9 @@ from skillweave.planning.compared import leaves
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.hand_over import wilson
-from skillweave.planning.lacking import read_log
-from skillweave.planning.machine import Readings, RewardMachine
+from skillweave.planning.lacking import names_of, read_log
+from skillweave.planning.machine import Readings, RewardMachine, predicate_of
 from skillweave.planning.planner import Planner
-from skillweave.planning.predicates import Predicate
 from skillweave.planning.tried import SLACK
 from skillweave.types import Array
 
@@ -188,9 +187,9 @@ def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings 
     """Return where most episodes end that fail, in these states (n,)."""
     begins = log.offset[:-1][log.order == 0]
     for arrow in machine.arrows_from(machine.plan.start):
-        bad = arrow.atoms[0]
-        if known is not None and machine.failing[arrow.target] and isinstance(bad, Predicate):
-            holds = known.events[begins, machine.number(bad)].mean()
+        if known is not None and machine.failing[arrow.target]:
+            numbers = [machine.number(predicate_of(atom)) for atom in arrow.atoms]
+            holds = known.events[begins][:, numbers].all(1).mean()
             if holds > 0.5:
                 bad = names_of([arrow])
                 return f"{bad}, which is avoided, holds in {holds:.0%} of the first steps"
