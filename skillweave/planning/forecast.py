@@ -102,6 +102,7 @@ def forecast(planner: Planner) -> Forecast:
     history = np.full((MOST_CALLS, 3, n), -1.0)
     for calls in history:
         here, until = np.flatnonzero(running), elapsed.copy()
+        was = state[here]
         at, may_here = np.arange(len(here)), may[here] | ~may[here].any(1, keepdims=True)
         option, near = planner.options(obs[here], state[here], may_here, rng)
         wide = graph.near(obs[here], EQUAL * graph.neighbours)
@@ -134,9 +135,10 @@ def forecast(planner: Planner) -> Forecast:
         begins = before[graph.pieces.first[piece]]
         off = np.maximum(_shift(graph, option, begins, obs[here]), SLACK)
         still = _shift(graph, option, begins, graph.end[end]) <= off
-        may[here[still], graph.choice_of[option[still]]] = False
-        here, end = here[~still], end[~still]
-        obs[here], may[here] = graph.end[end], graph.may[end]
+        stuck = still & (state[here] == was).all(1)
+        may[here[~stuck]] = graph.may[end[~stuck]]
+        may[here[stuck], graph.choice_of[option[stuck]]] = False
+        obs[here[~still]] = graph.end[end[~still]]
         for own, start, same in zip(leaves(obs), leaves(first), fixed, strict=True):
             np.copyto(own, start, where=same)
     done = machine.has_succeeded(state)

@@ -95,7 +95,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     follows[of[inside], of[inside + 1]] = True
     follows[of[log.offset[joined + 1] - 1], of[log.offset[log.followed_by[joined]]]] = True
     follows[count, of[log.offset[:-1][log.order == 0]]] = True
-    reached = np.zeros((len(task.accepting), count + 1), bool)
+    reached: Array = np.zeros((len(task.accepting), count + 1), bool)
     place, at = np.array([task.plan.start]), np.array([count])
     while len(place):
         reached[place, at] = True
@@ -109,7 +109,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
         over = task.is_over(place[:, None])
         reached[place[over], at[over]] = True
         place, at = place[new & ~over], at[new & ~over]
-    states: Array = reached.any(1)
+    states: Array = np.asarray(reached.any(1))
     if (states & task.accepting).any():
         return ""
     arrows = [a for a in task.plan.arrows if states[a.origin]]

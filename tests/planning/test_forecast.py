@@ -98,6 +98,13 @@ def test_what_the_log_allows_is_not_named(task: Any) -> None:
     assert (forecast(planner).chance is None) == (not can_succeed)
 
 
+def test_calls_that_change_nothing_are_repeated_only_where_that_counts() -> None:
+    walk = [(A, [1], True, "own"), (A, [1], True, "own"), (B, [2], True, "own")]
+    log = log_of(["a", "b"], [(0, walk), (0, [(B, [0], False, "own"), *walk])] * 9)
+    for task in (Mission(held(at(1), 5), at(2)), Mission(at(2))):
+        assert forecast(Planner(log, task)).chance == 1.0
+
+
 def test_goals_of_each_episode_are_judged_by_themselves() -> None:
     ends = [(1, 1)] * 8 + [(2, 1)] * 7 + [(2, 2)]
     calls = [(goal, [(A, [[end, goal]], True, "end")]) for goal, end in ends]
