@@ -116,3 +116,9 @@ def forget_registered() -> Iterator[None]:
 def unprobed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Call functions once, for the environments alone: for tests that record calls."""
     monkeypatch.setattr("skillweave.skills.probing._seen.first_time", lambda *_: False)
+
+
+@pytest.fixture
+def no_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Functions are called for what happens alone, not also to see whether they keep a state."""
+    monkeypatch.setattr("skillweave.skills.outputs.watch", lambda *_: None)

@@ -178,6 +178,7 @@ def test_many_more_cases_are_played_as_the_reference_does(user: str) -> None:
     drawn(user, 100)
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.parametrize("user", USERS)
 def test_a_skill_sees_the_steps_of_its_own_calls(user: str) -> None:
     """Also the action that reflexes left, and its own time."""

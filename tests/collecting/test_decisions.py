@@ -107,6 +107,7 @@ def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selecto
 # What skills see -------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("no_trials")
 def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training():
     shows, seen = SkillCase("right", max_steps=3, stops="recorded"), []
     engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
@@ -141,6 +142,7 @@ class Nested(gym.Env):
         return obs, 0.0, False, False, {"id": self.number, "deep": deep}
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_its_own_rows_of_info_however_deep():
     seen = []

@@ -259,6 +259,7 @@ def test_a_skills_termination_terminates_and_resets_at_once(collector):
     assert (env.obs[:, EPISODE] == 5).all()
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.usefixtures("unprobed")
 def test_a_skill_sees_the_whole_step_and_its_reward_replaces_the_tasks(collector):
     seen = []

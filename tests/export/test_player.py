@@ -94,6 +94,7 @@ print([int(runner.act(x)) for x in {obs.tolist()}])
     assert len(set(wanted)) > 1
 
 
+@pytest.mark.usefixtures("no_trials")
 def test_a_player_batches_infos_as_training_does() -> None:
     """A dict within a dict stays one, and lists of unequal lengths are no error."""
     seen: list[object] = []

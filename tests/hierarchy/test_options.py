@@ -345,6 +345,7 @@ class Balance(Skill):
         return np.abs(step.next_obs[:, 1]) > 0.4
 
 
+@pytest.mark.usefixtures("no_trials")
 @pytest.mark.filterwarnings("ignore:.*precision lowered")
 @pytest.mark.usefixtures("unprobed")
 def test_envpool_steps_only_those_whose_calls_go_on(options):

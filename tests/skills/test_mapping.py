@@ -218,7 +218,7 @@ def test_statistics_that_a_model_has_are_used_and_a_file_beside_its_zip_is_named
     from stable_baselines3.common.vec_env import VecNormalize
 
     vec = VecNormalize(make_vec_env("Pendulum-v1"), norm_reward=False)
-    vec.obs_rms.mean[:], vec.obs_rms.var[:] = (1, 2, 3), (4, 5, 6)
+    vec.obs_rms.mean[:], vec.obs_rms.var[:], vec.obs_rms.count = (1, 2, 3), (4, 5, 6), 100.0
     model = sb3.A2C("MlpPolicy", vec, device="cpu")
     spaces = model.observation_space, model.action_space
     obs = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
@@ -444,7 +444,7 @@ def test_functions_of_one_name_are_told_apart() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("sees", [], "sees is .*an object with each input"),
+        ("sees", [], "sees is .*an object of inputs"),
         ("sees", {"": [{"source": "camera"}]}, r"sees\[''\]\[0\] is .*its field source must be"),
         ("sees", {"": [{"source": "goal", "low": "x"}]}, r"sees\[''\]\[0\]: Goal.low is 'x'"),
         ("acts", {"to": [0, -1]}, r"acts: Acts.to is \[0, -1\]"),
