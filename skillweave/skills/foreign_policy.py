@@ -108,9 +108,9 @@ class Foreign(Memoryless):
         except SkillweaveError:
             raise
         except (Exception, SystemExit) as error:
-            raise self.failure(error) from error
+            raise self._failure(error) from error
 
-    def failure(self, error: BaseException) -> PolicyError:
+    def _failure(self, error: BaseException) -> PolicyError:
         """Return the error of a call that failed; it names the policy and its inputs."""
         text = f"{error_text(error)}{self._advice_on(error)}"
         return PolicyError(f"{self._who} fails on {self.given}: {text}")

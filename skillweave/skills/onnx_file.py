@@ -262,7 +262,7 @@ class OnnxPolicy(MappedPolicy):
         try:
             return self._session.run(names, rows)
         except Exception as error:  # onnxruntime's own errors have no common class
-            raise self.failure(error) from error
+            raise self._failure(error) from error
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""
