@@ -222,6 +222,7 @@ ALL = (
 )
 
 
+@pytest.mark.filterwarnings("ignore:the environment has changed")
 @pytest.mark.parametrize("commands", [QUICK, pytest.param(ALL, marks=pytest.mark.slow)])
 def test_commands_print_a_strangers_run_escaped(commands, evil, capfd, monkeypatch):
     os.rename(evil, evil.parent / "runs-1")

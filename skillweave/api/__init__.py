@@ -36,7 +36,6 @@ from skillweave.api.notebook_tables import (
     skills_table,
 )
 from skillweave.api.planning import (
-    lacking_features,
     mission_words,
     planned,
     start_of,
@@ -862,8 +861,6 @@ class Run:
             Interrupted: Ctrl-C has stopped it; what was recorded is kept.
         """
         spec = self._own_spec()
-        if words := lacking_features(self.hierarchy, self.policy):
-            notice(words)
         seed, info = self._calls.begin(self.policy, seed, info)
         how: dict[str, Any] = {"own_rewards": False, "keep": self._calls.add}
         return with_returns(spec, self.policy, steps, choose, num_envs, seed, info, **how)[0]

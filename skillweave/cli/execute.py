@@ -28,6 +28,7 @@ from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.weights import open_weights
+from skillweave.notices import notice
 from skillweave.planning import Explorer, HandOver, as_task
 from skillweave.planning.run_log import hand_over_json, hand_over_of
 from skillweave.reporting.curves_figure import plot_curves
@@ -138,6 +139,8 @@ def _render(command: commands.Render) -> None:
 
 def _log(command: commands.Log) -> None:
     run = _load_with_code(command.run, command.recipe)
+    if words := lacking_features(run.hierarchy, run.policy):
+        notice(words)
     if not command.quiet:
         say(f"recording {command.steps:,} steps")
     log = run.log_calls(

@@ -93,10 +93,10 @@ class Blame:
         else:
             third = _third(self.calls)
             best = shown_rate(self.best * third, third)
-            rest = shown_rate(self.others * (self.calls - third), self.calls - third)
+            worse = shown_rate(self.others * (self.calls - third), self.calls - third)
             parts.append(
                 f"{self.after!r} is to blame for where it ends: from the best third of its ends "
-                f"{self.skill!r} is done in {best}, from the others in {rest}"
+                f"{self.skill!r} is done in {best}, from the others in {worse}"
                 f"{self._difference()}"
                 if self.first
                 else f"It would not help if {self.after!r} ended elsewhere, as far as it can: "

@@ -20,7 +20,7 @@ from skillweave.planning.calls import CallLog, columns_of, join
 from skillweave.planning.hand_over import HandOver
 from skillweave.planning.recorder import MOST_BYTES
 from skillweave.reading import check_file, fit
-from skillweave.runs.directory import CALLS, RunDirectory
+from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header
 from skillweave.runs.lock import Lock
 
@@ -28,8 +28,6 @@ MOST_STEPS = 1_000_000
 """The most steps of the log in a run; the latest stay."""
 LARGEST = MOST_BYTES + 64 * 2**20
 """The most bytes of its file."""
-LOCK = ".calls.lock"
-"""The file that a process locks while it adds calls."""
 RECORD = "record a new log: run.log_calls(20_000), or skillweave log"
 
 
@@ -103,7 +101,7 @@ def save_calls(run: RunDirectory, log: CallLog) -> CallLog:
     """
     path = run.path / CALLS
     # A training holds the run's own lock for hours.
-    lock = Lock(run.path, LOCK, wait=True)
+    lock = Lock(run.path, CALLS_LOCK, wait=True)
     try:
         if path.exists() and (reason := _misfit(run)) is not None:
             notice(f"{path} {reason}. The new log replaces it")

@@ -71,6 +71,8 @@ First = Callable[["RunDirectory"], None]
 
 CALLS = "calls.safetensors"
 """The file of logged calls."""
+CALLS_LOCK = ".calls.lock"
+"""The file that a process locks while it adds calls."""
 FINAL = "final"
 """The folder of final states."""
 LINES = ("metrics_bytes", "lineage_bytes")
@@ -93,6 +95,8 @@ FOLDERS = {
 RESULTS = (
     "checkpoint*.safetensors",
     CALLS,
+    "calls-*.safetensors",
+    CALLS_LOCK,
     "evaluation*.json",
     "report.html",
     "film*.gif",

@@ -292,6 +292,7 @@ def test_who_was_killed_goes_on_and_comes_to_the_same(done, tmp_path, monkeypatc
         assert (again.scores, again.curve) == (first.scores, first.curve)
 
 
+@pytest.mark.filterwarnings("ignore:.*the code of the environment has changed")
 def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done, tmp_path):
     bench = Bench(suite(), done, seed=0)
     task = suite().tasks[1]
@@ -305,6 +306,7 @@ def test_fine_tuning_begins_with_what_the_flat_agent_was_on_the_first_task(done,
     assert found[TUNED] == replace(found[FLAT], agent=TUNED)
 
 
+@pytest.mark.filterwarnings("ignore:.*the code of the environment has changed")
 def test_skills_that_go_on_begin_with_what_they_were_and_f4_acts_with_those(tmp_path, monkeypatch):
     tasks = [
         Task("right", spec(3), 0.5),

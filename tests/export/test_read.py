@@ -251,7 +251,7 @@ def changed(folder: Path, change: Callable[[Any], Any]) -> None:
         (lambda x: x["policy"]["acts"].update(scale="x"), "policy.acts: Acts.scale is 'x'"),
         (lambda x: x["policy"]["acts"].update(to=[0, 9]), "acts.to is .* does not exist"),
         (lambda x: x["policy"].update(goal=[2.0]), "policy.goal is .2.0.*out of the range"),
-        (lambda x: x["policy"]["sees"]["obs"][0].update(key="gyr"), "sees.*reads 'gyr'.*'gyro'"),
+        (lambda x: x["policy"]["sees"]["obs"][0].update(key="gyr"), "sees.*reads 'gyr'.*gyro"),
         (lambda x: x["policy"]["sees"]["obs"].pop(0), r"gives 1 numbers .*takes 4: 3 stay unset"),
         (lambda x: x["policy"]["state"][0].update(shape=[2, 1]), r"policy.state has the shape"),
         (lambda x: x["policy"]["state"].clear(), "policy: .*does not set the input 'h'"),

@@ -352,7 +352,8 @@ def test_calls_come_first_and_the_rest_is_held_on(tmp_path):
         selector=lambda obs: np.full(len(obs), "down"),
         learn="apart",
         rest="hold",
-        apart=sw.Apart(start_calls=1, skill_steps=300),
+        steps=300,
+        apart=sw.Apart(start_calls=1),
     )
     hierarchy.train(tmp_path / "run", quiet=True)
     held = np.concatenate(seen)[:, 2]

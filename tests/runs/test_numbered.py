@@ -239,7 +239,8 @@ def test_an_unfinished_run_is_overwritten_and_a_run_may_start_from_itself(
             declare(640).train("run", checkpoint_every=64, quiet=True)
     Path("plain.py").write_text(RECIPE)
     assert main(["train", "plain.py", "-o", "run", "--overwrite", "--evaluate", "0"]) == 0
-    run = declare().train("run", overwrite=True, start_from="run", quiet=True)
+    with pytest.warns(UserWarning, match="the reward of skill 'left' has changed"):
+        run = declare().train("run", overwrite=True, start_from="run", quiet=True)
     assert sw.load(run.path, declare()).info()["seed"] == 0
 
 
