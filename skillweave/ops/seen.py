@@ -12,14 +12,16 @@ from skillweave.ops.moments import CLIP, scale_of
 
 FEWEST = 1_000
 """The fewest observations whose range says what is usual."""
+BEYOND = 10.0
+"""How many widths of the range a number must be outside: a wrong unit, or -999 for "unknown"."""
 
 
 @dataclass
 class Seen:
     """The range of numbers that were seen; the first one far beyond it is named, once.
 
-    It is far beyond where it is outside by more than three times the width of the range, and more
-    than ``CLIP`` deviations from the mean.
+    It is far beyond where it is outside by more than ``BEYOND`` widths of the range, and more than
+    ``CLIP`` deviations from the mean.
     """
 
     who: str
@@ -36,7 +38,7 @@ class Seen:
 
     @cached_property
     def _ends(self) -> tuple[Tensor, Tensor]:
-        width = 3.0 * (self.high - self.low)
+        width = BEYOND * (self.high - self.low)
         away = CLIP * scale_of(self.mean, self.var)
         low, high = self.low - width, self.high + width
         return low.minimum(self.mean - away), high.maximum(self.mean + away)

@@ -233,6 +233,7 @@ def test_what_cannot_be_split_is_refused(config, says, cluster, tmp_path, monkey
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings("ignore:the code of the environment has changed")
 def test_a_run_goes_on_on_ray_and_ends_the_same_though_an_actor_is_killed(
     whole, tmp_path, monkeypatch, capsys
 ):
