@@ -57,8 +57,15 @@ def is_own(frame: FrameType) -> bool:
 
 def is_own_code(code: Any) -> bool:
     """Return whether a class or a function is the user's."""
-    file = getattr(sys.modules.get(code.__module__), "__file__", None)
-    return code.__module__ == "__main__" if file is None else _is_own_file(file)
+    return is_own_module(code.__module__)
+
+
+def is_own_module(name: str) -> bool:
+    """Return whether a module of this name is the user's."""
+    file = getattr(sys.modules.get(name), "__file__", None)
+    if file is None:  # typed into a prompt, or loaded from a file under no name
+        return name.partition(".")[0] not in {"skillweave", *sys.stdlib_module_names}
+    return _is_own_file(file)
 
 
 def _is_own_file(file: str) -> bool:

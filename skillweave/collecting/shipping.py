@@ -110,7 +110,7 @@ def is_own_code(module: ModuleType) -> bool:
         return False
     # One that was loaded from its file, as recipes are, is not found by its name elsewhere,
     # wherever it lies.
-    return not is_installed(file) or not _is_found(top, tuple(sys.path))
+    return not _is_installed(file) or not _is_found(top, tuple(sys.path))
 
 
 @cache  # a sweep asks it of thousands of modules for each of its runs
@@ -120,7 +120,7 @@ def _is_found(name: str, path: tuple[str, ...]) -> bool:
 
 
 @cache
-def is_installed(file: str) -> bool:
+def _is_installed(file: str) -> bool:
     """Return whether a file lies where packages are installed, here or anywhere."""
     path = Path(file).resolve()
     if _PACKAGES & set(path.parts):

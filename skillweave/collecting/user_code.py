@@ -13,7 +13,6 @@ import functools
 import inspect
 import json
 import re
-import sys
 import textwrap
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -24,12 +23,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
-from skillweave.collecting.shipping import is_installed
 from skillweave.envs.make import EnvSpec
 from skillweave.notices import notice
 from skillweave.reading import shown
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.foreign_policy import checksum
+from skillweave.tracebacks import is_own_code, is_own_module
 
 Texts = dict[str, str]
 """Texts to compare, by what they are about: checksums of code, or arguments."""
@@ -113,18 +112,11 @@ def _maker(env: Any) -> Any:
         return env
     made: Any = entry.entry_point
     if isinstance(made, str):
-        if not _is_own(re.split("[.:]", made)[0]):
+        if not is_own_module(re.split("[.:]", made)[0]):
             return None
         with suppress(ImportError, AttributeError):
             made = load_env_creator(made)
     return made, entry.kwargs, entry.max_episode_steps
-
-
-def _is_own(module: Any) -> bool:
-    """Return whether a module of this name is the user's: not installed, and not the library's."""
-    file, top = getattr(sys.modules.get(module), "__file__", None), str(module).partition(".")[0]
-    known = top in sys.stdlib_module_names or top == "skillweave"
-    return not known and (file is None or not is_installed(file))
 
 
 def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
@@ -150,7 +142,7 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
     owner = getattr(x, "__self__", owner)
     x = getattr(x, "__func__", None) or getattr(x, "fget", x)  # of a method or a property
     code = x if isinstance(x, FunctionType | type) else type(x)
-    if not _is_own(code.__module__):
+    if not is_own_code(code):
         return code.__name__
     if id(x) in seen:
         return None
@@ -167,7 +159,9 @@ def _form(x: Any, seen: dict[int, Any], owner: Any = None) -> Any:
         first, _, attribute = name.partition(".")
         value = scope.get(first)
         if attribute:
-            known = first == "self" or (isinstance(value, ModuleType) and _is_own(value.__name__))
+            known = first == "self" or (
+                isinstance(value, ModuleType) and is_own_module(value.__name__)
+            )
             value = inspect.getattr_static(value, attribute, None) if known else None
         values[name] = _form(value, seen, owner if first == "self" else None)
     rest = code.__bases__ if isinstance(code, type) else code.__defaults__

@@ -101,7 +101,7 @@ def test_a_recipe_arrives_where_neither_it_nor_what_it_imports_is(recipe, tmp_pa
 def test_a_recipe_that_lies_where_packages_are_installed_is_sent_as_well(tmp_path, monkeypatch):
     places = (*shipping._INSTALLED, recipes.source("lunar-lander").parent.resolve())
     monkeypatch.setattr(shipping, "_INSTALLED", places)
-    monkeypatch.setattr(shipping, "is_installed", shipping.is_installed.__wrapped__)
+    monkeypatch.setattr(shipping, "_is_installed", shipping._is_installed.__wrapped__)
     file = tmp_path / "packed"
     file.write_bytes(packed(recipes.load("lunar-lander"), "it"))
     code = (
