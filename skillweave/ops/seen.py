@@ -52,6 +52,6 @@ class Seen:
         place = worst % len(self.low)
         notice(
             f"{self.who} {place} is {numbers.flatten()[worst]:g}, but only {self.low[place]:g} to "
-            f"{self.high[place]:g} was seen before, so what is done there is a guess. Check the "
+            f"{self.high[place]:g} was seen before, so its actions there are guesses. Check the "
             "unit, and whether the value means something else; or collect such values, too"
         )

@@ -99,7 +99,7 @@ class Blame:
                 f"{self.skill!r} is done in {best}, from the others in {worse}"
                 f"{self._difference()}"
                 if self.first
-                else f"It would not help if {self.after!r} ended elsewhere, as far as it can: "
+                else f"It would not help if {self.after!r} ended elsewhere: "
                 f"from the best third of its ends {self.skill!r} is done in {best}. So "
                 f"{self.skill!r} itself has to work from there"
             )
