@@ -60,8 +60,10 @@ def is_own_code(code: Any) -> bool:
     return is_own_module(code.__module__)
 
 
-def is_own_module(name: str) -> bool:
-    """Return whether a module of this name is the user's."""
+def is_own_module(name: str | None) -> bool:
+    """Return whether a module of this name is the user's; code that ``exec`` made has none."""
+    if name is None:
+        return True
     file = getattr(sys.modules.get(name), "__file__", None)
     if file is None:  # typed into a prompt, or loaded from a file under no name
         return name.partition(".")[0] not in {"skillweave", *sys.stdlib_module_names}

@@ -17,7 +17,7 @@ import pytest
 from shared_runs import SMALL
 
 import skillweave as sw
-from skillweave.collecting.user_code import changes, environment_texts, skill_texts
+from skillweave.collecting.user_code import changes, code_sum, environment_texts, skill_texts
 from skillweave.planning import CallLog, Mission, Planner, join
 from skillweave.runs.directory import CALLS
 from skillweave.runs.files import read_header
@@ -162,6 +162,14 @@ def test_values_in_closures_and_arguments_of_wrappers_count(edited: Any) -> None
         one, same, other = (texts(own, wrappers=(wrap(n),)) for n in (9, 9, 8))
         assert not changes(one, same)
         assert "wrappers" in changes(one, other)
+
+
+def test_code_that_was_made_from_text_has_no_module_and_no_sum() -> None:
+    scope: dict[str, Any] = {}
+    exec("def env(): return gym.make('CartPole-v1')\nreward = lambda step: step.reward", scope)
+    assert scope["env"].__module__ is None
+    assert environment_texts(sw.EnvSpec(scope["env"])).get("the code of the environment", "") == ""
+    assert code_sum(scope["reward"]) == ""
 
 
 def test_use_place_and_process_change_nothing(edited: Any, tmp_path: Path) -> None:
