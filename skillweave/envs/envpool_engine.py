@@ -11,13 +11,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.envs.checks import LAST_OBSERVATIONS, Watch, last_observation, time_limit
+from skillweave.envs.checks import Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.history import History
-from skillweave.envs.infos import ActionMasks, single_infos
+from skillweave.envs.infos import ActionMasks
 from skillweave.envs.pool import MakePool, installed, no_precision_warnings
 from skillweave.errors import EnvError, MissingExtra
-from skillweave.spaces import pack, put_observation
+from skillweave.spaces import pack
 from skillweave.types import Array
 
 RENEW_AFTER = 100_000
@@ -197,14 +197,6 @@ class EnvPoolEngine:
         # An episode that terminates in the step of its time limit arrives as truncated: EnvPool
         # computes `terminated = done & ~truncated`, so the two cannot be distinguished.
         raw = RawStep(*self._in_pools(ids, step))
-        last = {k: v for k, v in raw.info.items() if k.removeprefix("_") in LAST_OBSERVATIONS}
-        if last:  # the pool resets itself
-            raw.next_obs = raw.next_obs.copy()
-            each = single_infos(last, len(ids))
-            for row in np.flatnonzero(raw.terminated | raw.truncated).tolist():
-                obs, _ = last_observation(None, each[row], self)
-                if obs is not None:
-                    put_observation(self.observation_space, raw.next_obs, row, obs)
         self._masks.see(raw.info, ids, raw.terminated | raw.truncated)
         self._watch.check_step(raw, ids)
         raw.truncated = (raw.truncated | self._watch.too_long(ids)) & ~raw.terminated

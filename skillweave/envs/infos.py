@@ -116,7 +116,7 @@ def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> d
     if plain and all(_alike(info, first) for info in infos):
         return {key: np.concatenate([info[key] for info in infos]) for key in first}
     return batched_infos(
-        [one for info, n in zip(infos, counts, strict=True) for one in single_infos(info, n)]
+        [one for info, n in zip(infos, counts, strict=True) for one in _single(info, n)]
     )
 
 
@@ -130,12 +130,12 @@ def _alike(info: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     )
 
 
-def single_infos(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
+def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     """Return the info of each of n environments: the inverse of ``batched_infos``."""
     each: list[dict[str, Any]] = [{} for _ in range(n)]
     for key in info_keys(info):
         column = info[key]
-        values = single_infos(column, n) if isinstance(column, dict) else column
+        values = _single(column, n) if isinstance(column, dict) else column
         present = info.get(f"_{key}", np.ones(n, bool))
         for row in np.flatnonzero(present):
             each[row][key] = values[row]

@@ -36,22 +36,6 @@ class Auto(gym.Env):
         return self.reset()[0], 0.0, True, False, {self.key: self.form(obs), f"_{self.key}": True}
 
 
-class AutoPool:
-    """Such environments side by side."""
-
-    observation_space, action_space = Auto.observation_space, Auto.action_space
-
-    def __init__(self, num_envs, threads, seed):
-        self.envs = [Auto() for _ in range(num_envs)]
-
-    def reset(self, ids):
-        return np.stack([self.envs[i].reset()[0] for i in ids]), {}
-
-    def step(self, action, ids):
-        *columns, infos = zip(*(self.envs[i].step(0) for i in ids), strict=True)
-        return *map(np.stack, columns), batched_infos(infos)
-
-
 class Doubled(gym.ObservationWrapper):
     def observation(self, obs):
         return 2 * obs
@@ -72,9 +56,8 @@ def test_the_last_observation_is_the_true_successor(key, form):
     assert last_of(spec).next_obs.tolist() == [[3, 3]] * 2
 
 
-def test_wrappers_pools_and_tasks_have_it():
+def test_wrappers_and_tasks_have_it():
     assert last_of(sw.EnvSpec(Auto, wrappers=(Doubled,))).next_obs.tolist() == [[6, 6]] * 2
-    assert last_of(sw.EnvSpec(Auto, pool=AutoPool)).next_obs.tolist() == [[3, 3]] * 2
     task = as_task(Mission(lambda step: step.next_obs[:, 0] > 2))
     raw = last_of(sw.EnvSpec(Auto, wrappers=(Tasked(task),)))
     assert reported_success(raw.info, 2).tolist() == [1, 1]
