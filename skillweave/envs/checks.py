@@ -300,7 +300,7 @@ def _wrappers(env: gym.Env[Any, Any]) -> Iterator[gym.Wrapper[Any, Any, Any, Any
 
 
 def _drawn_spaces(env: gym.Env[Any, Any]) -> list[gym.Space[Any]]:
-    """Return the spaces from which an environment and its wrappers may draw; of a Dict its parts.
+    """Return the spaces from which an environment and its wrappers may draw.
 
     A space that stands in a class is copied, so that each environment draws from its own.
     """
@@ -310,18 +310,9 @@ def _drawn_spaces(env: gym.Env[Any, Any]) -> list[gym.Space[Any]]:
             shared = inspect.getattr_static(type(layer), kind, None)
             if isinstance(shared, gym.Space) and kind not in vars(layer):
                 setattr(layer, kind, copy.deepcopy(shared))
-            by_id |= {id(space): space for space in _leaves(getattr(layer, kind, None))}
+            if isinstance(space := getattr(layer, kind, None), gym.Space):
+                by_id[id(space)] = space
     return list(by_id.values())
-
-
-def _leaves(space: Any) -> Iterator[gym.Space[Any]]:
-    """Yield a space, or the parts of a Dict or Tuple: a Dict's own seed() is slow."""
-    if isinstance(space, gym.Space):
-        inner = parts(space)
-        if inner is None:
-            yield space
-        for part in (inner or {}).values():
-            yield from _leaves(part)
 
 
 def last_observation(obs: Any, info: dict[str, Any], env: Any) -> tuple[Any, dict[str, Any]]:
