@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import compared_places
@@ -146,8 +145,7 @@ def blame(
         )
     others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
     elsewhere = float(won[others].mean()) if len(others) else float("nan")
-    ends = log.end_reason[rows[~won[rows]]]
-    reasons = {end.name.lower(): int((ends == end).sum()) for end in list(CallEnd)[1:]}
+    reasons = log.take(rows[~won[rows]]).reasons
     rate, nan = float(won[rows].mean()), float("nan")
     unknown = Blame(
         skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan), reasons,

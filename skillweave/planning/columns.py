@@ -139,6 +139,11 @@ class CallColumns:
         following[a[joined]] = b[joined]
         return following
 
+    @property
+    def reasons(self) -> dict[str, int]:
+        """The number of calls by the reason of their end: own, limit, interrupted, episode."""
+        return {end.name.lower(): int((self.end_reason == end).sum()) for end in list(CallEnd)[1:]}
+
     def flat(self, obs: Array) -> Array:
         """Return the numbers of observations (n, …) without images, (n, F)."""
         vector = obs_codec(self.observation_space).split(to_tensor(obs))[0]

@@ -80,7 +80,9 @@ class Explorer(Memoryless):
         graph = CallGraph(log, self._features, self._neighbours)
         nothing = RewardMachine({})
         readings = nothing.read(graph.log.as_steps())
-        judged = graph.judge(nothing, PlanningStates(nothing), readings, self._gamma)
+        judged = graph.judge(
+            nothing, PlanningStates(nothing), readings, self._gamma, graph.terminated
+        )
         self._far = self._radius_of(graph)
         worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._far)
         self._graph, self._worth = graph, worth[:, 0]

@@ -128,7 +128,7 @@ def forecast(planner: Planner) -> Forecast:
             goes_on &= ~machine.is_over(state[here])
         calls[:, here] = graph.skill_of[graph.choice_of[option]], (elapsed - until)[here], far
         over = machine.is_over(state[here]) | (elapsed[here] >= limit) | ~np.isfinite(far)
-        running[here[over | planner.over_at(end)]] = False
+        running[here[over | planner.over[end]]] = False
         if not running.any():
             break
         # A call that led nowhere is not chosen again at once, as the episode's calls count, too.
@@ -143,7 +143,7 @@ def forecast(planner: Planner) -> Forecast:
             np.copyto(own, start, where=same)
     done = machine.has_succeeded(state)
     shown = done if done.any() else np.ones(n, bool)
-    chance = reason = None
+    chance, reason = None, ""
     if machine.accepting.any():
         chance = 0.0 if planner.obstacle else float(done.mean())
         if chance < UNLIKELY:
@@ -160,7 +160,7 @@ def forecast(planner: Planner) -> Forecast:
             for i, name in enumerate(log.skills)
             if (far := history[:, 2][history[:, 0] == i]).size and (far > FAR).mean() > OFTEN
         ),
-        reason or "",
+        reason,
     )
 
 

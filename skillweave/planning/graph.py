@@ -214,12 +214,11 @@ class CallGraph:
 
     def near(self, obs: Array, most: int = 0) -> Near:
         """Return the nearest pieces of each choice to observations (n, …): K, or ``most``."""
-        features = [each(obs) for each in self.maps]
-        return self._near([features[skill] for skill in self.skill_of], most=most)
+        return self.near_features([each(obs) for each in self.maps], most)
 
-    def near_features(self, features: list[Array]) -> Near:
-        """Return the nearest pieces to features of each skill, (n, F) each."""
-        return self._near([features[skill] for skill in self.skill_of])
+    def near_features(self, features: list[Array], most: int = 0) -> Near:
+        """Return the nearest pieces to features of each skill, (n, F) each: K, or ``most``."""
+        return self._near([features[skill] for skill in self.skill_of], most=most)
 
     def _near(self, features: list[Array], without: Array | None = None, most: int = 0) -> Near:
         """Return the nearest pieces to features for each choice, (n, F) each.
@@ -313,7 +312,7 @@ class CallGraph:
         states: PlanningStates,
         readings: Readings,
         gamma: float,
-        over: Array | None = None,
+        over: Array,
     ) -> Judged:
         """Return what each piece pays and leads to, from each planning state of a task.
 
@@ -322,8 +321,7 @@ class CallGraph:
             states: its planning states.
             readings: the machine's, of all steps of the log.
             gamma: γ of one step.
-            over: (E,) bool, the ends after which nothing follows; None: where the episode
-                terminated.
+            over: (E,) bool, the ends after which nothing follows.
         """
         pieces = self.pieces
         steps = pieces.stop - pieces.first
@@ -341,7 +339,6 @@ class CallGraph:
         follows, weights = states.corners(final)
         used = np.flatnonzero(weights.any((0, 1)))  # exact levels need one corner alone
         discount = gamma ** steps.astype(np.float64)
-        over = self.terminated if over is None else over
         discount[self._last] *= ~over[self._end_of]
         return Judged(
             reward, follows[..., used].astype(np.int32), weights[..., used],

@@ -318,12 +318,10 @@ def call_ends(log: CallColumns, skill: str) -> CallEnds:
     some = log.of(skill)
     if not len(some):
         raise RunError(f"the log has no call of {skill!r}; record some")
-    names = {end: end.name.lower() for end in list(CallEnd)[1:]}
-    reasons = {name: int((some.end_reason == end).sum()) for end, name in names.items()}
     return CallEnds(
         skill,
         len(some),
-        reasons,
+        some.reasons,
         int(((some.end_reason == CallEnd.OWN) & (some.terminated | some.truncated)).sum()),
         float(some.tau.mean()),
         float(some.succeeded.mean()),

@@ -96,19 +96,16 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
     follows[of[log.offset[joined + 1] - 1], of[log.offset[log.followed_by[joined]]]] = True
     follows[count, of[log.offset[:-1][log.order == 0]]] = True
     reached: Array = np.zeros((len(task.accepting), count + 1), bool)
-    place, at = np.array([task.plan.start]), np.array([count])
-    while len(place):
-        reached[place, at] = True
+    new = reached.copy()
+    new[task.plan.start, count] = True
+    while new.any():
+        reached |= new
+        place, at = np.nonzero(new & ~(task.accepting | task.failing)[:, None])
         rows, to = np.nonzero(follows[at])
-        state = task.start(len(rows))
-        state[:, 0] = place[rows]
-        state[:, 1:] = task.counter_steps[place[rows]] - 1
-        after = task.advance(state, events.take(first[to]))[0][:, 0]
-        place, at = np.unique(np.stack([after, to]), axis=1)
-        new: Array = ~reached[place, at]
-        over = task.is_over(place[:, None])
-        reached[place[over], at[over]] = True
-        place, at = place[new & ~over], at[new & ~over]
+        state = np.column_stack([place, task.counter_steps[place] - 1])[rows]
+        new = np.zeros_like(reached)
+        new[task.advance(state, events.take(first[to]))[0][:, 0], to] = True
+        new &= ~reached
     states: Array = np.asarray(reached.any(1))
     if (states & task.accepting).any():
         return ""

@@ -141,7 +141,8 @@ class Planner(ReadySelector):
         self.gamma, self.caution, self.temperature = gamma, caution, temperature
         self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
-        self._own_end = _own_end(self.task, self.graph)
+        self.over = _over(self.task, self.graph)
+        """(E,) bool, the ends of calls after which nothing follows."""
         self.machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
         self.states = PlanningStates(self.machine)
         for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
@@ -173,7 +174,7 @@ class Planner(ReadySelector):
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
-        judged = graph.judge(task, self.states, readings, self.gamma, self._own_end)
+        judged = graph.judge(task, self.states, readings, self.gamma, self.over)
         worth, sweeps = graph.solve(judged, near, may, caution=self.caution)
         return Plan(worth, sweeps)
 
@@ -226,11 +227,6 @@ class Planner(ReadySelector):
         """Return the best options of the graph, (n,), and the nearest calls; see ``choices``."""
         near = self.graph.near(obs)
         return self._choose(self._values(near, obs, state), may, rng), near
-
-    def over_at(self, end: Array) -> Array:
-        """Return where nothing follows the ends (n,) of calls."""
-        over: Array = (self.graph.terminated if self._own_end is None else self._own_end)[end]
-        return over
 
     def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
         """Return goals of choices (n,) from calls (n,) in the graph, as of ``with_goals``."""
@@ -431,14 +427,14 @@ def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
     return skill_set
 
 
-def _own_end(task: Task, graph: CallGraph) -> Array | None:
-    """Return the ends after which nothing follows, (E,) bool; None: where the episode terminated.
+def _over(task: Task, graph: CallGraph) -> Array:
+    """Return the ends after which nothing follows, (E,) bool: where the episode terminated.
 
     An episode that ended at its own goal would go on there for another one.
     """
-    if not isinstance(task, GoalTask) or task.columns is None:
-        return None
     over: Array = graph.terminated.copy()
+    if not isinstance(task, GoalTask) or task.columns is None:
+        return over
     rows = np.flatnonzero(over)
     own = task.of(graph.log.start[graph.end_call[rows]])
     over[rows] = ~task.holds(graph.end[rows], own)
