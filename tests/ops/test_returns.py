@@ -76,20 +76,11 @@ def test_normalise_works_on_each_member_by_itself():
     torch.testing.assert_close(y[0], y[1], atol=1e-5, rtol=0)
 
 
-def test_normalise_of_equal_numbers_is_zero():
-    assert normalise(torch.full((1, 4), 3.0)).tolist() == [[0.0] * 4]
-
-
 def test_explained_variance_is_one_for_the_target_and_zero_for_a_constant():
     target = torch.tensor([[1.0, 2.0, 3.0, 4.0]]).expand(3, 4)
     value = torch.stack([target[0], torch.full((4,), 9.0), torch.tensor([4.0, 3.0, 2.0, 1.0])])
     # the third: residuals −3, −1, 1, 3 with variance 5, over 1.25
     torch.testing.assert_close(explained_variance(value, target), torch.tensor([1.0, 0.0, -3.0]))
-
-
-@pytest.mark.parametrize("value", [torch.zeros(1, 4), torch.ones(1, 4), torch.arange(4.0)[None]])
-def test_explained_variance_of_a_constant_target_is_zero(value):
-    assert explained_variance(value, torch.ones(1, 4)).tolist() == [0.0]
 
 
 def test_a_target_by_hand_and_what_follows_an_end_may_be_anything():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import linecache
-import sys
-import types
 from dataclasses import replace
 from typing import Any
 
@@ -539,42 +536,6 @@ def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
         planner.among(log.skills).bind(box, gym.spaces.Discrete(4), "selector")
     with pytest.raises(RunError, match="'get_key' has changed since the log was recorded"):
         Planner(log, has_key, skills=skill_set(call_steps=3))
-
-
-def with_end(body: str) -> SkillSet:
-    """The corridor's skills, of which one has this code, in a file as a user's is."""
-    source = f"import numpy as np\nfrom skillweave import Skill\n\n{body}"
-    name = f"written_{abs(hash(body))}.py"
-    linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
-    module = types.ModuleType(f"user_{abs(hash(body))}")
-    module.__file__ = name
-    sys.modules[module.__name__] = module
-    exec(compile(source, name, "exec"), module.__dict__)
-    skills = (module.Wait(), *SKILLS[:3])
-    policies = (SKILLS[3].policy, *(s.policy for s in SKILLS[:3]))
-    return SkillSet(skills, policies)
-
-
-WAITING = """
-class Wait(Skill):
-    max_steps = 2
-    far = 3
-
-    def reward(self, step):
-        return step.reward
-
-    def termination(self, step):
-        return step.next_obs[:, 0] > self.far
-"""
-
-
-def test_a_skill_whose_code_has_changed_is_refused() -> None:
-    log = record_calls(SPEC, with_end(WAITING), 300)
-    same = WAITING.replace("far = 3", "far = 3  # places").replace("step.reward", "2 * step.reward")
-    log.check_skills(with_end(same))
-    for other in (WAITING.replace("> self", "< self"), WAITING.replace("far = 3", "far = 4")):
-        with pytest.raises(RunError, match=r"termination of skill 'wait' has changed"):
-            log.check_skills(with_end(other))
 
 
 @pytest.mark.parametrize(
