@@ -80,7 +80,7 @@ class OpenCalls:
             kept[name] for name in ("acted", "open", "reward", "discount", "tau")
         )
         lead, acts, reward = trace.lead, steps["valid"], steps["reward"]
-        reset = trace["terminated"] | trace["truncated"]
+        reset = trace.ended
         begins = trace.get(f"{self.level.path}{SELECTOR}/decided")
         begins = np.zeros(lead, bool) if begins is None else begins
         over, cut, first = (np.zeros(lead, bool) for _ in range(3))

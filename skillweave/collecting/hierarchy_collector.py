@@ -359,7 +359,7 @@ class HierarchyCollector(Collector):
         goal, goals = trace.get(f"{path}/goal"), level.player.goals.get(level.skills.index(skill))
         steps = steps_of(trace, skill, acts, elapsed, end, goal)
         # Elsewhere it is called again at once.
-        ends = trace["terminated"] | trace["truncated"] | timed_out(trace, skill, elapsed)
+        ends = trace.ended | timed_out(trace, skill, elapsed)
         if goal is not None:  # with another goal another trajectory begins
             other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
             ends[:-1] |= other
@@ -372,7 +372,7 @@ class HierarchyCollector(Collector):
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]
-        goes_on = acts & ~(trace["terminated"] | trace["truncated"])
+        goes_on = acts & ~trace.ended
         starts = ~np.concatenate([before[None], goes_on[:-1]])
         before[:] = goes_on[-1]
         return batch.replace(recurrent_state=self._states[path], episode_start=starts)
@@ -392,7 +392,7 @@ class HierarchyCollector(Collector):
         steps = steps_of(trace, skill, acts, elapsed, end, goal)
         own = trace[below.path + "call_end"]
         limited = steps["truncated"] & timed_out(trace, skill, elapsed)
-        over = trace["terminated"] | trace["truncated"]
+        over = trace.ended
         closes = (own != RUNNING) | over | limited
         if goal is not None:  # in its next call it decides again
             closes |= end != RUNNING
