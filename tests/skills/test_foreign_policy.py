@@ -163,14 +163,17 @@ def test_refusing_needs_nothing_installed_and_reads_nothing(monkeypatch, tmp_pat
         from_sb3(tmp_path / "nothing.zip", "ppo")
 
 
-@pytest.mark.parametrize("name", ["PPO", "A2C", "SAC"])
+GSDE = {
+    "PPO": {"n_steps": 64, "policy_kwargs": {"log_std_init": -2.0}},  # few actions are clipped
+    "SAC": {"learning_starts": 50},
+}
+
+
+@pytest.mark.parametrize("name", GSDE)
 def test_a_model_with_gsde_acts_as_its_predict_and_samples_its_distribution(name):
     sb3 = pytest.importorskip("stable_baselines3")
-    more = {"learning_starts": 50} if name == "SAC" else {"n_steps": 64}
-    kind = getattr(sb3, name)
-    if name != "SAC":
-        more["policy_kwargs"] = {"log_std_init": -2.0}  # so that few actions are clipped
-    model = kind("MlpPolicy", "Pendulum-v1", use_sde=True, device="cpu", seed=0, **more).learn(128)
+    how = {"use_sde": True, "device": "cpu", "seed": 0} | GSDE[name]
+    model = getattr(sb3, name)("MlpPolicy", "Pendulum-v1", **how).learn(128)
     policy = fit(from_sb3(model), model.observation_space, model.action_space)
     obs = ROWS[:, :3]
     greedy = model.predict(obs, deterministic=True)[0]
