@@ -154,19 +154,19 @@ def with_returns(
         played: list[int] = []
         # Without `keep` an interrupt may be one of the training around.
         until, stops = (nullcontext(), bool) if keep is None else (deferred("now"), requested)
-        stopped = None
+        stopped = False
         try:
             with until:
                 _play(recorder, engine, player, steps, turn, seeds.integer(), choose, played, stops)
-        except KeyboardInterrupt as error:
-            stopped = error
+        except KeyboardInterrupt:
+            if keep is None:
+                raise
+            stopped = True
         log = recorder.log()
         log = replace(log, seed=np.array(played)[log.episode])
         if keep is not None and len(log):
             keep(log)
-        if stopped is not None:
-            if keep is None:
-                raise stopped
+        if stopped:
             raise Interrupted(
                 f"stopped: {len(log):,} calls ({log.steps:,} steps) were recorded and are kept"
             )

@@ -75,6 +75,7 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
     text, step = str(error), isinstance(argument, Step)
     obs = argument.next_obs if step else argument
     keys = getattr(getattr(obs, "dtype", None), "names", None)
+    example = f"{'step.next_obs' if step else 'obs'}[{repr(keys[0]) if keys else ':, 0'}]"
     name = getattr(error, "name", None) if isinstance(error, AttributeError) else None
     key = error.args[0] if isinstance(error, KeyError) and error.args else None
     if step and isinstance(key, str) and key not in argument.info:
@@ -99,22 +100,18 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
         what = "(self, step)" if step else "(self, obs)"
         return f"; a method of a skill takes {what}, another function only the last of these"
     if step and ("not subscriptable" in text or name in dir(np.ndarray)):
-        return f"; its argument is a Step: write step.next_obs[{repr(keys[0]) if keys else ':, 0'}]"
+        return f"; its argument is a Step: write {example}"
     if step and name is not None and getattr(error, "obj", None) is argument:
         known = [f.name for f in fields(Step)]
         return meant(name, known, "a Step has").replace(": is", "; is")
     if isinstance(argument, np.ndarray) and name in Step.__slots__:
-        return (
-            "; its argument is observations, not a Step: "
-            f"write obs[{repr(keys[0]) if keys else ':, 0'}]"
-        )
+        return f"; its argument is observations, not a Step: write {example}"
     if keys and (
         isinstance(error, IndexError)
         or isinstance(getattr(error, "obj", None), np.ndarray)
         or any(part in text for part in OF_DICTS)
     ):
         kind = "Tuple" if keys[0] == "0" else "Dict"
-        example = f"{'step.next_obs' if step else 'obs'}[{keys[0]!r}]"
         names = ", ".join(map(repr, keys))
         return f"; the observation is a {kind} with the keys {names}: write {example}"
     if isinstance(error, IndexError) and step:

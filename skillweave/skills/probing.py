@@ -175,9 +175,9 @@ def _answer(function: Callable[..., Any], given: Any, more: tuple[Any, ...], spa
     """Return the answer of a function with the random numbers of its first call."""
     for space, values in spaces:
         space.update({k: _copied(v) for k, v in values.items() if isinstance(v, GENERATORS)})
-    more = () if isinstance(given, dict) else (given, *map(_copied, more))
+    more = tuple(map(_copied, more))
     with untouched(None), suppress(Exception, SystemExit):
-        return function(*more, **(given if isinstance(given, dict) else {}))
+        return function(**given) if isinstance(given, dict) else function(given, *more)
     return None
 
 

@@ -59,9 +59,8 @@ def test_what_a_seed_does_not_repeat_is_said_once(tmp_path, recwarn, env, more, 
     assert sum("check_seed=False" in str(each.message) for each in recwarn) == notices
 
 
-@pytest.mark.parametrize("name", ["CartPole-v1", "LunarLander-v3", "Ant-v5"])
-def test_good_environments_are_not_blamed(name):
-    pytest.importorskip({"L": "Box2D", "A": "mujoco"}.get(name[0], "gymnasium"))
-    engine = make_engine(sw.EnvSpec(name, engine="sync"), 1)
+def test_a_physics_engine_that_does_not_repeat_the_last_digits_is_not_blamed():
+    pytest.importorskip("mujoco")
+    engine = make_engine(sw.EnvSpec("Ant-v5", engine="sync"), 1)
     engine.trains = True
     engine.reset(0)

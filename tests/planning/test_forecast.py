@@ -41,7 +41,7 @@ def test_the_chance_is_that_of_the_logged_calls(share: float) -> None:
     assert str(expected).startswith("a (2 steps) → b (1 steps): a chance of ")
 
 
-def test_few_starts_make_a_wide_interval_and_few_calls_are_unsure() -> None:
+def test_few_starts_make_a_wide_interval() -> None:
     low, high = forecast(Planner(goes_right(0.5, 10), Mission(at(1)))).interval
     assert high - low > 0.4
 
