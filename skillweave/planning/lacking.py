@@ -45,25 +45,15 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
 
     The error names the predicates that never hold, and the skill that comes nearest to one.
     """
-    holds = readings.events[:, : len(task.events)].max(0, initial=False).tolist()
-    number = {id(event): i for i, event in enumerate(task.events)}
-
-    def happens(predicate: Predicate) -> bool:
-        i = number.get(id(predicate))
-        if i is None:  # another object of the same function
-            i = next(j for j, e in enumerate(task.events) if e.function == predicate.function)
-        return bool(holds[i])
-
+    happens = readings.events.max(0, initial=False)
     reached, queue = {task.plan.start}, [task.plan.start]
     missing: dict[str, Predicate] = {}
     pays = any(task.plan.each_step.values())
     while queue:
         state = queue.pop()
-        for arrow in task.plan.arrows:
-            if arrow.origin != state:
-                continue
+        for arrow in task.arrows_from(state):
             atoms = [predicate_of(atom) for atom in arrow.atoms]
-            absent = [a for a in atoms if not happens(a)]
+            absent = [a for a in atoms if not happens[task.number(a)]]
             if absent and not task.failing[arrow.target]:
                 missing |= {a.name: a for a in absent}
             if not absent:

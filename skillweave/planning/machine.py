@@ -235,8 +235,7 @@ class RewardMachine:
     def number(self, predicate: Predicate) -> int:
         """Return the number of a predicate among the events; the same function has one number."""
         for i, known in enumerate(self.events):
-            same = known.function is predicate.function or known.function == predicate.function
-            if same and known.reads == predicate.reads:
+            if known.function == predicate.function and known.reads == predicate.reads:
                 return i
         self.events.append(predicate)
         return len(self.events) - 1
