@@ -921,8 +921,8 @@ class Run:
         hierarchy, policy = planned(declared, self.policy, planner)
         run = PlannedRun(hierarchy, self.path, policy)
         # Each goal of its own would need a plan of its own now.
-        if planner.plan.sweeps and (reason := run.explain().reason):
-            notice(f"this plan has a chance of {run.explain().chance:.0%}: {reason}")
+        if planner.plan.sweeps and (expected := run.explain()).reason:
+            notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         return run
 
     @checked_names

@@ -89,8 +89,8 @@ def log_so_far(run: RunDirectory) -> CallLog | None:
         raise RunError(f"{error}. Delete {path} to record a new log") from error
 
 
-def save_calls(run: RunDirectory, log: CallLog) -> CallLog:
-    """Write calls into a run, joined with those that are there, and return them all.
+def save_calls(run: RunDirectory, log: CallLog) -> None:
+    """Write calls into a run, joined with those that are there.
 
     A log of other skills, weights or ``info`` keys is replaced. One of an environment or of skills
     whose code has changed is put aside. A notice says so. Calls that were recorded again, with the
@@ -112,7 +112,6 @@ def save_calls(run: RunDirectory, log: CallLog) -> CallLog:
         write_calls(path, columns_of(log), vars(log), header)
     finally:
         lock.release()
-    return log
 
 
 def _joined_or_aside(path: Path, log: CallLog) -> CallLog:

@@ -56,8 +56,9 @@ class PlayedCalls:
         }
         self._goals = {path: goals_in(below) for path, (below, _) in self._levels.items()}
         self._spaces = spaces
-        self._how: dict[str, Any] = {"info": info, "own_rewards": own_rewards, "inside": inside}
-        self._how["spec"] = spec
+        self._how: dict[str, Any] = {
+            "info": info, "own_rewards": own_rewards, "inside": inside, "spec": spec,
+        }  # fmt: skip
         self._feed: TraceFeed | None = None
 
     def add(self, played: Played) -> None:
