@@ -45,6 +45,8 @@ from skillweave.hierarchy import select_best, training
 from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
 from skillweave.training import joint
+from skillweave.training.episodes import Episodes
+from skillweave.training.skill_report import SkillReport
 from skillweave.training.stage_log import START, StageLog, success_rate
 
 
@@ -62,6 +64,13 @@ def declare(*skills, **how):
         "checkpoint_every": 75,
     }
     return Hierarchy(**plainly(options | how))
+
+
+CALLED = {"left": SkillReport(3, 3, {}, None, None), "push": SkillReport(9, 1, {}, None, None)}
+
+
+def alternately(obs):
+    return np.where(obs[:, 0] > 0, "left", "push")
 
 
 class Other(Balance):
@@ -259,7 +268,7 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     def played(policy, spec, *, engine, **how):
         assert engine == spec.engine == wanted, "they are played where it was trained"
         mean = 10.0 if policy.skills.greedy is better else 5.0
-        return SimpleNamespace(mean=mean, lengths=(7, 8), skills={})
+        return SimpleNamespace(mean=mean, returns=(mean,), lengths=(7, 8), skills=CALLED)
 
     monkeypatch.setattr(select_best, "evaluate", played)
     heard = Heard()
@@ -271,28 +280,29 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     assert run.stage("together")["evaluation_steps"] == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
     words = "greedy {:.4g}, with skills that sample {:.4g} (4 episodes each); kept: "
-    assert words.format(*returns) in heard.said[-1]
-    assert "playing 4 episodes of each kind" in heard.said[-2]
+    compared = next(i for i, text in enumerate(heard.said) if "playing 4 episodes of each" in text)
+    assert words.format(*returns) in heard.said[compared + 1]
 
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize(
     ("means", "kept"),
     [
-        ({"greedy": 5.0, "selector": 10.0}, "selector_samples"),
-        ({"greedy": 5.0, "selector": 5.1}, "greedy"),  # not clearly better
-        ({"greedy": 5.0, "skills": 7.0, "selector": 10.0}, "both_sample"),
+        ({"greedy": 5.0, "selector_samples": 10.0}, "selector_samples"),
+        ({"greedy": 5.0, "selector_samples": 5.1}, "greedy"),  # not clearly better
+        ({"skills_sample": 7.0, "selector_samples": 10.0, "both_sample": 9.9}, "selector_samples"),
+        # Under a greedy selector that is stuck, greedy skills and sampling ones are worth the same.
+        ({"both_sample": 10.0}, "both_sample"),
     ],
 )
 def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, means, kept):
     """A greedy selector can call one skill forever, where a sampling one solves the task."""
 
     def played(policy, spec, **how):
-        samples = not policy.skills.greedy_selector
-        skills = "greedy" if policy.skills.greedy else "skills"
-        mean = means["selector"] if samples else means.get(skills, 0.0)
+        kind = (not policy.skills.greedy, not policy.skills.greedy_selector)
+        mean = means.get(next(name for name, flags in SAMPLING.items() if flags == kind), 0.0)
         returns = (mean - 1.0, mean + 1.0) * 20
-        return SimpleNamespace(mean=mean, returns=returns, lengths=(7,), skills={})
+        return SimpleNamespace(mean=mean, returns=returns, lengths=(7,), skills=CALLED)
 
     monkeypatch.setattr(select_best, "evaluate", played)
     run = declare().train(tmp_path / "run", quiet=True)
@@ -306,12 +316,43 @@ def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize(
+    ("exploring", "error", "learns", "is_said"),
+    [
+        (0.33, 0.04, True, True),
+        (0.33, 0.04, False, False),  # nothing is chosen at random
+        (0.22, 0.02, True, False),  # by chance
+        (0.20, 0.00, True, False),
+        (None, None, True, False),  # no episode has ended
+    ],
+)
+def test_a_selector_that_was_better_with_exploration_is_named(
+    tmp_path, monkeypatch, exploring, error, learns, is_said
+):
+    """Returns of 0 and 1, of which a fifth are 1 without exploration: an error of 0.04."""
+
+    def played(policy, spec, **how):
+        return SimpleNamespace(mean=0.2, returns=(0, 0, 0, 0, 1) * 20, lengths=(7,), skills=CALLED)
+
+    known = {} if exploring is None else {"return": exploring, "return_error": error}
+    monkeypatch.setattr(Episodes, "summary", lambda self: {"length": 7.0} | known)
+    monkeypatch.setattr(select_best, "evaluate", played)
+    heard, hierarchy = Heard(), declare() if learns else declare(selector=alternately)
+    run = new_run(hierarchy, tmp_path / "run")
+    with closing(run):
+        training.train(hierarchy, run, (heard,))
+    said = [text for text in heard.said if "chosen at random" in text]
+    assert [("'left' in 75% of its decisions, for 1.0 steps" in text) for text in said] == [
+        True
+    ] * is_said
+
+
+@pytest.mark.parametrize(
     ("steps", "length", "episodes"),
     [
         (1_000_000, 200.0, 100),
         (100_000, 200.0, 50),
         (100_000, 500.0, 20),
-        (100_000, 600.0, 8),  # 4 candidates of 8 episodes are 20 % of the steps
+        (100_000, 600.0, 8),  # 5 candidates of 8 episodes are 24 % of the steps
         (100_000, 1_100.0, 0),  # fewer than five
         (500, None, 0),
     ],

@@ -23,7 +23,7 @@ from skillweave.algorithms.parameters import ParameterGroup, epsilon_now, rate_n
 from skillweave.algorithms.rollouts import Cells, Samples, minibatches, values_after
 from skillweave.errors import DeclarationError
 from skillweave.experience import Reference, Rehearsal, Report, Rollout
-from skillweave.networks.heads import head_of
+from skillweave.networks.heads import ChoiceHead, head_of
 from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
@@ -39,6 +39,9 @@ REPORT = ("policy_loss", "value_loss", "entropy", "kl", "grad_norm")
 """Metrics of a minibatch."""
 REHEARSAL_COST = 0.2
 """Cost of a nat of KL in the rehearsal's observations, where advantages have a deviation of 1."""
+OPENNESS = 0.1
+"""Cost of a nat of KL from uniform choices, times epsilon: the least likely of n choices keeps a
+probability near 0.1·ε/n, where advantages have a deviation of 1, and can be learnt again."""
 _LR_RANGE = (1e-5, 1e-2)  # of the schedule 'kl', as in rl_games
 
 
@@ -78,6 +81,7 @@ class PPOAlgorithm(Algorithm):
         ):
             raise DeclarationError(f"epsilon needs discrete actions, but they are {action_space}")
         self.head = head_of(self.codec, config.action_std, config.squash_actions)
+        self.choice = self.head.heads[0] if isinstance(self.head, ChoiceHead) else self.head
         self.actor_net = Net("actor", self.obs, config.network, self.head.width)
         self.critic_net = Net("critic", self.obs, config.critic or config.network, 1)
         acting = dict(self.actor_net.shapes)
@@ -262,6 +266,10 @@ class PPOAlgorithm(Algorithm):
         if (surplus := self.head.surplus(dist_params, log_std)) is not None:
             bonus = mean_entropy - masked_mean(surplus, acted)
         total = policy + state.vf_coef * value - terms.ent_coef * bonus
+        if terms.openness is not None:
+            logits = dist_params[..., : self.choice.width]  # without those of goals
+            away = self.choice.kl(torch.zeros_like(logits), None, logits, None, batch.mask)
+            total = total + terms.openness * masked_mean(away, acted)
         with torch.no_grad():
             kl = approximate_kl(log_prob, old, weight, acted)
         report = {"policy_loss": policy, "value_loss": value, "entropy": mean_entropy, "kl": kl}
@@ -338,6 +346,7 @@ class Terms:
     rate: Tensor  # (P,), Adam's step size
     ent_coef: Tensor  # (P,)
     reference: Reference | None
+    openness: Tensor | None  # (P,), cost of a nat of KL from uniform choices; None: no epsilon
     rehearsal: RehearsalRows | None = None  # of the present minibatch
 
     @classmethod
@@ -349,7 +358,9 @@ class Terms:
         final = config.ent_coef_final
         if final is not None:
             ent_coef = torch.lerp(ent_coef, torch.full_like(ent_coef, final), progress)
-        return cls(rate, ent_coef, rollout.reference)
+        epsilon = epsilon_now(config, progress, rate)
+        openness = None if epsilon is None else OPENNESS * epsilon.flatten()
+        return cls(rate, ent_coef, rollout.reference, openness)
 
 
 @torch.no_grad()
@@ -376,14 +387,6 @@ def samples_of(
     reward = rollout.reward
     discount = rollout.discount
     last = rollout.last
-    grid = gae(reward, discount, cells.grid(value), following, last, state.gae_lambda)
-    advantage = cells.flat(grid)
-    returns = advantage + value
-    metrics = {"explained_variance": explained_variance(value, returns, valid)}
-    if cfg.normalize_returns:
-        agent.update_return_stats(state, returns, valid)
-    mean = state.return_mean
-    scale = state.return_scale
     action = cells.flat(rollout.action)
     mask = cells.flat_or_none(rollout.mask)
     # Clipping and KL refer to the current policy, even if an older one, or one with epsilon, acted.
@@ -391,12 +394,32 @@ def samples_of(
     # because the policy can change only a share of 1 − epsilon of the mixture.
     dist_params, _ = agent.run(agent.actor_net, params.views, inputs, memory, starts)
     log_prob, _ = agent.head.stats(dist_params, params.views.get("actor.log_std"), mask, action)
+    importance = likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action))
+    # Values are those of the policy itself. Were they of its mixture with random choices, waiting
+    # for these would seem to be worth something, and the policy alone would wait forever.
+    own_share = None if terms.openness is None else importance.clamp_max(1.0)
+    grid = gae(
+        reward,
+        discount,
+        cells.grid(value),
+        following,
+        last,
+        state.gae_lambda,
+        None if own_share is None else cells.grid(own_share),
+    )
+    advantage = cells.flat(grid)
+    returns = (advantage if own_share is None else own_share * advantage) + value
+    metrics = {"explained_variance": explained_variance(value, returns, valid)}
+    if cfg.normalize_returns:
+        agent.update_return_stats(state, returns, valid)
+    mean = state.return_mean
+    scale = state.return_scale
     own = _own(cells.flat_or_none(rollout.overridden), valid)
     samples = Samples(
         inputs={} if memory is not None else inputs,
         action=action,
         log_prob=log_prob,
-        importance=likelihood_ratio(log_prob, _acted(agent, rollout, cells, mask, action)),
+        importance=importance,
         advantage=_advantage(agent, advantage, cells.flat_or_none(rollout.advantage), own),
         reference=_reference(agent, terms, rollout, cells),
         target=(returns - mean) / scale,

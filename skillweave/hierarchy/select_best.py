@@ -21,7 +21,7 @@ from skillweave.paths import join, levels_to
 from skillweave.runs.comparison import SAMPLING, comparison_words, needs_comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.training.skill_text import useless_skills
+from skillweave.training.skill_text import stuck_selector, useless_skills
 from skillweave.training.stage import TOGETHER, Policies
 from skillweave.training.stage_log import Listener
 
@@ -36,10 +36,10 @@ FEWEST = 5
 SHARE = 0.1
 """Share of the stage's steps that the episodes of a candidate may take."""
 SHORT_SHARE = 0.05
-"""The same share where it would not hold ``LEAST``: there are at most four candidates."""
+"""The same share where it would not hold ``LEAST``: there are at most five candidates."""
 CLEARLY = 2.0
-"""Standard errors by which a sampling selector must be better than a greedy one to replace it;
-users expect a greedy one."""
+"""Standard errors by which a sampling selector must be better than a greedy one to replace it, as
+users expect a greedy one; and training episodes better than all, so that it is said."""
 
 
 def select_best(
@@ -75,7 +75,8 @@ def select_best(
             listener.message(f"{entry['name']}: {comparison_words(entry['kept'])}")
             best = scores[entry["kept"]["kept"]].skills
             learns = level.ready_selector is None
-            for hint in useless_skills(best, episodes, selector_learns=learns):
+            hints = _exploration(entry, scores) if learns else []
+            for hint in hints or useless_skills(best, episodes, selector_learns=learns):
                 listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
 
@@ -126,9 +127,9 @@ def _scores(
     if entry["greedy_judged"] and skills_open:
         scores["skills_sample"] = sampling("skills_sample")
     if entry["greedy_judged"] and selector_open:
-        better = max(scores, key=lambda name: scores[name].mean)  # of equals the first
-        name = "selector_samples" if better == "greedy" else "both_sample"
-        scores[name] = sampling(name)
+        # Under a greedy selector that is stuck, no episode shows how skills should act.
+        for name in ("selector_samples", "both_sample")[: len(scores)]:
+            scores[name] = sampling(name)
     if entry["compared"]:
         scores["before"] = score(resolve_greedy(roles, run), before)
     return scores
@@ -136,14 +137,29 @@ def _scores(
 
 def _best(scores: Mapping[str, Evaluation]) -> str:
     """Return the candidate with the best mean; a selector samples only if it is clearly better."""
-    greedy = {k: v for k, v in scores.items() if k == "before" or not SAMPLING[k][1]}
-    best = max(greedy, key=lambda name: greedy[name].mean)  # of equals the first
-    for name in scores.keys() - greedy.keys():
-        one, other = np.array(scores[name].returns), np.array(scores[best].returns)
-        error = math.sqrt(one.var() / len(one) + other.var() / len(other))
-        if one.mean() - other.mean() > CLEARLY * error:
-            return name
-    return best
+    by_mean = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
+    greedy = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
+    first, other = scores[by_mean[0]], scores[greedy]
+    return by_mean[0] if _is_clear(first.mean - other.mean, first, _error(other)) else greedy
+
+
+def _is_clear(difference: float, score: Evaluation, error: float) -> bool:
+    """Return whether a score differs clearly from a mean return with this standard error."""
+    return difference > CLEARLY * math.hypot(_error(score), error)
+
+
+def _error(score: Evaluation) -> float:
+    """Return the standard error of a mean return."""
+    return float(np.std(score.returns)) / math.sqrt(len(score.returns))
+
+
+def _exploration(entry: Mapping[str, Any], scores: Mapping[str, Evaluation]) -> list[str]:
+    """Return a sentence if training episodes, with choices at random, were clearly the best."""
+    final, best = entry["final"], max(scores.values(), key=lambda score: score.mean)
+    mean = final.get("return")
+    if mean is None or not _is_clear(mean - best.mean, best, final["return_error"]):
+        return []
+    return [stuck_selector(mean, best.mean, scores["greedy"].skills)]
 
 
 def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:

@@ -15,6 +15,7 @@ def gae(
     next_value: Float[Tensor, "P T B"],
     last: Bool[Tensor, "P T B"],
     gae_lambda: Float[Tensor, " P"],
+    importance: Float[Tensor, "P T B"] | None = None,
 ) -> Float[Tensor, "P T B"]:
     """Compute generalised advantage estimates, exact for semi-MDPs and time limits.
 
@@ -38,12 +39,18 @@ def gae(
         next_value: (P, T, B), V of the true successor; ignored where ``discount`` is 0.
         last: (P, T, B) bool, the trajectory is cut here.
         gae_lambda: (P,) float.
+        importance: (P, T, B), at most 1: the probability of each action under the policy whose
+            advantages are wanted ÷ that under the one that acted. Later rows count by it, as in
+            Retrace (Munos et al. 2016, eq. 4), so that ``V + importance·A`` is V-trace's target
+            (Espeholt et al. 2018, eq. 1). None: one policy, all are 1.
 
     Returns:
         Advantages, (P, T, B).
     """
     delta = td_target(reward, discount, next_value) - value
     decay = discount * gae_lambda[:, None, None] * (~last)
+    if importance is not None:
+        decay[:, :-1] *= importance[:, 1:]
     advantage = torch.empty_like(delta)
     running = torch.zeros_like(delta[:, 0])
     for t in range(delta.shape[1] - 1, -1, -1):

@@ -93,8 +93,14 @@ class Episodes:
             window.extend(state[name].tolist())
 
     def summary(self) -> dict[str, float]:
-        """Return means over the window; empty before the first episode ended."""
-        return {k: float(np.mean(v)) for k, v in self._windows.items() if v}
+        """Return means over the window; empty before the first episode ended.
+
+        ``return_error`` is the standard error of the mean return.
+        """
+        means = {k: float(np.mean(v)) for k, v in self._windows.items() if v}
+        if returns := self._windows["return"]:
+            means["return_error"] = float(np.std(returns) / np.sqrt(len(returns)))
+        return means
 
 
 @dataclass

@@ -172,6 +172,25 @@ def useless_skills(
     return sentences
 
 
+def stuck_selector(exploring: float, alone: float, skills: Mapping[str, SkillReport]) -> str:
+    """Return a sentence on a selector that did clearly better while it explored.
+
+    Args:
+        exploring: mean return of the latest training episodes.
+        alone: the best mean return without choices at random.
+        skills: of episodes with a greedy selector.
+    """
+    name, report = max(skills.items(), key=lambda item: item[1].calls)
+    share = report.calls / max(1, sum(one.calls for one in skills.values()))
+    done = "" if report.has_goals else "let its initiation() be False where its work is done, "
+    return (
+        "The latest training episodes, with some calls chosen at random, had a mean return of "
+        f"{exploring:.4g}; without such calls the best is {alone:.4g}. A greedy selector calls "
+        f"{name!r} in {share:.0%} of its decisions, for {report.length_mean or 0.0:.1f} steps "
+        f"each: {done}let each call cost a little (Selection(call_cost=0.001)), or give more steps."
+    )
+
+
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.0%}"
 

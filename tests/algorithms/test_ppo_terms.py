@@ -10,6 +10,7 @@ from torch.distributions import Categorical, Independent, Normal, kl_divergence
 from toys import Toy, learn
 
 from skillweave import PPO, Network
+from skillweave.algorithms import ppo
 from skillweave.algorithms.parameters import epsilon_now
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import RehearsalRows, Terms, samples_of
@@ -178,6 +179,72 @@ def test_with_a_floor_samples_are_weighted_and_the_clip_counts_from_the_policy_i
     found, _ = samples_of(algorithm, state, rollout, Terms.of(config, state, rollout))
     torch.testing.assert_close(found.log_prob, chosen.log())
     torch.testing.assert_close(found.importance, chosen / (0.1 * chosen + 0.9 / 4))
+
+
+def shares(algorithm, state):
+    """The probabilities of actions in the observation 0, without epsilon."""
+    params = algorithm.acting_params_of(algorithm.weights(state))
+    return algorithm.act(params, torch.zeros(1, 1, 3), None, None)[1].softmax(-1)[0, 0]
+
+
+def of_two_choices(algorithm, state, seed, paid):
+    """Choices in one place: the first ends at once, the second is paid and ends the episode.
+
+    Some choices are made at random, by epsilon.
+    """
+    rollout = rollout_of(algorithm, state, seed)
+    rollout.obs.zero_()
+    rollout.next_obs.zero_()
+    rollout.reward = paid * rollout.action.float()
+    rollout.discount = 0.99 * (rollout.action == 0)
+    rollout.last |= rollout.action == 1
+    return rollout
+
+
+def collapsed(**settings):
+    """An algorithm of two choices, and a state that takes the first one nearly always."""
+    config = PPO(
+        epsilon=0.3, network=SMALL, normalize_obs=False, learning_rate_schedule="constant",
+        **settings,
+    )  # fmt: skip
+    algorithm = make_algorithm(config, SEEN, gym.spaces.Discrete(2))
+    state = algorithm.init([Seeds(0)])
+    algorithm.layout.views(state.params)[f"{algorithm.actor_net.head}.bias"][..., 0] += 12.0
+    return algorithm, state
+
+
+def test_a_policy_that_has_collapsed_learns_what_exploration_finds(monkeypatch):
+    found = []
+    for openness in (ppo.OPENNESS, 0.0):
+        monkeypatch.setattr(ppo, "OPENNESS", openness)
+        algorithm, state = collapsed(learning_rate=1e-2)
+        assert shares(algorithm, state)[1] < 1e-5
+        for i in range(60):
+            rollout = of_two_choices(algorithm, state, i, 1.0)
+            state, _ = algorithm.update(state, rollout, [torch.Generator().manual_seed(i)])
+        found.append(shares(algorithm, state)[1].item())
+    assert found[0] > 0.9
+    assert found[1] < 1e-3, "else this shows nothing"
+
+
+def test_no_choice_vanishes_while_there_is_exploration():
+    """The second choice costs; in the end about 0.1·ε/n is left of it."""
+    algorithm, state = collapsed(learning_rate=1e-2)
+    for i in range(100):
+        rollout = of_two_choices(algorithm, state, i, -1.0)
+        state, _ = algorithm.update(state, rollout, [torch.Generator().manual_seed(i)])
+    assert 0.002 < shares(algorithm, state)[1] < 0.1
+
+
+def test_values_are_those_of_the_policy_without_its_random_choices():
+    """The policy never takes the choice that is paid; its mixture with chance does."""
+    algorithm, state = collapsed(learning_rate=1e-9, normalize_returns=False)
+    rollout = of_two_choices(algorithm, state, 0, 1.0)
+    samples, _ = samples_of(algorithm, state, rollout, Terms.of(algorithm.config, state, rollout))
+    assert rollout.action.any()
+    torch.testing.assert_close(samples.target, torch.zeros_like(samples.target), atol=1e-4, rtol=0)
+    paid = rollout.action.flatten(1) == 1
+    assert (samples.advantage[paid] > 1.0).all(), "normalised, far above the mean"
 
 
 @pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.Box(-1, 1, (2,), np.float32)])

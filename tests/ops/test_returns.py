@@ -45,6 +45,20 @@ def test_gae_without_lambda_is_the_one_step_error_and_with_lambda_one_the_whole_
     assert advantages(*args, lam=1.0)[0] == pytest.approx(1 + 0.5 + 0.25 + 0.125 * 8 - 3)
 
 
+def test_gae_of_another_policy_than_the_one_that_acted():
+    # δ₁ = 2 − 5 = −3, δ₀ = 1 + 0.9·5 − 4 = 1.5; of row 1 a quarter counts: 1.5 + 0.45·0.25·(−3)
+    rows = one(1.0, 2.0), one(0.9, 0.0), one(4.0, 5.0), one(5.0, 99.0), one(False, True)
+    importance = one(0.5, 0.25)
+    got = gae(*rows, torch.tensor([0.5]), importance)
+    assert got.flatten().tolist() == pytest.approx([1.1625, -3.0])
+    # V-trace as it is defined (Espeholt et al. 2018, eq. 1), with λ in its c:
+    # v₁ = 5 + 0.25·(−3) = 4.25; v₀ = 4 + 0.5·1.5 + 0.9·(0.5·0.5)·0.25·(−3) = 4.58125
+    target = one(4.0, 5.0) + importance * got
+    assert target.flatten().tolist() == pytest.approx([4.58125, 4.25])
+    everywhere = gae(*rows, torch.tensor([0.5]), torch.ones(1, 2, 1))
+    torch.testing.assert_close(everywhere, gae(*rows, torch.tensor([0.5])), atol=0, rtol=0)
+
+
 def test_gae_ignores_the_next_value_where_the_discount_is_zero_even_if_it_is_not_a_number():
     # A physics engine may well terminate *because* its last observation is not finite.
     got = advantages([1.0, 2.0], [0.9, 0.0], [4.0, 5.0], [5.0, float("nan")], [False, True])
