@@ -268,7 +268,7 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     def played(policy, spec, *, engine, **how):
         assert engine == spec.engine == wanted, "they are played where it was trained"
         mean = 10.0 if policy.skills.greedy is better else 5.0
-        return SimpleNamespace(mean=mean, returns=(mean,), lengths=(7, 8), skills=CALLED)
+        return SimpleNamespace(mean=mean, returns=(mean,) * 2, lengths=(7, 8), skills=CALLED)
 
     monkeypatch.setattr(select_best, "evaluate", played)
     heard = Heard()

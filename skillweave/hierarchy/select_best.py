@@ -12,14 +12,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
-from skillweave.paths import join, levels_to
+from skillweave.paths import join, level_of, levels_to
 from skillweave.runs.comparison import SAMPLING, comparison_words, needs_comparison
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.episodes import standard_error
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.skill_text import stuck_selector, useless_skills
 from skillweave.training.stage import TOGETHER, Policies
@@ -140,26 +139,24 @@ def _best(scores: Mapping[str, Evaluation]) -> str:
     by_mean = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
     greedy = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
     first, other = scores[by_mean[0]], scores[greedy]
-    return by_mean[0] if _is_clear(first.mean - other.mean, first, _error(other)) else greedy
+    difference, error = first.mean - other.mean, standard_error(other.returns)
+    return by_mean[0] if _is_clear(difference, first, error) else greedy
 
 
 def _is_clear(difference: float, score: Evaluation, error: float) -> bool:
     """Return whether a score differs clearly from a mean return with this standard error."""
-    return difference > CLEARLY * math.hypot(_error(score), error)
-
-
-def _error(score: Evaluation) -> float:
-    """Return the standard error of a mean return."""
-    return float(np.std(score.returns)) / math.sqrt(len(score.returns))
+    return difference > CLEARLY * math.hypot(standard_error(score.returns), error)
 
 
 def _exploration(entry: Mapping[str, Any], scores: Mapping[str, Evaluation]) -> list[str]:
     """Return a sentence if training episodes, with choices at random, were clearly the best."""
     final, best = entry["final"], max(scores.values(), key=lambda score: score.mean)
-    mean = final.get("return")
-    if mean is None or not _is_clear(mean - best.mean, best, final["return_error"]):
+    if "return_error" not in final:  # too few episodes have ended
         return []
-    return [stuck_selector(mean, best.mean, scores["greedy"].skills)]
+    if not _is_clear(final["return"] - best.mean, best, final["return_error"]):
+        return []
+    own = {name: one for name, one in scores["greedy"].skills.items() if not level_of(name)}
+    return [stuck_selector(final["return"], best.mean, own)]
 
 
 def resolve_greedy(roles: Roles, run: RunDirectory) -> Roles:

@@ -95,12 +95,17 @@ class Episodes:
     def summary(self) -> dict[str, float]:
         """Return means over the window; empty before the first episode ended.
 
-        ``return_error`` is the standard error of the mean return.
+        ``return_error`` is the standard error of the mean return, from two episodes on.
         """
         means = {k: float(np.mean(v)) for k, v in self._windows.items() if v}
-        if returns := self._windows["return"]:
-            means["return_error"] = float(np.std(returns) / np.sqrt(len(returns)))
+        if len(returns := self._windows["return"]) > 1:
+            means["return_error"] = standard_error(returns)
         return means
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """Return the standard error of the mean of two values or more."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 @dataclass
