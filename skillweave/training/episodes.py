@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -104,8 +105,8 @@ class Episodes:
 
 
 def standard_error(values: Sequence[float]) -> float:
-    """Return the standard error of the mean of two values or more."""
-    return float(np.std(values, ddof=1) / np.sqrt(len(values)))
+    """Return the standard error of the mean; of one value it is not known, so infinite."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else math.inf
 
 
 @dataclass
