@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -275,16 +275,21 @@ TASKS = {
 
 
 def score(name: str, way: str, seed: int, out: Path) -> float:
-    """Return the mean return of 100 episodes after training; a result that is there is read."""
-    file = out / f"{name}-{way}-{seed}.json"
-    if file.exists():
-        return float(json.loads(file.read_text())["mean"])
+    """Return the mean return of 100 episodes after training."""
     task = TASKS[name]
     env = task.env if isinstance(task.env, EnvSpec) else EnvSpec(task.env, workers=1)
     hierarchy = Hierarchy(env, task.skills(), steps=task.steps)
     if way == "apart":
         hierarchy.learn = "apart"
-    run = hierarchy.train(out / f"{name}-{way}-{seed}", seed=seed, flat=way == "flat", quiet=True)
+    return scored(hierarchy, out / f"{name}-{way}-{seed}", seed, flat=way == "flat")
+
+
+def scored(hierarchy: Hierarchy, folder: Path, seed: int, flat: bool = False) -> float:
+    """Return the mean return of 100 episodes after training; a result that is there is read."""
+    file = Path(f"{folder}.json")
+    if file.exists():
+        return float(json.loads(file.read_text())["mean"])
+    run = hierarchy.train(folder, seed=seed, flat=flat, quiet=True)
     found = run.evaluate(100).to_json()
     stages = run.info()["stages"]
     kept = stages[-1].get("kept", {}).get("kept")
@@ -292,27 +297,48 @@ def score(name: str, way: str, seed: int, out: Path) -> float:
     return float(found["mean"])
 
 
-def main() -> None:
-    """Train all, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=list(TASKS))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--out", type=Path, default=Path("runs/declarations"))
+def compare(
+    what: str,
+    tasks: Mapping[str, str],
+    ways: Sequence[str],
+    seeds: Sequence[int],
+    score: Callable[[str, str, int, Path], float],
+    about: str | None,
+) -> None:
+    """Train tasks in several ways, and print a table of the scores.
+
+    Args:
+        what: the benchmark's name.
+        tasks: their names, and their kinds for the table.
+        seeds: the default.
+        score: of a task, a way and a seed; the folder is for its runs.
+        about: the description for ``--help``.
+    """
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("names", nargs="*", default=list(tasks))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(seeds))
+    parser.add_argument("--out", type=Path, default=Path("runs", what))
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
-    jobs = [(n, w, s) for n in asked.names for w in WAYS for s in asked.seeds]
+    jobs = [(n, w, s) for n in asked.names for w in ways for s in asked.seeds]
     with workers(asked.processes) as pool:
         found = [(job, pool.submit(score, *job, asked.out)) for job in jobs]
         scores = {job: future.result() for job, future in found}
     rows = [
-        [name, "dense" if TASKS[name].dense else "sparse"]
-        + [" ".join(f"{scores[name, way, s]:.2f}" for s in asked.seeds) for way in WAYS]
+        [name, tasks[name]]
+        + [" ".join(f"{scores[name, way, s]:.2f}" for s in asked.seeds) for way in ways]
         for name in asked.names
     ]
-    print(table(["task", "reward", *WAYS], rows))
+    print(table(["task", "reward", *ways], rows))
     plain = {"/".join(map(str, job)): value for job, value in scores.items()}
-    report("declarations", {"seeds": asked.seeds, "scores": plain})
+    report(what, {"seeds": asked.seeds, "scores": plain})
+
+
+def main() -> None:
+    """Train all, and print a table."""
+    kinds = {name: "dense" if task.dense else "sparse" for name, task in TASKS.items()}
+    compare("declarations", kinds, WAYS, (0, 1, 2), score, __doc__)
 
 
 if __name__ == "__main__":
