@@ -244,7 +244,7 @@ def test_an_episode_without_film_is_told_and_the_film_stays(film: Any) -> None:
     cells = film.eval_on_selector_all(
         "#calls tbody tr:nth-child(4) td", "all => all.map(e => e.innerText)"
     )
-    assert cells == ["4", "go", "7", "2", "with the episode", "+11", "+4", "yes"]
+    assert cells == ["4", "go", "7", "2", "by itself", "+11", "+4", "yes"]
 
 
 def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> None:
