@@ -58,7 +58,7 @@ def gap(run: Run, player: Player, obs: Array) -> float:
     acting = policy.skills.policies[int(player.memory["skill"][0])]
     found = []
     for network in (policy.selector, acting):
-        best = np.sort(network.heads(obs[None])[0])[::-1]  # type: ignore[attr-defined]
+        best = np.sort(network.heads(obs[None])[0])[::-1]  # type: ignore[union-attr]
         found.append(float(best[0] - best[1]))
     return min(found)
 

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from skillweave.terminal import printable
+from skillweave.policies.errors import PolicyError as PolicyError
+from skillweave.policies.errors import SkillError as SkillError
+from skillweave.policies.errors import SkillweaveError as SkillweaveError
+from skillweave.policies.errors import printable
 from skillweave.tracebacks import ShortTraceback
 
-
-class SkillweaveError(ShortTraceback, Exception):
-    """Base class of all errors that Skillweave raises."""
-
-    def __init__(self, message: str = "") -> None:
-        super().__init__(printable(message))
+SkillweaveError._render_traceback_ = ShortTraceback._render_traceback_  # type: ignore[attr-defined]
 
 
 class DeclarationError(SkillweaveError):
@@ -24,14 +22,6 @@ class DeclarationError(SkillweaveError):
 
 class EnvError(SkillweaveError):
     """An environment cannot be made or used, or broke Gymnasium's contract."""
-
-
-class SkillError(SkillweaveError):
-    """Code of a skill, a selector or a reflex failed, or returned an unusable value."""
-
-
-class PolicyError(SkillweaveError):
-    """A policy cannot be loaded or exported, does not fit where it is used, or failed there."""
 
 
 class TrainingError(SkillweaveError):

@@ -11,7 +11,6 @@ import numpy as np
 
 from skillweave.errors import DeclarationError, RunError
 from skillweave.tracebacks import place
-from skillweave.types import Array
 
 MOST = 10**12
 """The largest whole number that an argument may be: a million times it fits into 64 bits."""
@@ -36,11 +35,6 @@ def close_matches(name: str, known: Iterable[str]) -> str:
     """Return a sentence after a space with up to four known names like ``name``; "" if none is."""
     near = difflib.get_close_matches(name, known, n=4, cutoff=0.6)
     return f" Close matches: {', '.join(near)}." if near else ""
-
-
-def observed(obs: Array) -> str:
-    """Return an observation for a message, in one line, its middle left out where it is long."""
-    return shortened(" ".join(np.array2string(obs, precision=3, threshold=20).split()), 200)
 
 
 def error_text(error: BaseException) -> str:

@@ -3,33 +3,20 @@
 Names and dates in a run may come from another person, and a terminal obeys control characters in
 them. The reader may close the stream (``2>&1 | head``), a log's disk may be full, and a locale may
 support only ASCII. Training continues in all of these cases.
-
-This module imports no other module of the library, so that all can import it.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-_CONTROLS = re.compile(
-    "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # all but tab and newline
-    "\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]"  # order and lines of text
-)
+from skillweave.policies.errors import printable as printable
+
 STANDARD = (0, 1, 2)
 """Numbers of the standard streams."""
-
-
-def printable(text: str) -> str:
-    """Escape the control characters of a text (``\\x1b`` for the one that terminals obey).
-
-    Tabs and newlines do not change.
-    """
-    return _CONTROLS.sub(_escape, text)
 
 
 def one_line(value: object) -> str:
@@ -97,11 +84,6 @@ def steady_streams() -> Iterator[None]:
         finally:
             if sys.stderr is nowhere:
                 sys.stderr = closed
-
-
-def _escape(found: re.Match[str]) -> str:
-    code = ord(found[0])
-    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
 
 
 def _encodable(text: str, stream: Any) -> str:

@@ -1,20 +1,21 @@
 """Types that every room shares: steps, policies and arrays.
 
-This module imports no other module of the library, and no torch.
+This module imports no torch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium import Space
-from numpy.typing import NDArray
+
+from skillweave.policies.core import Array as Array
+from skillweave.policies.core import Step as Step
+from skillweave.policies.core import read_only as read_only
 
 T = TypeVar("T")
-Array: TypeAlias = NDArray[Any]
 Memory: TypeAlias = dict[str, Array]
 """A policy's state of each environment: arrays whose first axis is the environment."""
 
@@ -30,23 +31,6 @@ def unprefixed(prefix: str, named: Mapping[str, T]) -> dict[str, T]:
     return {k.removeprefix(start): v for k, v in named.items() if k.startswith(start)}
 
 
-def flat(prefix: str, value: Any) -> dict[str, Any]:
-    """Flatten nested dicts to one, with dotted names."""
-    if not isinstance(value, dict):
-        return {prefix: value}
-    flattened: dict[str, Any] = {}
-    for k, v in value.items():
-        flattened |= flat(f"{prefix}.{k}", v)
-    return flattened
-
-
-def read_only(array: Array) -> Array:
-    """Return a view that cannot be written to."""
-    view = array.view()
-    view.setflags(False)  # type: ignore[call-arg]  # a keyword takes three times as long
-    return view
-
-
 LARGEST_REWARD = 1e15
 """The largest size of a reward: learners square sums of rewards in float32."""
 
@@ -55,38 +39,6 @@ def wrong_reward(rewards: Array) -> int | None:
     """Return the first row that is not finite or exceeds ``LARGEST_REWARD``; None: all fit."""
     fit = np.abs(rewards) <= LARGEST_REWARD
     return int(np.flatnonzero(~fit)[0]) if b"\0" in fit.tobytes() else None
-
-
-@dataclass(slots=True)
-class Step:
-    """An environment transition in the form that a skill's methods receive, of N environments.
-
-    Its arrays are read-only, because they are shared.
-
-    ``elapsed`` counts the steps of the current episode or call, this one included (so it is 1
-    on the first). ``timed_out`` is True where the skill's ``max_steps`` ended the call. ``goal`` is
-    what the call is for, where the skill has goals (``Skill.goal_space``).
-    """
-
-    obs: Array  # (N, *obs_shape)
-    action: Array  # (N,) or (N, *action_shape)
-    next_obs: Array  # (N, *obs_shape), always the true successor
-    reward: Array  # (N,) float32, the environment's own reward
-    terminated: Array  # (N,) bool
-    truncated: Array  # (N,) bool, the environment's time limit
-    timed_out: Array  # (N,) bool, the skill's time limit
-    elapsed: Array  # (N,) int64, steps
-    info: Mapping[str, Any]  # the environment's, arrays over N
-    goal: Any = None  # (N, *goal_shape), the same in all steps of a call; None: a skill without
-
-    def __post_init__(self) -> None:
-        # Runs in every step of training: a loop over the names takes three times as long.
-        self.obs, self.next_obs = read_only(self.obs), read_only(self.next_obs)
-        self.action, self.reward = read_only(self.action), read_only(self.reward)
-        self.terminated, self.truncated = read_only(self.terminated), read_only(self.truncated)
-        self.timed_out, self.elapsed = read_only(self.timed_out), read_only(self.elapsed)
-        if self.goal is not None:
-            self.goal = read_only(self.goal)
 
 
 class Policy(Protocol):

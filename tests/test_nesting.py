@@ -259,9 +259,9 @@ def test_a_guide_in_a_hierarchy_below_is_kept_to(whole):
     called = set()
 
     def look(memory):
-        high = memory["1.guide.state"] == 1
-        acts = (memory["skill"] == 1) & (memory["1.elapsed"] == 0)
-        called.update(memory["1.skill"][acts & high].tolist())
+        high = memory["1"]["guide"]["state"] == 1
+        acts = (memory["skill"] == 1) & (memory["1"]["elapsed"] == 0)
+        called.update(memory["1"]["skill"][acts & high].tolist())
 
     engine = make_engine(CARTPOLE, 1)
     engine.reset(0)

@@ -22,6 +22,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 BASE = {
     "errors",
     "types",
+    "policies",
     "terminal",
     "tracebacks",
     "notebooks",
@@ -42,11 +43,12 @@ EVERYTHING = LEARNING | {"training", "hierarchy", "evolution", "reporting", "exp
 EVERYTHING |= {"shipped", "api"}
 ROOMS: dict[str, set[str]] = {
     "seeding": set(),
-    "terminal": set(),
+    "policies": set(),
+    "terminal": {"policies"},
     "tracebacks": set(),
     "notebooks": set(),
-    "errors": {"terminal", "tracebacks"},
-    "types": set(),
+    "errors": {"policies", "tracebacks"},
+    "types": {"policies"},
     "shapes": set(),
     "paths": set(),
     "messages": {"errors", "types", "tracebacks"},

@@ -15,7 +15,7 @@ import numpy as np
 
 from skillweave.algorithms.config import PPO
 from skillweave.api.task_views import OwnSelector, own_skills
-from skillweave.collecting.guide import as_logits
+from skillweave.collecting.calls import as_logits
 from skillweave.collecting.skill_set import skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from skillweave.arguments import checked_names
+from skillweave.collecting.skill_set import in_place
 from skillweave.envs.infos import MASK, batched_infos, checked_mask, observes_mask
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import SkillAlone
 from skillweave.messages import short
+from skillweave.policies.core import Memory, Turn, World
 from skillweave.spaces import (
     allows_each,
     choice_counts,
@@ -21,7 +23,10 @@ from skillweave.spaces import (
     put_observation,
 )
 from skillweave.spaces.packing import parts
-from skillweave.types import Array, Memory, Policy, Step
+from skillweave.types import Array, Policy, Step
+
+ROW = np.zeros(1, np.int64)
+"""The one environment."""
 
 
 @checked_names
@@ -67,7 +72,7 @@ class Player:
         self._dtype, self._shape = obs_dtype(self._space), obs_shape(self._space)
         self._choices = choice_counts(policy.action_space)
         self._seed = seed
-        self._rng = np.random.default_rng(seed)
+        self._world = World(np.random.default_rng(seed))
         self.reset(goal=goal)
 
     def reset(self, *, goal: Any = None) -> None:
@@ -88,7 +93,8 @@ class Player:
                 )
             self.policy = self.policy.with_goal(goal, "the player")
         self._needs_goal = isinstance(self.policy, SkillAlone)
-        self.memory: Memory = self.policy.start(1)
+        self._acts = in_place(self.policy)
+        self.memory: Memory = self._acts.start(1)
         self._before: tuple[Array, Array] | None = None
         self._elapsed = 0
 
@@ -119,8 +125,7 @@ class Player:
             given[MASK] = self._allowed(given[MASK])[0]
         if self._before is not None:
             self._elapsed += 1
-            step = self._step(seen, reward, given)
-            self.memory = self.policy.observe(self.memory, step)
+            self._acts.observe(self.memory, ROW, self._step(seen, reward, given))
         if mask is not None and not self._choices:
             raise DeclarationError(
                 f"act(): mask is {short(mask)}, but actions of {short(self.policy.action_space)} "
@@ -133,11 +138,10 @@ class Player:
         allowed = None if mask is None else self._allowed(mask)
         if self._needs_goal:  # where the episode starts
             assert isinstance(self.policy, SkillAlone)
-            self.policy.choose_goals(self.memory, np.zeros(1, np.int64), seen, [self._rng])
+            self.policy.choose_goals(self.memory, ROW, seen, [self._world.rng])
             self._needs_goal = False  # only now: without its goal it must not act
-        action, self.memory = self.policy.act(
-            self.memory, seen, allowed, deterministic=self._deterministic, rng=self._rng
-        )
+        turn = Turn(self._world, allowed, greedy=self._deterministic)
+        action = self._acts.act(self.memory, ROW, seen, turn)
         self._before = seen, action
         return env_form(self.policy.action_space, action[0])
 

@@ -14,20 +14,22 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.guide import ActiveGuide, LastCall
-from skillweave.collecting.skill_set import SkillSet
-from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.collecting.skill_set import SkillSet, policy_of
+from skillweave.hierarchy.policy import Functional, HierarchyPolicy
 from skillweave.planning.task_env import OwnView
+from skillweave.policies.core import LastCall
+from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.parts import Viewed
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.foreign_policy import source_of
-from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal
+from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.own_part import OwnPart
-from skillweave.types import Array, Memory, Policy, Step, prefixed, unprefixed
+from skillweave.types import Array, Memory, Policy, Step
 
 
-class OwnPolicy:
+class OwnPolicy(Functional):
     """A policy that sees the environment's own observations.
 
     Args:
@@ -52,71 +54,21 @@ class OwnPolicy:
         goals: Goals | None = None,
         part: OwnPart | None = None,
     ) -> None:
-        self.policy, self._view, self._goals, self._part = policy, view, goals, part
-        self._base = None if part is None else part.base
+        def seen(obs: Array) -> Array:
+            """Return what the policy sees of observations that hold the task's state."""
+            own = view.obs(obs)
+            return own if part is None else part.see(own)
+
+        inside = policy_of(policy, goals, part, "the policy's act()")
+        super().__init__(Viewed(inside, seen), joins=goals is not None)
+        self.policy = policy
         self.observation_space = space if goals is None else with_goal(space, goals.space)
         self.action_space = policy.action_space if part is None else part.written_space
         self.labels = policy.labels
-        self.acting = policy.acting
-
-    def start(self, n: int) -> Memory:
-        """Return the memory of n environments, with that of the policy that it corrects."""
-        memory = self.policy.start(n)
-        if self._base is None:
-            return memory
-        return memory | prefixed(BASE, self._base.start(n))
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return the policy's actions (n, …)."""
-        how: Any = {"deterministic": deterministic, "rng": rng}
-        own = self._seen(obs if self._goals is None else obs[OBSERVATION])
-        if self._goals is not None:
-            own = self._goals.join(own, obs[GOAL])
-        if self._base is None:
-            return self.policy.act(memory, own, mask, **how)
-        assert self._part is not None
-        assert self._part.correction is not None
-        memory, of_base = _split(memory)
-        base, of_base = self._base.act(of_base, own, None, deterministic=True, rng=rng)
-        learnt, memory = self.policy.act(memory, own, mask, **how)
-        return self._part.correction.apply(base, learnt), memory | prefixed(BASE, of_base)
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Let the policy notice a step, of which the action is the skill's own part."""
-        step = replace(step, obs=self._seen(step.obs), next_obs=self._seen(step.next_obs))
-        if self._base is None:
-            return self.policy.observe(memory, step)
-        memory, of_base = _split(memory)
-        of_base = self._base.observe(of_base, step)
-        return self.policy.observe(memory, step) | prefixed(BASE, of_base)
-
-    def _seen(self, obs: Array) -> Array:
-        """Return what the policy sees of observations that hold the task's state."""
-        own = self._view.obs(obs)
-        return own if self._part is None else self._part.see(own)
 
     def source(self) -> dict[str, Any]:
         """Return the policy's source."""
         return source_of(self.policy)
-
-
-BASE = "base"
-"""Begins the names in a memory of what a policy that is corrected remembers."""
-
-
-def _split(memory: Memory) -> tuple[Memory, Memory]:
-    """Return the memory of the correction, and of the policy that it corrects."""
-    base = unprefixed(BASE, memory)
-    beside = prefixed(BASE, base)
-    return {k: v for k, v in memory.items() if k not in beside}, base
 
 
 class OwnSelector(ReadySelector):

@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.guide import as_logits
 from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
-from skillweave.skills.goal_spaces import OBSERVATION
+from skillweave.policies.parts import OBSERVATION
 from skillweave.types import Array
+
+SMOOTHED = 0.05
+"""Share of a guide's choice that is uniform: without it one deviation would cost infinitely much.
+"""
 
 
 class OpenCalls:
@@ -32,9 +35,9 @@ class OpenCalls:
     def __init__(
         self, level: Level, num_envs: int, shaped: dict[str, Array], *, keep_rewards: bool = False
     ) -> None:
-        n, player, self._shaped = num_envs, level.player, shaped
+        n, hierarchy, self._shaped = num_envs, level.hierarchy, shaped
         self.level, self.keep_rewards = level, keep_rewards
-        self.memory_size = 0 if level.selector is None else level.selector.acting.memory_size
+        self.memory_size = 0 if level.selector is None else level.selector.net.memory_size
         self.kept: dict[str, Array] = {
             "acted": np.zeros(n, bool),  # the level acted in the latest step
             "open": np.zeros(n, bool),  # a call is open
@@ -44,12 +47,12 @@ class OpenCalls:
             "tau": np.zeros(n, np.int64),
         }
         """Of each environment, (N, …); changed in place."""
-        if not player.goals:  # else its shape is that of the selector's choices
+        if not hierarchy.goals:  # else its shape is that of the selector's choices
             self.kept["action"] = np.zeros(n, np.int64)  # the choice
         if self.memory_size:
             self.kept["state_before"] = np.zeros((n, self.memory_size), np.float32)
-        if player.restricts or player.guide is not None:
-            self.kept["allowed"] = np.ones((n, player.skills.choices), bool)  # when it decided
+        if hierarchy.restricts or hierarchy.guide is not None:
+            self.kept["allowed"] = np.ones((n, hierarchy.choices), bool)  # when it decided
 
     def calls_of(self, trace: Trace, steps: Batch, closes: Array, gamma: Array) -> Batch:
         """Return the calls that end in a trace as decisions, (D, N); keep those that are open.
@@ -132,7 +135,7 @@ class OpenCalls:
         """Return the calls that ended as columns (D, N): some have more of them than others."""
         row, env, cut = ends["row"], ends["env"], ends["cut"]
         values = self._at_decisions(trace, ends) | {
-            "reward": (ends["reward"] - self.level.player.skills.call_cost).astype(np.float32),
+            "reward": (ends["reward"] - self.level.skill_set.call_cost).astype(np.float32),
             "steps": ends["steps"],
             "terminated": steps["terminated"][row, env] & ~cut,
             "truncated": steps["truncated"][row, env] | cut,
@@ -142,14 +145,14 @@ class OpenCalls:
         if cut.any():
             values["next_obs"][cut] = self.level.seen(trace, "obs")[row[cut], env[cut]]
         selector = self.level.selector
-        if selector is not None and not self.level.player.goals:
-            values["action"] = np.asarray(selector.acting.to_env(values["action"]))
+        if selector is not None and not self.level.hierarchy.goals:
+            values["action"] = np.asarray(selector.net.to_env(values["action"]))
         if "mask" in values:
             values["next_mask"] = self._next_mask(trace, values, row, env)
         if (chances := trace.get(self.level.path + "chances")) is not None:
             values["guide"] = as_logits(chances[row, env], values["mask"])
-        if selector is not None and selector.widen is not None and "mask" in values:
-            values |= {name: selector.widen(values[name]) for name in ("mask", "next_mask")}
+        if selector is not None and "mask" in values:
+            values |= {name: selector.net.widened(values[name]) for name in ("mask", "next_mask")}
         if self.keep_rewards:
             values["rewards"] = ends["rewards"]
         return self._laid_out(values, env)
@@ -190,9 +193,7 @@ class OpenCalls:
         on = np.flatnonzero(~values["terminated"])
         if len(on):
             seen = values["next_obs"][on]
-            may = level.player.skills.startable(
-                seen if level.player.own_goals is None else seen[OBSERVATION]
-            )
+            may = level.hierarchy.may_start(seen if level.goals is None else seen[OBSERVATION])
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
             may = may | ~may.any(axis=1, keepdims=True)
@@ -241,3 +242,16 @@ DECIDED_ON = {
     "recurrent_state": "state_before",
 }
 """By a name of decisions: the selector's column in a trace, and its name among open calls."""
+
+
+def as_logits(chances: Array, may: Array) -> Array:
+    """Logits of choices that are as likely as that, but for a share that is uniform.
+
+    Args:
+        chances: (…, choices).
+        may: (…, choices) bool, what is allowed: the share is shared among it.
+    """
+    uniform = may / np.maximum(may.sum(-1, keepdims=True), 1)
+    mixed = (1.0 - SMOOTHED) * chances + SMOOTHED * uniform
+    found: Array = np.log(np.maximum(mixed, 1e-8)).astype(np.float32)
+    return found

@@ -68,10 +68,8 @@ class Collector:
             "sums": np.zeros((n, 3)),  # of it: return, return of the task, length as the skill's
         }
         """What is kept of each environment, (N, …) each; changed in place."""
-        self.ranges: dict[str, range] = {}
-        """By names of these, what numbers that choose among something may be."""
-        self.goals: dict[str, Goals] = {}
-        """By names of these, the skills whose goals they are."""
+        self.values: dict[str, range | Goals] = {}
+        """By names of these, what numbers that choose among something may be, or whose goals."""
         self.seen_goals: dict[str, Goals] = {}
         """By names of open calls' observations, the goals that stand in them."""
         self.open: dict[str, Array] = {}
@@ -152,7 +150,8 @@ class Collector:
 
     def state(self) -> dict[str, Array]:
         """Return what ``restore`` needs. It changes nothing."""
-        kept = {k: v.copy() for k, v in self.kept.items()} | {"obs": checksums(self.obs)}
+        kept = {k: as_numbers(v).copy() for k, v in self.kept.items()}
+        kept["obs"] = checksums(self.obs)
         opened = {k: v.copy() for k, v in self.open.items()}
         found = prefixed("kept", kept) | prefixed("open", opened)
         return found | prefixed("engine", self.engine.state())
@@ -169,15 +168,15 @@ class Collector:
         # Environments that draw from global generators go on otherwise than they began.
         seed_global_generators(Seeds(_checksum(state)) / "global")
         kept = unprefixed("kept", state)
-        for name, own in self.kept.items():
-            found = kept[name]
+        for name, values in self.kept.items():
+            found, own = kept[name], as_numbers(values)
             if found.shape != own.shape or found.dtype != own.dtype:
                 raise RunError(
                     f"the checkpoint's {name!r} of open episodes is {found.dtype} {found.shape}, "
                     f"where {own.dtype} {own.shape} belongs: it is not of this stage, or damaged"
                 )
             own[:] = found
-        check_numbers(self.kept, self.ranges, self.goals)
+        check_numbers(self.kept, self.values)
         obs, early = self.engine.restore(unprefixed("engine", state))
         self.obs, self.begun = np.array(obs), True
         space = self.engine.observation_space
@@ -245,8 +244,9 @@ class Collector:
         for name, kept in self.kept.items():
             if name not in self.after_request:
                 kept[ids] = 0
-        for name, goals in self.goals.items():  # zero may be no goal
-            self.kept[name][ids] = goals.start(len(ids))
+        for name, goals in self.values.items():
+            if not isinstance(goals, range):  # zero may be no goal
+                self.kept[name][ids] = goals.start(len(ids))
 
     def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
         """Keep arrays (N, …) that change when the steps of a request are judged."""
@@ -294,6 +294,11 @@ class Collector:
         if success is not None:
             episodes[:, SUCCESS] = success
         self._ended.append((row, ids, episodes))
+
+
+def as_numbers(x: Array) -> Array:
+    """Return an array (N, …) as a checkpoint holds it, the same memory: records as bytes."""
+    return x if x.dtype.names is None else x.view(np.uint8).reshape(len(x), -1)
 
 
 def _checksum(state: Mapping[str, Array]) -> int:

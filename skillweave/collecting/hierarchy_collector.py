@@ -14,15 +14,11 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import EPISODE, LIMIT, RUNNING, end_with_episode
 from skillweave.collecting.calls import OpenCalls
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.judge import judge, seen_by
-from skillweave.collecting.levels import Level, with_learners
-from skillweave.collecting.player import LearnerActor, Player, Turn
-from skillweave.collecting.restored import ranges_of, stored_goals
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.levels import Level, own_memory, with_learners
+from skillweave.collecting.skill_set import SkillSet, acting_policy, within
 from skillweave.collecting.views import (
     call_successes,
     info_numbers_of,
@@ -34,13 +30,25 @@ from skillweave.collecting.views import (
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
-from skillweave.errors import DeclarationError, SkillError
+from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import CRITIC, SELECTOR
-from skillweave.skills import Skill, path_of
+from skillweave.policies.core import (
+    EPISODE,
+    LIMIT,
+    RUNNING,
+    Turn,
+    World,
+    end_with_episode,
+    flat,
+    restart,
+)
+from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.leaves import Learning
+from skillweave.skills import Skill
 from skillweave.skills.goals import CallGoals, goals_of
 from skillweave.spaces import action_codec
-from skillweave.types import Array, Step, prefixed, unprefixed
+from skillweave.types import Array, Step, prefixed
 
 CALLS = (
     "obs",
@@ -100,49 +108,44 @@ class HierarchyCollector(Collector):
         if learners is not None:
             self.skills = with_learners(skills, learners, margins or {})
         self.keep_rewards, self.guide, self.as_skill = keep_rewards, guide, as_skill
-        self.selector = None if acting is None else LearnerActor(acting, SELECTOR, decides=True)
+        self.acting = acting
+        selector = None if acting is None else Learning(acting, SELECTOR, decides=True)
         self._goals = goals_of(as_skill)
-        self.player = Player(self.skills, self.selector, guide, self._goals)
-        self.memory = self.player.start(n)
-        """The player's, (N, …) each; changed in place."""
-        self.kept |= prefixed("player", self.memory)
-        self.ranges |= prefixed("player", ranges_of(self.player))
-        self.goals |= prefixed("player", stored_goals(self.player))
+        self.policy = acting_policy(self.skills, selector, guide, self._goals)
+        self.memory = self.policy.start(n)
+        """The policy's, of all environments; changed in place."""
+        self.kept |= prefixed("player", flat(self.memory))
+        self.values |= prefixed("player", self.policy.values())
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
-            self.goals["goal"] = self._goals
+            self.values["goal"] = self._goals
             self.kept["needs_goal"] = np.ones(n, bool)  # an episode starts
-        self.root = Level(self.player, self.learners)
-        self.levels = {
-            level: self.memory
-            if level is self.root
-            else unprefixed(level.prefix.removesuffix("."), self.memory)
-            for level in self.root.all()
-        }
-        """The levels in which something learns, each with its own memory."""
+        self.root = Level(self.skills, within(self.policy), self.memory, self.learners, self._goals)
+        self.levels = tuple(self.root.all())
+        """The levels in which something learns."""
+        ready = acting is None and guide is not None and guide.decides
         self._together = learners is not None
         self._whole = self._together or as_skill is not None
         """All learn from the steps, or what they are judged by needs them as a whole."""
         self._open: dict[str, OpenCalls] = {}  # by the paths of levels whose selectors learn
-        ready = guide is not None and guide.decides and acting is None
         for level in self.levels:
             if level.selector is not None or (level is self.root and not ready):
                 calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
                 self._open[level.path] = calls
-                if level.player.own_goals is not None:
-                    self.seen_goals[f"{level.path}obs"] = level.player.own_goals
+                if level.goals is not None:
+                    self.seen_goals[f"{level.path}obs"] = level.goals
                 self._keep_after_request(level.path, calls.kept)
                 if "action" in calls.kept:
-                    self.ranges[f"{level.path}action"] = range(level.player.skills.choices)
+                    self.values[f"{level.path}action"] = range(level.hierarchy.choices)
         self._recurrent = {
-            level.path + level.skills[i].name: memory[f"{i}.rnn"]
-            for level, memory in self.levels.items()
-            for i, actor in level.learning.items()
-            if actor.acting.memory_size
+            level.path + level.skills[i].name: own_memory(level.memory[str(i)])["rnn"]
+            for level in self.levels
+            for i, learning in level.learning.items()
+            if learning.net.memory_size
         }
         for path in self._recurrent:  # whether the skill acted in the latest step
             self._keep_after_request(f"{path}/", {"acted": np.zeros(n, bool)})
-        reflexes = any(level.player.skills.reflexes for level in self.levels)
+        reflexes = any(level.skill_set.reflexes for level in self.levels)
         self.overridden = np.zeros(n, bool) if reflexes and self._together else None
         """(N,), where reflexes acted in the latest step; None: not recorded."""
 
@@ -156,7 +159,7 @@ class HierarchyCollector(Collector):
 
     def _forget(self, ids: Array) -> None:
         super()._forget(ids)
-        self.player.restart(self.memory, ids)
+        restart(self.policy, self.memory, ids)
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
 
@@ -164,14 +167,15 @@ class HierarchyCollector(Collector):
 
     def _prepare(self, request: Request) -> None:
         self._record, self._gammas = request.record, dict[str, Array]()  # by path, (N,)
-        if self.selector is not None:
-            self._begin("", self.selector.acting, request)
+        if self.acting is not None:
+            self._begin("", self.acting, request)
         for path, acting in self.learners.items():
             self._begin(path.removesuffix(SELECTOR), acting, request.below[path])
         self._states = {path: memory.copy() for path, memory in self._recurrent.items()}
         self._goal_rng = (request.seeds / "goals").numpy()
         rng = (request.seeds / "skills").numpy()
-        self._turn = Turn(request.greedy, rng, self.kept["age"], self.overridden)
+        self._world = World(rng, self.kept["age"], overridden=self.overridden)
+        self._greedy = request.greedy
 
     def _begin(self, path: str, acting: Acting, request: Request) -> None:
         """Let a learner act by a request."""
@@ -185,30 +189,33 @@ class HierarchyCollector(Collector):
         reads = self.as_skill is not None or any(name.startswith(INFO) for name in self._record)
         reads |= any(s.defines(method) for s in judges for method in ("reward", "termination"))
         reads |= logs and (bool(self.log_calls) or any(s.defines("success") for s in root))
-        self._turn.trace = TraceWriter(rows, self.num_envs, keep_infos=reads)
-        return self._turn.trace
+        writer = TraceWriter(rows, self.num_envs, keep_infos=reads)
+        self._world.trace = writer
+        return writer
 
     def _step(self, out: TraceWriter) -> None:
         """One step of every environment."""
         obs, mask = self.obs, self.engine.mask()
         if self.overridden is not None:
             self.overridden[:] = False
-        seen, goal = self._with_goals(obs)
-        action = self.player.act(self.memory, self._all, seen, mask, self._turn)
+        goal = self._goal(obs)
+        turn = Turn(self._world, mask, goal, self._greedy)
+        action = self.policy.act(self.memory, self._all, obs, turn)
         if self._records:
             out.write(goal=goal)
             out.write(obs=obs, env_action=action, mask=mask, overridden=self.overridden)
-            for level, memory in self.levels.items():
-                out.write(**{level.path + "skill": memory["skill"]})
-                for i, goals in level.player.goals.items():
-                    of_call = goals.read(memory[f"goal.{i}"])
+            for level in self.levels:
+                out.write(**{level.path + "skill": level.memory["skill"]})
+                for i in level.hierarchy.goals:
+                    of_call = level.memory["goal"][str(i)]
                     out.write(**{f"{level.path}{level.skills[i].name}/goal": of_call})
         raw = self.engine.step(action)
         self.kept["age"] += 1
         step = raw.seen(obs, action, self.kept["age"].copy())
         if goal is not None:
             step = replace(step, goal=goal)
-        end = self.player.observe(self.memory, self._all, step)
+        self.policy.observe(self.memory, self._all, step)
+        end = self.memory["end"].copy()
         terminated, truncated = self._ends(step, end)
         end_with_episode(end, terminated | truncated)
         ended = np.flatnonzero(terminated | truncated)
@@ -222,19 +229,15 @@ class HierarchyCollector(Collector):
             self._begin_anew(ended)
         out.next(raw.info)
 
-    def _with_goals(self, obs: Array) -> tuple[Array, Array | None]:
-        """Return what the hierarchy sees, (N, …), after the goals of new episodes; and its goals.
-
-        None: it has none.
-        """
+    def _goal(self, obs: Array) -> Array | None:
+        """Return the hierarchy's goals, (N, …), after those of new episodes; None: it has none."""
         if self._goals is None:
-            return obs, None
+            return None
         needs, kept = self.kept["needs_goal"], self.kept["goal"]
         if len(ids := np.flatnonzero(needs)):
-            kept[ids] = self._goals.stored(self._goals.draw(obs[ids], self._goal_rng))
+            kept[ids] = self._goals.draw(obs[ids], self._goal_rng)
             needs[ids] = False
-        goal = self._goals.read(kept).copy()
-        return self._goals.join(obs, goal), goal
+        return kept.copy()
 
     def _ends(self, step: Step, end: Array) -> tuple[Array, Array]:
         """Return where episodes are terminated, and truncated, (N,) bool each.
@@ -254,16 +257,16 @@ class HierarchyCollector(Collector):
 
     def _write(self, out: TraceWriter, step: Step, end: Array) -> None:
         """Write what a step has led to, and why calls ended, (N,)."""
-        for level, memory in self.levels.items():
-            path, player = level.path, level.player
+        for level in self.levels:
+            path, memory, guide = level.path, level.memory, level.hierarchy.guide
             if self._records:
                 ends = {"call_elapsed": memory["elapsed"], "call_end": memory["end"]}
                 out.write(**{path + name: value for name, value in ends.items()})
-            if player.guide is not None and level.selector is not None:
-                every = np.ones((self.num_envs, player.skills.choices), bool)
-                allows = player.guide.ahead(memory, self._all, every)
+            if guide is not None and level.selector is not None:
+                every = np.ones((self.num_envs, level.hierarchy.choices), bool)
+                allows = level.hierarchy.guided(memory, self._all, every)
                 out.write(**{path + "guide_allows": allows})
-                if player.guide.tells:
+                if guide.tells:
                     out.write(**{path + "chances": memory["chances"]})
         out.write(env_reward=step.reward, call_end=end)
         if self.log_calls is not None and "limit" in self.memory:
@@ -299,8 +302,8 @@ class HierarchyCollector(Collector):
         return Batch(reward=reward, **ends, valid=every), self._count(each)
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
-        self._check_lengths()
-        self._turn.trace = None  # only learners hold it from here on
+        self.root.hierarchy.check_lengths(self.memory, LONGEST_EPISODE)
+        self._world.trace = None  # only learners hold it from here on
         end = trace["call_end"]
         return dict(self._of_level(trace, self.root, steps, end, end != RUNNING))
 
@@ -340,7 +343,7 @@ class HierarchyCollector(Collector):
         """Return all steps of a level, for its critic."""
         acts, running = steps["valid"], trace[level.path + "skill"]
         seen = {name: level.seen(trace, name) for name in ("obs", "next_obs")}
-        if own := level.player.goals:
+        if own := level.hierarchy.goals:
             names = ((i, f"{level.path}{level.skills[i].name}/goal") for i in own)
             goals = {i: trace[name] for i, name in names}
             where = np.where(acts, running, -1)
@@ -356,7 +359,10 @@ class HierarchyCollector(Collector):
     def _of_skill(self, trace: Trace, level: Level, skill: Skill, acts: Array, end: Array) -> Batch:
         """Return what a skill that learns did, judged by its own reward and ends."""
         path, elapsed = level.path + skill.name, trace[level.path + "call_elapsed"]
-        goal, goals = trace.get(f"{path}/goal"), level.player.goals.get(level.skills.index(skill))
+        goal, goals = (
+            trace.get(f"{path}/goal"),
+            level.hierarchy.goals.get(level.skills.index(skill)),
+        )
         steps = steps_of(trace, skill, acts, elapsed, end, goal)
         # Elsewhere it is called again at once.
         ends = trace.ended | timed_out(trace, skill, elapsed)
@@ -364,7 +370,7 @@ class HierarchyCollector(Collector):
             other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
             ends[:-1] |= other
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
-        part = level.player.skills.part(level.skills.index(skill))
+        part = level.skill_set.part(level.skills.index(skill))
         batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)
         if "action" not in batch:
             space = self.engine.action_space if part is None else part.action_space
@@ -400,15 +406,3 @@ class HierarchyCollector(Collector):
         cut = (own == RUNNING) & (end != RUNNING)
         inner = np.where(over, np.int8(EPISODE), np.int8(LIMIT))
         return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
-
-    def _check_lengths(self) -> None:
-        """Raise a SkillError where a call has run for so long that nothing seems to end it."""
-        steps = self.memory["elapsed"]
-        if steps.max() >= LONGEST_EPISODE:
-            row = int(steps.argmax())
-            name = path_of(self.skills.skills[int(self.memory["skill"][row])])
-            raise SkillError(
-                f"skill {name!r} has run for {int(steps[row]):,} steps in environment {row}, and "
-                "neither its termination() nor the episode's end has come: give it max_steps, or "
-                "the hierarchy call_steps"
-            )

@@ -8,13 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from skillweave.envs.infos import info_rows, own_step, random_actions, reported_success
+from skillweave.envs.infos import random_actions, reported_success
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch
+from skillweave.policies.core import own_step, part_of
+from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
-from skillweave.skills.goal_spaces import GOAL, OBSERVATION
 from skillweave.skills.goals import goals_of
 from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
@@ -166,23 +167,6 @@ def seen_by(
         rows: (m,) ascending, some rows of the step; None: all.
         goal: (m, *goal_shape) of its calls; None: it has no goals.
     """
-    step = step if skill is None else own_step(step)
-    every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
-    at = slice(None) if every else rows
-    terminated = step.terminated[at]
-    timed_out = np.zeros(len(terminated), bool)
-    if skill is not None and skill.max_steps is not None:
-        timed_out = (elapsed >= skill.max_steps) & ~terminated
-    info = step.info if rows is None or every else info_rows(step.info, rows, len(step.reward))
-    return Step(
-        obs=step.obs[at],
-        action=step.action[at],
-        next_obs=step.next_obs[at],
-        reward=step.reward[at],
-        terminated=terminated,
-        truncated=step.truncated[at],
-        timed_out=timed_out,
-        elapsed=elapsed,
-        info=info,
-        goal=goal,
-    )
+    if skill is None:
+        return part_of(step, elapsed, rows, None, goal)
+    return part_of(own_step(step), elapsed, rows, skill.max_steps, goal)

@@ -7,17 +7,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.call_end import Interruption
-from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.player import LearnerActor, Player
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, within
 from skillweave.experience import Trace
 from skillweave.paths import CRITIC, SELECTOR
+from skillweave.policies.core import Memory
+from skillweave.policies.hierarchy import ActiveGuide, Hierarchy, Interruption
+from skillweave.policies.leaves import Learning
 from skillweave.skills import Skill
-from skillweave.skills.goals import goals_of
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.types import Array, Policy
 
 
@@ -31,6 +32,11 @@ class UntrainedHierarchy:
     """None: it learns."""
     guide: ActiveGuide | None = None
     """A ready selector beside it."""
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The environment's."""
+        return self.skills.action_space
 
 
 def with_learners(
@@ -47,14 +53,14 @@ def with_learners(
     def policy_of(skill: Skill, policy: Any) -> Any:
         name = path + skill.name
         if name in learners:
-            return LearnerActor(learners[name], name)
+            return Learning(learners[name], name)
         if not isinstance(policy, UntrainedHierarchy):
             return policy
         selector: Any = policy.selector
         if (chooser := f"{name}/{SELECTOR}") in learners:
-            selector = LearnerActor(learners[chooser], chooser, decides=True)
+            selector = Learning(learners[chooser], chooser, decides=True)
         below = with_learners(policy.skills, learners, margins, f"{name}/")
-        return Player(below, selector, policy.guide, goals_of(skill))
+        return UntrainedHierarchy(below, selector, policy.guide)
 
     pairs = zip(skills.skills, skills.policies, strict=True)
     critic, interruption = path + CRITIC, None
@@ -62,6 +68,12 @@ def with_learners(
         interruption = Interruption(_worth(learners[critic]), margins[critic])
     policies = tuple(policy_of(*pair) for pair in pairs)
     return replace(skills, policies=policies, interruption=interruption)
+
+
+def own_memory(memory: Memory) -> Memory:
+    """Return what a skill's own policy remembers, without what it corrects."""
+    own: Memory = memory.get("own", memory)
+    return own
 
 
 def _worth(critic: Acting) -> Callable[[Array], Array]:
@@ -78,28 +90,32 @@ def _worth(critic: Acting) -> Callable[[Array], Array]:
 class Level:
     """Skills below one selector: the root's, or those of a skill that is a hierarchy and learns."""
 
-    player: Player
+    skill_set: SkillSet
+    hierarchy: Hierarchy
+    """Of these skills."""
+    memory: Memory
+    """What it remembers, of all environments; changed in place."""
     learners: Mapping[str, Acting]
     """By path, all who learn below the first selector."""
+    goals: Goals | None = None
+    """Its own, as a skill that has goals."""
     path: str = ""
     """Of these skills, as columns of a trace have it: empty, or ``inner/`` for example."""
-    prefix: str = ""
-    """Of its memory in that of the root's player: empty, or ``1.`` for example."""
 
     @property
     def skills(self) -> tuple[Skill, ...]:
         """The skills, in order."""
-        return self.player.skills.skills
+        return self.skill_set.skills
 
     @property
-    def selector(self) -> LearnerActor | None:
+    def selector(self) -> Learning | None:
         """The selector; None: it does not learn."""
-        found = self.player.selector
-        return found if isinstance(found, LearnerActor) else None
+        found = self.hierarchy.selector
+        return found if isinstance(found, Learning) else None
 
     def seen(self, trace: Trace, name: str) -> Array:
         """Return the column ``name``, "obs" or "next_obs", as selector and critic see it."""
-        own = self.player.own_goals
+        own = self.goals
         return trace[name] if own is None else own.join(trace[name], trace[self.path + "goal"])
 
     @property
@@ -111,17 +127,20 @@ class Level:
     def below(self) -> dict[int, Level]:
         """The skills that are hierarchies in which something learns, by their place in the list."""
         found: dict[int, Level] = {}
-        for i, player in self.player.below.items():
-            path = f"{self.path}{self.skills[i].name}/"
+        for i, (skill, policy) in enumerate(zip(self.skills, self.skill_set.policies, strict=True)):
+            path = f"{self.path}{skill.name}/"
             if any(name.startswith(path) for name in self.learners):
-                found[i] = Level(player, self.learners, path, f"{self.prefix}{i}.")
+                inside, memory = within(self.hierarchy.skills[i].policy), self.memory[str(i)]
+                found[i] = Level(
+                    policy.skills, inside, memory, self.learners, goals_of(skill), path
+                )
         return found
 
     @cached_property
-    def learning(self) -> dict[int, LearnerActor]:
+    def learning(self) -> dict[int, Learning]:
         """The skills that learn and are no hierarchies, by their place in the list."""
-        actors = enumerate(self.player.actors)
-        return {i: actor for i, actor in actors if isinstance(actor, LearnerActor)}
+        policies = enumerate(self.skill_set.policies)
+        return {i: policy for i, policy in policies if isinstance(policy, Learning)}
 
     def all(self) -> Iterator[Level]:
         """This level and all below it, each before those below it."""

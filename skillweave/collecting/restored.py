@@ -8,17 +8,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import RUNNING, CallEnd
-from skillweave.collecting.player import Player
 from skillweave.paths import join, level_of, name_of
+from skillweave.policies.core import RUNNING
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals
 from skillweave.spaces import obs_codec, to_tensor
-from skillweave.types import Array, Memory, prefixed
+from skillweave.types import Array, Memory
 
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""
-OF_OTHERS = ("player.", "starters.", "base.")
+OF_OTHERS = ("player.", "starters.", "base.", "last_action")
 """How names begin of what others remember, who may be a user's: that may be anything."""
 PLAYERS = ("player", "starters")
 """What players are called whose memory is kept."""
@@ -31,25 +30,23 @@ def known(x: Array) -> Array:
 
 def check_numbers(
     kept: Mapping[str, Array],
-    ranges: Mapping[str, range],
-    goals: Mapping[str, Goals] | None = None,
+    values: Mapping[str, range | Goals],
 ) -> None:
     """Raise a ValueError where numbers are none that a collector keeps.
 
     Args:
         kept: of each environment, (N, …) each.
-        ranges: by name, what numbers that choose among something may be.
-        goals: by name, of the skills whose goals they are.
+        values: by name, what numbers may be that choose among something, or the goals that they
+            are.
     """
-    goals = goals or {}
-    for name, of_skill in goals.items():
-        if not of_skill.contains(kept[name]):
+    ranges = {name: those for name, those in values.items() if isinstance(those, range)}
+    for name, of_skill in values.items():
+        if not isinstance(of_skill, range) and not of_skill.contains(kept[name]):
             raise ValueError(f"{name!r} of an open call is no goal of its skill")
-    own = {
-        name: x for name, x in kept.items() if not name.startswith(OF_OTHERS) and name not in goals
-    }
+    known_by = {*values} - {*ranges}
+    own = {k: x for k, x in kept.items() if not k.startswith(OF_OTHERS) and k not in known_by}
     counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
-    for name, those in (counts | dict(ranges)).items():
+    for name, those in (counts | ranges).items():
         wrong = kept[name][(kept[name] < those[0]) | (kept[name] > those[-1])]
         if len(wrong):
             raise ValueError(
@@ -87,7 +84,7 @@ def opened(
         if name_of(name) == "obs":  # of a hierarchy below: "inner/obs"
             like, codec = obs, plain
             if (own := (goals or {}).get(name)) is not None:
-                like = own.join(obs, own.read(own.start(len(obs))))
+                like = own.join(obs, own.start(len(obs)))
                 codec = obs_codec(with_goal(observation_space, own.space))
             found[name] = value.copy().view(like.dtype).reshape(like.shape)
             # What calls that are over were decided on is not kept.
@@ -107,29 +104,4 @@ def opened(
     running = kept.get("player.end", np.ones(1, np.int8)) == RUNNING
     if "tau" in kept and running.any() and "obs" not in found:
         raise ValueError("it does not say where open calls began")
-    return found
-
-
-def stored_goals(player: Player) -> dict[str, Goals]:
-    """Return the goals in a player's memory by name; for checkpoints."""
-    found = {f"goal.{i}": goals for i, goals in player.goals.items()}
-    for i, below in player.below.items():
-        found |= prefixed(str(i), stored_goals(below))
-    return found
-
-
-def ranges_of(player: Player) -> dict[str, range]:
-    """Return the valid ranges of numbers in a player's memory, by name; for checkpoints."""
-    skills = player.skills
-    found = {
-        "skill": range(-1, len(skills.skills)),
-        "elapsed": range(2**31),
-        "end": range(len(CallEnd)),
-    }
-    if skills.lengths:
-        found["limit"] = range(max(skills.lengths) + 1)
-    if player.guide is not None:
-        found |= prefixed("guide", player.guide.selector.ranges)
-    for i, below in player.below.items():
-        found |= prefixed(str(i), ranges_of(below))
     return found

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.call_end import LIMIT, OWN, RUNNING, end_with_episode
 from skillweave.collecting.collector import SUCCESS, Collector
 from skillweave.collecting.judge import judge, seen_by
-from skillweave.collecting.player import Turn, actor_of
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, base_of
 from skillweave.collecting.start_policy import StartPolicy
 from skillweave.collecting.views import rows_of, steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
@@ -22,8 +20,21 @@ from skillweave.envs.engine import Engine, RawStep
 from skillweave.envs.infos import reported_success
 from skillweave.errors import TrainingError
 from skillweave.experience import INFO, Batch, Trace
-from skillweave.messages import observed
-from skillweave.skills import Reflex, Skill, apply_reflexes, asked
+from skillweave.policies.core import (
+    LIMIT,
+    OWN,
+    RUNNING,
+    Policy,
+    Turn,
+    World,
+    end_with_episode,
+    flat,
+    observed,
+    part_of,
+    restart,
+)
+from skillweave.policies.parts import Reflexes
+from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import ZERO, OwnPart, Rest
 from skillweave.types import Array, Memory, Step, prefixed
@@ -111,14 +122,13 @@ class SkillCollector(Collector):
             self.kept["last_action"] = self._rest.start(n)
         self._base: Any = None
         if part is not None and part.base is not None:
-            blamed = f"{part.who}: act() of the policy that it corrects"
-            self._base = actor_of(part.base, blamed)
+            self._base = base_of(part, goals_of(skill))
             self._base_memory: Memory = self._base.start(n)
-            self.kept |= prefixed("base", self._base_memory)
+            self.kept |= prefixed("base", flat(self._base_memory))
         self._goals = goals_of(skill)
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)
-            self.goals["goal"] = self._goals
+            self.values["goal"] = self._goals
             self.kept["needs_goal"] = np.zeros(n, bool)  # a call of the skill starts
         self._asks = self._searches or (skill is not None and skill.defines("termination"))
         self._asks |= self._base is not None and self._base.watches
@@ -133,8 +143,7 @@ class SkillCollector(Collector):
                 self.kept["sought"] = np.zeros(n, np.int64)  # steps until one ended; −1: one has
             self._starters = StartPolicy(starters, n, engine.action_space, self._start_after)
             self.kept |= self._starters.kept
-            self.ranges |= self._starters.ranges
-            self.goals |= self._starters.goals
+            self.values |= self._starters.values
 
     @property
     def memory(self) -> Array | None:
@@ -175,12 +184,12 @@ class SkillCollector(Collector):
             self._draw_calls()
         obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
         goal, part = None, self._part
-        seen = obs if part is None else part.see(obs)
+        own = seen = obs if part is None else part.see(obs)
         if self._goals is not None:
             goal = self._choose_goals(playing)
-            seen = self._goals.join(seen, goal)
+            seen = self._goals.join(own, goal)
         acted = self.acting.all(seen, mask if part is None else part.mask(mask), memory)
-        action, overridden = self._actions(obs, seen, acted.action, mask, playing)
+        action, overridden = self._actions(obs, own, goal, acted.action, mask, playing)
         out.write(
             obs=obs,
             action=acted.action,
@@ -193,14 +202,14 @@ class SkillCollector(Collector):
         )
         raw = self.engine.step(action)
         if self._rest is not None:
-            self.kept["last_action"][:] = self._rest.stored(action)
+            self.kept["last_action"][:] = action
         self.kept["age"] += 1
         self.kept["elapsed"] += 1 if playing is None else playing
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
         if part is not None and step is not None and self._base is not None and self._base.watches:
             rows = self._all if playing is None else np.flatnonzero(playing)
-            own = part.own_step(seen_by(None, step, self.kept["elapsed"][rows], rows))
-            self._base.observe(self._base_memory, rows, own)
+            seen_step = part_of(step, self.kept["elapsed"][rows], rows)
+            self._base.observe(self._base_memory, rows, part.own_step(seen_step))
         end = self._ends(raw, step, playing, goal)
         out.write(
             next_obs=raw.next_obs,
@@ -233,12 +242,19 @@ class SkillCollector(Collector):
         return ~self.kept["searching"]
 
     def _actions(
-        self, obs: Array, seen: Array, chosen: Array, mask: Array | None, playing: Array | None
+        self,
+        obs: Array,
+        own: Array,
+        goal: Array | None,
+        chosen: Array,
+        mask: Array | None,
+        playing: Array | None,
     ) -> tuple[Array, Array | None]:
         """Return the actions (N, …) of the skill, of reflexes, and of the search for its start.
 
         Args:
-            seen: what the learner sees of ``obs``.
+            own: its part of ``obs``.
+            goal: of the skill, (N, …).
             chosen: what the learner chose, in policy units.
 
         Returns:
@@ -248,11 +264,11 @@ class SkillCollector(Collector):
         last = self.kept.get("last_action")
         if self._part is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
-            action = self._part.write(action, last, self._corrected(seen, rows))
+            action = self._part.write(action, last, self._corrected(own, goal, rows))
             self._part.check_mask(None if mask is None else mask[rows], action[rows])
         if self.reflexes:
-            space = self.engine.action_space
-            action, overridden = apply_reflexes(self.reflexes, obs, action, space)
+            reflexes = Reflexes(Policy(), self.reflexes, self.engine.action_space)
+            action, overridden = reflexes.over(obs, action)
         if playing is not None:
             searching, action = np.flatnonzero(~playing), action.copy()
             action[searching] = self._starters.act(
@@ -260,11 +276,12 @@ class SkillCollector(Collector):
             )
         return action, overridden
 
-    def _corrected(self, seen: Array, rows: Array) -> Array | None:
+    def _corrected(self, own: Array, goal: Array | None, rows: Array) -> Array | None:
         """Return the actions (N, …) of the policy that the skill corrects; None: it has none.
 
         Args:
-            seen: (N, …), what the skill sees.
+            own: (N, …), its part of the observation.
+            goal: of the skill, (N, …).
             rows: (k,) where it acts; elsewhere they are 0.
         """
         if self._part is None or self._base is None:
@@ -272,8 +289,8 @@ class SkillCollector(Collector):
         shape = self._part.action_space.shape or ()
         action = np.zeros((self.num_envs, *shape), np.float64)
         if len(rows):
-            turn = Turn(True, self._rng)
-            action[rows] = self._base.act(self._base_memory, rows, seen[rows], None, turn)
+            turn = Turn(World(self._rng), None, None if goal is None else goal[rows])
+            action[rows] = self._base.act(self._base_memory, rows, own[rows], turn)
         return action
 
     def _search(self, step: Step, searching: Array) -> None:
@@ -285,7 +302,7 @@ class SkillCollector(Collector):
         if last is not None:
             is_named = is_named.copy()
             is_named[ids] = self._starters.named(ids)
-        free = self._starters.observe(ids, seen_by(None, step, step.elapsed[ids], ids))
+        free = self._starters.observe(ids, part_of(step, step.elapsed[ids], ids))
         left = self.kept["calls_left"]
         left[free] = np.maximum(left[free] - 1, 0)
         if last is not None:
@@ -322,9 +339,9 @@ class SkillCollector(Collector):
         needs, kept = self.kept["needs_goal"], self.kept["goal"]
         ids = np.flatnonzero(needs if playing is None else needs & playing)
         if len(ids):
-            kept[ids] = self._goals.stored(self._goals.draw(self.obs[ids], self._goal_rng))
+            kept[ids] = self._goals.draw(self.obs[ids], self._goal_rng)
             needs[ids] = False
-        return self._goals.read(kept)
+        return kept
 
     def _ends(
         self, raw: RawStep, step: Step | None, playing: Array | None, goal: Array | None
@@ -405,8 +422,7 @@ class SkillCollector(Collector):
         if self._rest is not None:
             self.kept["last_action"][ids] = self._rest.start(len(ids))
         if self._base is not None:
-            for name, value in self._base.start(len(ids)).items():
-                self._base_memory[name][ids] = value
+            restart(self._base, self._base_memory, ids)
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True
         if self._searches:

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
-from skillweave.collecting.call_end import Interruption
 from skillweave.collecting.lengths import Lengths
-from skillweave.errors import SkillError
-from skillweave.messages import observed
-from skillweave.skills import Reflex, Skill, asked, path_of
+from skillweave.errors import PolicyError
+from skillweave.policies.core import Around, Policy, flat
+from skillweave.policies.hierarchy import ActiveGuide, Hierarchy, Interruption
+from skillweave.policies.hierarchy import Skill as Called
+from skillweave.policies.leaves import Ready, Returns
+from skillweave.policies.parts import Corrects, Given, Joined, Reflexes, Remembers
+from skillweave.skills import Reflex, Skill, path_of
+from skillweave.skills.answers import ask
 from skillweave.skills.goal_spaces import choice_space
-from skillweave.skills.own_part import OwnPart
-from skillweave.types import Array, Policy
+from skillweave.skills.goals import CallGoals, Goals, goals_of
+from skillweave.skills.outputs import blame
+from skillweave.skills.own_part import ZERO, OwnPart, PartOf, Rest
+from skillweave.types import Array, Memoryless
 
 
 @dataclass(frozen=True)
 class SkillSet:
-    """Skills with their policies, and the limits of their calls; a ``Player`` lets them act.
+    """Skills with their policies, and the limits of their calls; ``hierarchy_of`` lets them act.
 
     A choice is a number below ``choices``: a skill, or a skill and a length.
     """
 
     skills: tuple[Skill, ...]
-    policies: tuple[Policy, ...]
+    policies: tuple[Any, ...]
     reflexes: tuple[Reflex, ...] = ()
     call_steps: int | Lengths | None = None
     """A call lasts at most so long; None: until the skill stops by itself."""
@@ -59,50 +65,19 @@ class SkillSet:
         goal_spaces = {s.name: s.goal_space for s in self.skills if s.goal_space is not None}
         return choice_space(self.choices, goal_spaces, [s.name for s in self.skills])
 
-    def mask(self, obs: Array, age: Array | None = None) -> Array | None:
-        """Return the allowed choices, (n, choices) bool; None: all, everywhere.
-
-        Args:
-            age: (n,), steps of the episodes so far, for messages.
-
-        Raises:
-            SkillError: in some observation no skill may start.
-        """
-        if not self.restricts:
-            return None
-        mask = self.startable(obs)
-        if not mask.any(axis=1).all():
-            row = int(np.flatnonzero(~mask.any(axis=1))[0])
-            names = ", ".join(repr(path_of(s)) for s in self.skills)
-            where = observed(obs[row])
-            where += "" if age is None else f", after {int(age[row])} steps of the episode"
-            raise SkillError(
-                f"no skill may start in observation {where}: the initiation() of {names} is False "
-                "there. Let at least one start everywhere"
-            )
-        return mask
-
-    def startable(self, obs: Array) -> Array:
-        """Choices whose skill may start, (n, choices) bool; perhaps none in some observation."""
-        may = [self._may_start(i, obs) for i in range(len(self.skills))]
-        return np.stack(may, axis=1).repeat(max(1, len(self.lengths)), axis=1)
+    @cached_property
+    def hierarchy(self) -> Hierarchy:
+        """The skills in calls, without a selector."""
+        return hierarchy_of(self)
 
     @property
     def restricts(self) -> bool:
         """True if some skill, here or in a hierarchy below, may not start everywhere."""
-        below = (skills_below(p) for p in self.policies)
-        own = any(s.defines("initiation") for s in self.skills)
-        return own or any(skills.restricts for skills in below if skills is not None)
+        return self.hierarchy.restricts
 
-    def _may_start(self, i: int, obs: Array) -> Array:
-        """Return where skill ``i`` may start, (n,); of a hierarchy, also one of its skills."""
-        skill, below = self.skills[i], skills_below(self.policies[i])
-        may = np.ones(len(obs), bool)
-        if skill.defines("initiation"):
-            may = asked(skill, "initiation", obs, len(obs))
-        if below is not None and below.restricts:
-            may = may & below.startable(obs).any(axis=1)
-        return may
+    def startable(self, obs: Array) -> Array:
+        """Choices whose skill may start, (n, choices) bool; perhaps none in some observation."""
+        return self.hierarchy.may_start(obs)
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -117,13 +92,12 @@ class SkillSet:
     @property
     def holds(self) -> bool:
         """True if the last action counts for some skill, here or in a hierarchy below."""
-        below = (skills_below(p) for p in self.policies)
-        own = any(part is not None and part.holds for part in self.parts)
-        return own or any(skills.holds for skills in below if skills is not None)
+        return any(map(self.held, range(len(self.skills))))
 
-    def skill_of(self, choice: Array) -> Array:
-        """The skills that choices (k,) are of."""
-        return choice // len(self.lengths) if self.lengths else choice
+    def held(self, i: int) -> bool:
+        """Return whether the last action counts for skill ``i``, or for a skill below it."""
+        part, below = self.part(i), skills_below(self.policies[i])
+        return (part is not None and part.holds) or (below is not None and below.holds)
 
     def limit(self, i: int) -> int | None:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
@@ -133,7 +107,150 @@ class SkillSet:
         return min(limits) if limits else None
 
 
-def skills_below(policy: Policy | None) -> SkillSet | None:
+def skills_below(policy: Any) -> SkillSet | None:
     """The skills of a policy that is a hierarchy; None: it is none."""
     found = getattr(policy, "skills", None)
     return found if isinstance(found, SkillSet) else None
+
+
+def acting_policy(
+    skills: SkillSet,
+    selector: Any = None,
+    guide: ActiveGuide | None = None,
+    goals: Goals | None = None,
+    *,
+    outermost: bool = True,
+) -> Policy:
+    """Return the policy of a selector and its skills, with reflexes.
+
+    Args:
+        selector, guide, goals: see ``hierarchy_of``.
+        outermost: it remembers the last action, where that counts for a skill; else
+            it is in the ``World``.
+    """
+    policy = hierarchy_of(skills, selector, guide, goals)
+    return _outermost(policy, skills, outermost and skills.holds)
+
+
+def acting_alone(skills: SkillSet, i: int) -> Policy:
+    """Return the policy of skill ``i`` without a selector, with reflexes."""
+    skill = _skill(skills, i)
+    policy = skill.policy if skill.goals is None else Given(skill.policy, skill.goals)
+    return _outermost(policy, skills, skills.held(i))
+
+
+def hierarchy_of(
+    skills: SkillSet,
+    selector: Any = None,
+    guide: ActiveGuide | None = None,
+    goals: Goals | None = None,
+) -> Hierarchy:
+    """Return skills in calls.
+
+    Args:
+        skills: with their policies; one that has skills and a selector itself is a hierarchy.
+        selector: chooses where a call has ended; None: the caller does, by ``begin``.
+        guide: a ready selector that restricts the choices.
+        goals: of the hierarchy, as a skill that has goals.
+    """
+    if guide is not None and guide.decides:
+        selector, guide = guide.selector, None
+    inside = [_skill(skills, i) for i in range(len(skills.skills))]
+    with_goals = {i: skill.goals for i, skill in enumerate(inside) if skill.goals is not None}
+    return Hierarchy(
+        None if selector is None else _leaf(selector, "the selector's act()"),
+        inside,
+        ask,
+        lengths=skills.lengths,
+        guide=guide and replace(guide, selector=_leaf(guide.selector, "the guide")),
+        interruption=skills.interruption,
+        call_goals=CallGoals(with_goals) if with_goals and skills.interruption else None,
+        fresh_calls=goals is not None,
+        greedy=skills.greedy,
+        greedy_selector=skills.greedy_selector,
+    )
+
+
+def within(policy: Policy) -> Hierarchy:
+    """Return the hierarchy that reflexes and the like stand around."""
+    while isinstance(policy, Around):
+        policy = policy.policy
+    assert isinstance(policy, Hierarchy)
+    return policy
+
+
+def in_place(policy: Any) -> Policy:
+    """Return a policy of any form as one whose memory is changed in place."""
+    if isinstance(policy, Policy):
+        return policy
+    found = getattr(policy, "in_place", None)
+    return found if isinstance(found, Policy) else _leaf(policy, "the policy's act()")
+
+
+def _skill(skills: SkillSet, i: int) -> Called:
+    skill, part = skills.skills[i], skills.part(i)
+    path, goals = path_of(skill), goals_of(skill)
+    policy = policy_of(skills.policies[i], goals, part, f"skill {path!r}: its policy's act()")
+    _check_memory(policy, skill)
+    if part is not None:
+        policy = PartOf(part, policy)
+    asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
+    return Called(skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks)
+
+
+def _outermost(policy: Policy, skills: SkillSet, remembers: bool) -> Policy:
+    """Return a policy with reflexes, which perhaps remembers the last action."""
+    if skills.reflexes:
+        policy = Reflexes(policy, skills.reflexes, skills.action_space)
+    return Remembers(policy, Rest(ZERO, skills.action_space).start) if remembers else policy
+
+
+def policy_of(policy: Any, goals: Goals | None, part: OwnPart | None, who: str) -> Policy:
+    """Return a skill's policy, whose actions are those of its own part; ``who`` for messages."""
+    own = _policy(policy, goals, who)
+    if part is None or part.correction is None:
+        return own
+    return Corrects(own, base_of(part, goals), part.correction.apply)
+
+
+def base_of(part: OwnPart, goals: Goals | None) -> Policy:
+    """Return the policy that a skill corrects; a hierarchy remembers its own last actions."""
+    base: Any = part.base
+    if (below := skills_below(base)) is not None:
+        return acting_policy(below, base.selector, base.guide, goals)
+    return _policy(base, goals, f"{part.who}: the act() of the policy that it corrects")
+
+
+ENDS = ("initiation", "termination", "success")
+"""The methods of a skill that are asked while it acts."""
+
+
+def _policy(policy: Any, goals: Goals | None, who: str) -> Policy:
+    """Return a policy that acts in calls, with these goals; None: it is not there yet."""
+    if policy is None:
+        return Policy()
+    if (below := skills_below(policy)) is not None and hasattr(policy, "selector"):
+        return acting_policy(below, policy.selector, policy.guide, goals, outermost=False)
+    leaf = _leaf(policy, who)
+    return leaf if goals is None else Joined(leaf)
+
+
+def _leaf(policy: Any, who: str) -> Policy:
+    if isinstance(policy, Policy):
+        return policy
+    if hasattr(policy, "watch"):
+        return Ready(policy, partial(blame, who=who))
+    watches = getattr(type(policy), "observe", None) is not Memoryless.observe
+    return Returns(policy, partial(blame, who=who), watches=watches)
+
+
+def _check_memory(policy: Policy, skill: Skill) -> None:
+    """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
+    if isinstance(policy, Hierarchy | Reflexes):
+        return
+    for name, value in flat(policy.start(1)).items():
+        if value.dtype.kind not in "biuf":
+            raise PolicyError(
+                f"skill {skill.name!r}: its policy remembers {name!r} as {value.dtype}; a memory "
+                "is an array of numbers whose first axis is the environment"
+            )

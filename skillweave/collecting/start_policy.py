@@ -12,13 +12,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import RUNNING
-from skillweave.collecting.judge import seen_by
-from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.restored import ranges_of, stored_goals
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, acting_policy, within
 from skillweave.envs.infos import allowed_rows, random_actions
-from skillweave.skills.goals import Goals
+from skillweave.policies.core import RUNNING, Turn, World, flat, part_of, restart
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.types import Array, Memory, Step, prefixed
 
@@ -51,16 +47,15 @@ class StartPolicy:
         self._space = action_space
         self.kept: dict[str, Array] = {}
         """Its state in each environment, (N, …) each; changed in place."""
-        self.ranges: dict[str, range] = {}
-        """As of ``Collector``."""
-        self.goals: dict[str, Goals] = {}
+        self.values: dict[str, Any] = {}
         """As of ``Collector``."""
         if self.skills is not None:
-            self._player = Player(self.skills)
-            self._calls: Memory = self._player.start(num_envs)
-            self.kept = prefixed("starters", self._calls)
-            self.ranges = prefixed("starters", ranges_of(self._player))
-            self.goals = prefixed("starters", stored_goals(self._player))
+            # The last action is in the ``World``: others act, too.
+            self._policy = acting_policy(self.skills, outermost=False)
+            self._hierarchy = within(self._policy)
+            self._calls: Memory = self._policy.start(num_envs)
+            self.kept = prefixed("starters", flat(self._calls))
+            self.values = prefixed("starters", self._policy.values())
 
     def act(
         self,
@@ -75,7 +70,7 @@ class StartPolicy:
 
         Args:
             last: (N,) bool, the next call is to be one of a named skill, if one may start.
-            last_action: as of ``Turn``.
+            last_action: as of ``World``.
         """
         if self.skills is None:
             return random_actions(self._space, len(ids), rng, allowed_rows(mask, ids))
@@ -84,10 +79,8 @@ class StartPolicy:
         called, free = ids[runs], ids[~runs]
         action: Array = np.zeros((len(ids), *obs_shape(self._space)), obs_dtype(self._space))
         if len(called):
-            allowed, turn = allowed_rows(mask, called), Turn(rng=rng, last_action=last_action)
-            action[runs] = self._player.act_in_calls(
-                self._calls, called, obs[called], allowed, turn
-            )
+            turn = Turn(World(rng, last_action=last_action), allowed_rows(mask, called))
+            action[runs] = self._policy.act(self._calls, called, obs[called], turn)
         if len(free):
             allowed = allowed_rows(mask, free)
             action[~runs] = random_actions(self._space, len(free), rng, allowed)
@@ -106,9 +99,9 @@ class StartPolicy:
         if not len(called):
             return ids
         rows = np.flatnonzero(runs)
-        part = seen_by(None, step, step.elapsed[rows], rows)
-        end = self._player.observe(self._calls, called, part)
-        return np.concatenate([ids[~runs], called[end != RUNNING]])
+        part = part_of(step, step.elapsed[rows], rows)
+        self._policy.observe(self._calls, called, part)
+        return np.concatenate([ids[~runs], called[self._calls["end"][called] != RUNNING]])
 
     def named(self, ids: Array) -> Array:
         """Return whether the open call in environments ``ids`` (k,) is a named skill's, (k,)."""
@@ -118,7 +111,7 @@ class StartPolicy:
     def stop(self, ids: Array) -> None:
         """End the calls in environments ``ids`` (k,): the skill starts, or an episode."""
         if self.skills is not None:
-            self._player.restart(self._calls, ids)
+            restart(self._policy, self._calls, ids)
 
     def _runs(self, ids: Array) -> Array:
         """(k,) bool, a call runs."""
@@ -140,5 +133,11 @@ class StartPolicy:
         chance = np.where(may, rng.random(may.shape), -1.0)
         some = may.any(axis=1)
         choice = chance[some].argmax(axis=1)
-        goals = self._player.drawn_goals(choice, obs[ids[some]], rng)
-        self._player.begin(self._calls, ids[some], choice, goals)
+        here, skill = obs[ids[some]], self._hierarchy.skill_of(choice)
+        found = dict[int, Array]()
+        for i, goals in self._hierarchy.goals.items():
+            mine = np.flatnonzero(skill == i)
+            if len(mine):
+                found[i] = goals.start(len(choice))
+                found[i][mine] = goals.draw(here[mine], rng)
+        self._hierarchy.begin(self._calls, ids[some], choice, found)

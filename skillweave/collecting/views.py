@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from skillweave.collecting.call_end import OWN, RUNNING
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import short
+from skillweave.policies.core import OWN, RUNNING
 from skillweave.skills import Skill
 from skillweave.skills.goal_read import check_reads_goal, is_unchecked
 from skillweave.skills.goals import Goals

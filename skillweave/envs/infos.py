@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +11,7 @@ import numpy as np
 
 from skillweave.errors import EnvError
 from skillweave.messages import short
+from skillweave.policies.core import OWN_REWARD, SUCCESS
 from skillweave.skills.info_words import NUMBERS, info_keys
 from skillweave.spaces import (
     action_codec,
@@ -22,7 +22,7 @@ from skillweave.spaces import (
     put_observation,
 )
 from skillweave.spaces.packing import parts
-from skillweave.types import Array, Step
+from skillweave.types import Array
 
 
 def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -140,21 +140,6 @@ def _single(info: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
         for row in np.flatnonzero(present):
             each[row][key] = values[row]
     return each
-
-
-def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
-    """Return the part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
-
-    Values that are not arrays over the n environments are returned unchanged.
-    """
-    return {key: _rows(value, rows, n) for key, value in info.items()}
-
-
-def _rows(value: Any, rows: Array, n: int) -> Any:
-    if isinstance(value, dict):
-        return info_rows(value, rows, n)
-    batched = isinstance(value, np.ndarray) and value.ndim > 0 and len(value) == n
-    return value[rows] if batched else value
 
 
 MASK = "action_mask"
@@ -314,27 +299,8 @@ class ActionMasks:
         return allowed
 
 
-OWN_REWARD = "env_reward"
-OWN_SUCCESS = "env_success"
-SUCCESS = "success"
-"""Keys of info: the first two where a task gives the reward and says what success is."""
 IS_SUCCESS = "is_success"
 """The key of success in Stable-Baselines3 and Gymnasium-Robotics."""
-
-
-def own_step(step: Step) -> Step:
-    """Return a step of a task's environment as the environment itself gave it.
-
-    A task's environment (``planning.task_env``) has the task's reward and success, and keeps the
-    environment's own in ``info``. A step of another environment is returned unchanged.
-    """
-    if OWN_REWARD not in step.info:
-        return step
-    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
-    for mark in ("", "_"):  # batches mark under "_key" where a key is there
-        if mark + OWN_SUCCESS in info:
-            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
-    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
 
 
 def reported_success(info: Mapping[str, Any], n: int) -> Array | None:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from skillweave.envs.engine import Engine, RawStep
-from skillweave.envs.infos import info_rows, joined_infos
+from skillweave.envs.infos import joined_infos
+from skillweave.policies.core import info_rows
 from skillweave.types import Array
 
 

@@ -15,8 +15,6 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import Interruption
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
@@ -25,6 +23,7 @@ from skillweave.export.parts import PartEntry, part_of, with_base
 from skillweave.export.write import FORMAT, MANIFEST
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
+from skillweave.policies.hierarchy import ActiveGuide, Interruption
 from skillweave.reading import fit, parse_json, read_file
 from skillweave.selectors import Automaton, ReadySelector
 from skillweave.selectors.function import FunctionSelector

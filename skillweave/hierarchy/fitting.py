@@ -12,13 +12,13 @@ import gymnasium as gym
 
 from skillweave.algorithms.base import read_by
 from skillweave.algorithms.config import AlgorithmConfig, check_spaces
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.skill_set import skills_below
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.paths import join
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted

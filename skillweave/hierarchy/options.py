@@ -9,16 +9,16 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from skillweave.collecting.call_end import RUNNING
-from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, acting_policy, within
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
-from skillweave.errors import DeclarationError, SkillError
+from skillweave.errors import DeclarationError
 from skillweave.messages import short
+from skillweave.policies.core import RUNNING, Turn, World, restart
+from skillweave.policies.hierarchy import SKILL
+from skillweave.policies.parts import GOAL
 from skillweave.seeding import Seeds
-from skillweave.skills.goal_spaces import GOAL, SKILL
 from skillweave.skills.goals import as_goals
 from skillweave.spaces import obs_dtype, unpack
 from skillweave.spaces.choices import ChoiceSpace
@@ -58,7 +58,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._gamma = float(gamma)
-        self._player = Player(skills)
+        self._policy = acting_policy(skills)
+        self._hierarchy, self._all = within(self._policy), np.arange(engine.num_envs)
         self._seed = seed
         self._obs: Array = np.empty(0)
         self._mask: Array | None = None
@@ -82,9 +83,9 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             raise DeclarationError("OptionsEnv.reset takes one seed for all environments")
         self._seed = self._seed + 1 if seed is None else seed
         self._calls = 0
-        self._memory = self._player.start(self.num_envs)
+        self._memory = self._policy.start(self.num_envs)
         self._obs = self.engine.reset(self._seed)
-        self._mask = self.skills.mask(self._obs)
+        self._mask = self._hierarchy.mask(self._obs)
         info = {} if self._mask is None else {"action_mask": self._mask}
         return unpack(self.single_observation_space, self._obs), info
 
@@ -103,14 +104,14 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         """
         n = self.num_envs
         goals = None
-        if self._player.goals:
+        if self._hierarchy.goals:
             choice = self._choices(actions)
             skill = choice[SKILL]
-            goals = self._player.goals_in(choice, self._obs, "OptionsEnv.step")
+            goals = self._hierarchy.goals_in(choice, self._obs, "OptionsEnv.step")
         else:
             skill = self._checked(actions)
-        self._player.begin(self._memory, np.arange(n), skill, goals)
-        turn = Turn(rng=(Seeds(self._seed) / "call" / self._calls).numpy())
+        self._hierarchy.begin(self._memory, self._all, skill, goals)
+        world = World((Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
         obs = self._obs
         next_obs = np.empty_like(obs)
@@ -121,12 +122,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         terminated = np.zeros(n, bool)
         truncated = np.zeros(n, bool)
         rows = np.arange(n)
-        turns = 0
         while len(rows):
-            turns = self._turn(turns, rows, skill)
+            self._hierarchy.check_lengths(self._memory, LONGEST_EPISODE)
             rows_obs = obs if len(rows) == n else obs[rows]
             allowed = allowed_rows(self.engine.mask(), rows)
-            action = self._player.act_in_calls(self._memory, rows, rows_obs, allowed, turn)
+            action = self._policy.act(self._memory, rows, rows_obs, Turn(world, allowed))
             raw = self.engine.step(action, None if len(rows) == n else rows)
             reward[rows] += discount[rows] * raw.reward
             call_return[rows] += raw.reward
@@ -134,7 +134,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             steps[rows] += 1
             next_obs[rows] = raw.next_obs
             step = raw.seen(rows_obs, action, steps[rows])
-            over = self._player.observe(self._memory, rows, step) != RUNNING
+            self._policy.observe(self._memory, rows, step)
+            over = self._memory["end"][rows] != RUNNING
             ended = raw.terminated | raw.truncated
             if len(rows) == n:
                 obs = raw.next_obs.copy()
@@ -144,11 +145,11 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
                 terminated[rows] = raw.terminated
                 truncated[rows] = raw.truncated
                 obs[rows[ended]] = self.engine.reset_some(rows[ended])
-                self._player.restart(self._memory, rows[ended])
+                restart(self._policy, self._memory, rows[ended])
             if over.any():
                 rows = rows[~over]
         self._obs = obs
-        self._mask = self.skills.mask(obs)
+        self._mask = self._hierarchy.mask(obs)
         info = {
             "steps": steps,
             "discount": (discount * ~terminated).astype(np.float32),
@@ -173,7 +174,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         mask[terminated] = True
         limited = np.flatnonzero(truncated & ~terminated)
         if len(limited):
-            mask[limited] = self._player.allowed(self._memory, limited, next_obs[limited])
+            mask[limited] = self._hierarchy.allowed(self._memory, limited, next_obs[limited])
         return {"action_mask": self._mask, "next_action_mask": mask}
 
     def _final(self, next_obs: Array, ended: Array) -> dict[str, Any]:
@@ -185,23 +186,8 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             final[i] = unpack(self.single_observation_space, next_obs[i])
         return {"final_obs": final, "_final_obs": ended}
 
-    def _turn(self, turns: int, rows: Array, skill: Array) -> int:
-        """Return the number of turns after one more step of the calls of ``skill`` in ``rows``.
-
-        Raises:
-            SkillError: the calls are too long to end by themselves.
-        """
-        if turns >= LONGEST_EPISODE:
-            name = self._named(skill[rows[0]])
-            raise SkillError(
-                f"skill {name!r} has run for {turns:,} steps in environment {int(rows[0])}, and "
-                "neither its termination() nor the episode's end has come: give it max_steps, or "
-                "the hierarchy call_steps"
-            )
-        return turns + 1
-
     def _named(self, choice: Array) -> str:
-        return self.skills.skills[int(self.skills.skill_of(choice))].name
+        return self.skills.skills[int(self._hierarchy.skill_of(choice))].name
 
     def _choices(self, actions: Any) -> Array:
         """Return skills with goals as choices (N,); no number of a goal changes."""

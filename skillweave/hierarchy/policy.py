@@ -11,22 +11,74 @@ from typing import Any, cast
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.call_end import Interruption
-from skillweave.collecting.guide import ActiveGuide
-from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, acting_alone, acting_policy
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.skills import apply_reflexes
+from skillweave.policies.core import Memory as InPlaceMemory
+from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.core import Turn, World, flat, nested
+from skillweave.policies.hierarchy import ActiveGuide, Interruption
+from skillweave.policies.parts import GOAL, OBSERVATION, OWN_GOAL
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.types import Array, Memory, Policy, Step, prefixed, unprefixed
+from skillweave.types import Array, Memory, Policy, Step
+
+
+class Functional:
+    """A policy as ``skillweave.Policy`` says, over one whose memory is changed in place.
+
+    Args:
+        in_place: the same policy.
+        joins: it observes its goal beside the observation.
+    """
+
+    labels: tuple[str, ...] = ()
+
+    def __init__(self, in_place: InPlace, *, joins: bool = False) -> None:
+        self.in_place, self._joins = in_place, joins
+        self._like = in_place.start(0)
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of ``n`` environments whose episodes start."""
+        return flat(self.in_place.start(n))
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
+
+        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
+
+        ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
+        selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
+        """
+        memory, goal = {k: v.copy() for k, v in memory.items()}, None
+        if self._joins:
+            obs, goal = obs[OBSERVATION], obs[GOAL]
+        turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
+        return self.in_place.act(nested(self._like, memory), rows, obs, turn), memory
+
+    def observe(self, memory: Memory, step: Step) -> Memory:
+        """Return the ``memory`` after a ``step``; calls that are over end in it."""
+        memory = {k: v.copy() for k, v in memory.items()}
+        self.in_place.observe(nested(self._like, memory), np.arange(len(step.reward)), step)
+        return memory
+
+    def acting(self, memory: Memory) -> Array | None:
+        """Return the running skills in a ``memory``, (n,) int64; None: it has no skills."""
+        return memory["skill"] if self.labels else None
 
 
 @checked_names
-class HierarchyPolicy:
-    """A selector and its skills as one policy; its memory is that of a ``Player``.
+class HierarchyPolicy(Functional):
+    """A selector and its skills as one policy; its memory is that of ``policies.Hierarchy``.
 
     Args:
         selector: chooses a row of the skills.
@@ -42,10 +94,11 @@ class HierarchyPolicy:
         guide: ActiveGuide | None = None,
         goals: Goals | None = None,
     ) -> None:
+        super().__init__(acting_policy(skills, selector, guide, goals), joins=goals is not None)
+        self.goals = goals
         self.selector = selector
         self.skills = skills
         self.guide = guide
-        self.player = Player(skills, selector, guide, goals)
         self.observation_space = selector.observation_space
         self.action_space = skills.action_space
         self.labels = tuple(s.name for s in skills.skills)
@@ -77,61 +130,32 @@ class HierarchyPolicy:
         whole = json.dumps([checksums, skills, reflexes, call_steps, *greedy])
         return {"sha256": checksum(whole.encode())}
 
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments that wait for their first decision."""
-        return self.player.start(n)
+    def goal_now(self, memory: InPlaceMemory, row: int = 0) -> Array | None:
+        """Return the goal of the skill that acts in environment ``row``; None: it has none.
 
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
-
-        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
-
-        ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
-        selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
-        """
-        memory = {k: v.copy() for k, v in memory.items()}
-        turn = Turn(deterministic, rng)
-        return self.player.act(memory, np.arange(len(obs)), obs, mask, turn), memory
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Return the ``memory`` after a ``step``; calls that are over end in it."""
-        memory = {k: v.copy() for k, v in memory.items()}
-        self.player.observe(memory, np.arange(len(step.reward)), step)
-        return memory
-
-    def acting(self, memory: Memory) -> Array | None:
-        """Return the running skills in a ``memory``, (n,) int64."""
-        return memory["skill"]
-
-    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
-        """Return the goal of the skill that acts in ``row`` of ``memory``; None: it has none.
+        Args:
+            memory: of ``in_place``.
 
         Returns:
             (…) an element of ``goal_space``, or None.
         """
-        i = int(memory["skill"][row])
-        policy = self.skills.policies[i]
+        i = str(memory["skill"][row])
+        policy = self.skills.policies[int(i)]
         if isinstance(policy, HierarchyPolicy):
-            return policy.goal_now(unprefixed(str(i), memory), row)
-        goal = self.player.goal_of(memory, i, np.array([row]))
-        return None if goal is None else goal[0]
+            return policy.goal_now(memory[i], row)
+        goals: Array | None = memory.get("goal", {}).get(i)
+        return None if goals is None else goals[row]
 
-    def acts(self, memory: Memory, row: int = 0) -> str:
-        """Return the path of the skill that acts in ``row`` of the ``memory``: ``inner/skill``."""
+    def acts(self, memory: InPlaceMemory, row: int = 0) -> str:
+        """Return the path of the skill that acts in environment ``row``: ``inner/skill``.
+
+        ``memory`` is that of ``in_place``.
+        """
         i = int(memory["skill"][row])
-        name = self.labels[i]
-        policy = self.skills.policies[i]
+        name, policy = self.labels[i], self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
             return name
-        return f"{name}/{policy.acts(unprefixed(str(i), memory), row)}"
+        return f"{name}/{policy.acts(memory[str(i)], row)}"
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
@@ -139,12 +163,12 @@ def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:
     return replace(skills, interruption=Interruption(critic.heads, margin, critic))
 
 
-class SkillAlone:
+class SkillAlone(Functional):
     """Policy of one skill without a selector, with the reflexes in force.
 
-    It acts from an episode's start to its end, whatever its initiation set and ends. Its memory is
-    the memory of the skill's policy. A skill that has goals is given one in each episode, by
-    ``choose_goals``: the one of ``with_goal``, or one that is drawn.
+    It acts from an episode's start to its end, whatever its initiation set and ends. A skill that
+    has goals is given one in each episode, by ``choose_goals``: the one of ``with_goal``, or one
+    that is drawn.
 
     Args:
         skills: the skill and those beside it.
@@ -154,21 +178,20 @@ class SkillAlone:
 
     def __init__(self, skills: SkillSet, name: str, path: str = "") -> None:
         at = [s.name for s in skills.skills].index(name)
+        super().__init__(acting_alone(skills, at))
         self.skill = skills.skills[at]
         self.path = path or name
         self.policy = skills.policies[at]
         self.reflexes = skills.reflexes
         self.goals = goals_of(self.skill)
-        self.part = skills.part(at)
         self.observation_space = self.policy.observation_space
         if self.goals is not None:
             self.observation_space = without_goal(self.observation_space)
-        if self.part is not None:
-            self.observation_space = self.part.whole_observation_space
+        if (part := skills.part(at)) is not None:
+            self.observation_space = part.whole_observation_space
         self.action_space = skills.action_space
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
-        self.acting = self.policy.acting
         self._goal: Array | None = None  # (1, …), of all episodes; None: drawn for each
         self._gives = ""
 
@@ -188,60 +211,26 @@ class SkillAlone:
         alone._goal, alone._gives = self.goals.one(goal, who), who
         return alone
 
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments whose episodes start."""
-        return self.policy.start(n) | self._fresh(n)
-
-    def _fresh(self, n: int) -> Memory:
-        """Return what is remembered beside the skill's own policy, where episodes start."""
-        fresh = {} if self.goals is None else {"goal": self.goals.start(n)}
-        if self.part is not None and self.part.rest is not None and self.part.holds:
-            fresh["last_action"] = self.part.rest.start(n)
-        if self.part is not None and self.part.base is not None:
-            fresh |= prefixed("base", self.part.base.start(n))
-        return fresh
-
-    def _divided(self, memory: Memory) -> tuple[Memory, Memory]:
-        """Return the memory of the skill's own policy, and what is remembered beside it."""
-        beside = self._fresh(0)
-        own = {k: v for k, v in memory.items() if k not in beside}
-        return own, {k: memory[k] for k in beside}
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Return the ``memory`` after a ``step``."""
-        own, beside = self._divided(memory)
-        if "last_action" in beside:
-            assert self.part is not None
-            assert self.part.rest is not None
-            beside["last_action"] = self.part.rest.stored(step.action)
-        if self.part is not None:
-            step = self.part.own_step(step)
-            if self.part.base is not None:
-                after = self.part.base.observe(unprefixed("base", beside), step)
-                beside |= prefixed("base", after)
+    def goal_now(self, memory: InPlaceMemory, row: int = 0) -> Array | None:
+        """Return its goal in environment ``row`` of a ``memory`` of ``in_place``; None: no goal."""
         if self.goals is not None:
-            step = replace(step, goal=self.goals.read(memory["goal"]))
-        return self.policy.observe(own, step) | beside
-
-    def goal_now(self, memory: Memory, row: int = 0) -> Array | None:
-        """Return its goal in ``row`` of the ``memory``; None: it has none."""
-        if self.goals is not None:
-            goal: Array = self.goals.read(memory["goal"])[row]
+            goal: Array = memory[OWN_GOAL][row]
             return goal
         below = self.policy
         return below.goal_now(memory, row) if isinstance(below, HierarchyPolicy) else None
 
-    def choose_goals(self, memory: Memory, rows: Array, obs: Array, rngs: Sequence[Any]) -> None:
+    def choose_goals(
+        self, memory: InPlaceMemory, rows: Array, obs: Array, rngs: Sequence[Any]
+    ) -> None:
         """Set the goal of each episode that starts in ``rows`` (k,); ``Skill.goals`` draws it.
 
         Args:
-            memory: of all environments, changed in place.
+            memory: of ``in_place``, of all environments; changed in place.
             obs: (k, …).
             rngs: the source of chance of each episode.
         """
-        if self.goals is not None:
-            for i, rng in enumerate(rngs):
-                memory["goal"][rows[i]] = self.goals.stored(self._next_goal(obs[i : i + 1], rng))[0]
+        for i, rng in enumerate(rngs if self.goals is not None else ()):
+            memory[OWN_GOAL][rows[i]] = self._next_goal(obs[i : i + 1], rng)[0]
 
     def _next_goal(self, obs: Array, rng: Any) -> Array:
         """Return the goal of an episode that starts in ``obs`` (1, …), (1, …)."""
@@ -249,33 +238,3 @@ class SkillAlone:
         if self._goal is None:
             return self.goals.draw(obs, rng)
         return self.goals.fitted(obs, self._goal.copy(), self._gives)
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return the skill's actions, or a reflex's action where its condition holds."""
-        how: Any = {"deterministic": deterministic, "rng": rng}
-        own, beside = self._divided(memory)
-        part, seen, allowed = self.part, obs, mask
-        if part is not None:
-            seen, allowed = part.see(obs), part.mask(mask)
-        if self.goals is not None:
-            seen = self.goals.join(seen, self.goals.read(beside["goal"]))
-        action, own = self.policy.act(own, seen, allowed, **how)
-        if part is not None:
-            corrected = None
-            if part.base is not None:
-                base = unprefixed("base", beside)
-                corrected, base = part.base.act(base, seen, None, deterministic=True, rng=rng)
-                beside |= prefixed("base", base)
-            action = part.write(action, beside.get("last_action"), corrected)
-            part.check_mask(mask, action)
-        memory = own | beside
-        action, _ = apply_reflexes(self.reflexes, obs, action, self.action_space)
-        return action, memory

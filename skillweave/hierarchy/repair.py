@@ -20,6 +20,7 @@ from skillweave.planning import CallLog, HandOver, join
 from skillweave.planning.hand_over import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
 from skillweave.planning.record import RandomChoice, with_returns
+from skillweave.policies.core import Memory, Turn
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
@@ -27,7 +28,7 @@ from skillweave.skills.own_part import OwnPart
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Array, Step
 
 START_CALLS = 1
 """The most calls at random before the other episodes of a repair, if the hierarchy has any."""
@@ -184,22 +185,17 @@ class PairChoice(RandomChoice):
         """Return the skills that were called last, (n,) int64; −1: none."""
         return {"last": np.full(n, -1)}
 
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,)."""
-        again = memory["last"] == self._skill
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return choices (k,)."""
+        assert turn.world.rng is not None
+        again = memory["last"][rows] == self._skill
         weights = np.where(again[:, None], self._again, self._weights)
         # The largest of u^(1/w) is choice i with probability w_i / Σw (Efraimidis & Spirakis 2006).
-        score = np.log((rng or np.random.default_rng()).random(weights.shape)) / weights
-        choice: Array = (score if mask is None else np.where(mask, score, -np.inf)).argmax(1)
-        return choice, {"last": choice // self._lengths}
+        score = np.log(turn.world.rng.random(weights.shape)) / weights
+        best = score if turn.mask is None else np.where(turn.mask, score, -np.inf)
+        choice = np.asarray(best.argmax(1))
+        memory["last"][rows] = choice // self._lengths
+        return choice
 
 
 @dataclass(frozen=True)

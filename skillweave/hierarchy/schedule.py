@@ -18,7 +18,8 @@ from skillweave.hierarchy.fitting import active_guide
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.networks.config import Network
 from skillweave.paths import SELECTOR, decides, join
-from skillweave.skills.goal_spaces import OBSERVATION, goal_part
+from skillweave.policies.parts import OBSERVATION
+from skillweave.skills.goal_spaces import goal_part
 from skillweave.spaces import obs_codec
 from skillweave.training.learning_task import (
     JointTask,

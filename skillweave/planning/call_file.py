@@ -14,10 +14,10 @@ import gymnasium as gym
 import numpy as np
 from torch import Tensor
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
+from skillweave.policies.core import CallEnd
 from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, Count

@@ -12,10 +12,10 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, shortened
+from skillweave.policies.core import CallEnd
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array, Step
 

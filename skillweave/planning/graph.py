@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
@@ -35,6 +34,7 @@ from skillweave.planning.neighbours import (
     weights_of,
 )
 from skillweave.planning.states import PlanningStates
+from skillweave.policies.core import CallEnd
 from skillweave.types import Array
 
 PIECE = 5

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
@@ -19,6 +18,7 @@ from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
 from skillweave.planning.neighbours import feature_maps, nearest, weights_of
 from skillweave.planning.predicates import as_event
+from skillweave.policies.core import CallEnd
 from skillweave.types import Array
 
 START = "start"

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from skillweave.errors import RunError, SkillError, SkillweaveError
-from skillweave.messages import observed
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.machine import Arrow, Readings, RewardMachine, predicate_of
 from skillweave.planning.neighbours import Standard
 from skillweave.planning.predicates import Predicate
+from skillweave.policies.core import observed
 from skillweave.types import Array
 
 TRIES = 20_000

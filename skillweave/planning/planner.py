@@ -12,9 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.guide import LastCall
 from skillweave.collecting.skill_set import SkillSet, skills_below
-from skillweave.envs.infos import own_step
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
@@ -27,6 +25,7 @@ from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
 from skillweave.planning.task import Task, as_task
 from skillweave.planning.tried import Tried
+from skillweave.policies.core import LastCall, own_step
 from skillweave.selectors.base import ReadySelector
 from skillweave.skills.foreign_policy import checksum
 from skillweave.skills.goal_spaces import from_numbers, numbers_in

@@ -11,10 +11,8 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.interrupts import deferred, requested
-from skillweave.collecting.player import Player, Turn
-from skillweave.collecting.skill_set import SkillSet, skills_below
+from skillweave.collecting.skill_set import SkillSet, acting_policy, in_place, skills_below
 from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
@@ -23,11 +21,15 @@ from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
+from skillweave.policies.core import Around, CallEnd, Turn, World, restart
+from skillweave.policies.core import Memory as InPlaceMemory
+from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.parts import GOAL
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.skills.goal_spaces import GOAL, blank_choices, from_numbers
+from skillweave.skills.goal_spaces import blank_choices, from_numbers
 from skillweave.spaces import same_space
-from skillweave.types import Array, Memory, Memoryless
+from skillweave.types import Array
 
 
 @runtime_checkable
@@ -46,7 +48,7 @@ class LearnsFromCalls(Protocol):
         ...
 
 
-class RandomChoice(Memoryless):
+class RandomChoice(InPlace):
     """A selector that chooses uniformly among what may start.
 
     Args:
@@ -56,18 +58,12 @@ class RandomChoice(Memoryless):
     def __init__(self, choices: int) -> None:
         self.choices = choices
 
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,)."""
-        score = (rng or np.random.default_rng()).random((len(obs), self.choices))
-        return (score if mask is None else np.where(mask, score, -1.0)).argmax(1), memory
+    def act(self, memory: InPlaceMemory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return choices (k,)."""
+        assert turn.world.rng is not None
+        score = turn.world.rng.random((len(obs), self.choices))
+        best = score if turn.mask is None else np.where(turn.mask, score, -1.0)
+        return np.asarray(best.argmax(1))
 
 
 @checked_names
@@ -145,19 +141,19 @@ def with_returns(
         recorder = Recorder(
             skill_set, spaces, num_envs, info=info, own_rewards=own_rewards, spec=spec
         )
-        player = Player(skill_set, selector)
+        policy = acting_policy(skill_set, selector)
         rng = (seeds / "choices").numpy()
         sampled = isinstance(choose, RandomChoice) or (
             isinstance(choose, str) and choose == "random"
         )
-        turn = Turn(not sampled, rng)
+        turn = Turn(World(rng), greedy=not sampled)
         played: list[int] = []
         # Without `keep` an interrupt may be one of the training around.
         until, stops = (nullcontext(), bool) if keep is None else (deferred("now"), requested)
         stopped = False
         try:
             with until:
-                _play(recorder, engine, player, steps, turn, seeds.integer(), choose, played, stops)
+                _play(recorder, engine, policy, steps, turn, seeds.integer(), choose, played, stops)
         except KeyboardInterrupt:
             if keep is None:
                 raise
@@ -173,7 +169,7 @@ def with_returns(
         return log, recorder.own_returns() if own_rewards else np.zeros(0)
 
 
-class WithDrawnGoals(Memoryless):
+class WithDrawnGoals(Around):
     """A selector of skills alone, with goals that are drawn as for practice.
 
     An ``Explorer`` also repeats goals of logged calls.
@@ -185,40 +181,27 @@ class WithDrawnGoals(Memoryless):
     """
 
     def __init__(self, selector: Any, skills: SkillSet, space: gym.Space[Any]) -> None:
+        super().__init__(in_place(selector))
         self._selector, self._skills, self._space = selector, skills, space
         self._goals = goals_in(skills)
 
-    def start(self, n: int) -> Memory:
-        """Return the selector's memory."""
-        memory: Memory = self._selector.start(n)
-        return memory
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,) with goals."""
-        rng = rng or np.random.default_rng()
-        how: dict[str, Any] = {"deterministic": deterministic, "rng": rng}
-        again: dict[str, tuple[Array, Array]] = {}
+    def act(self, memory: InPlaceMemory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return choices (k,) with goals."""
+        rng, again = turn.world.rng, dict[str, tuple[Array, Array]]()
+        assert rng is not None
         if isinstance(self._selector, Explorer):
-            number, again = self._selector.decide(obs, mask, rng)
+            number, again = self._selector.decide(obs, turn.mask, rng)
         else:
-            number, memory = self._selector.act(memory, obs, mask, **how)
-        choice, skill = blank_choices(self._space, number), self._skills.skill_of(number)
+            number = super().act(memory, rows, obs, turn)
+        choice, skill = blank_choices(self._space, number), self._skills.hierarchy.skill_of(number)
         for i, (name, goals) in self._goals.items():
             mine = np.flatnonzero(skill == i)
             if len(mine):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
         spaces = {goals.skill.name: goals.space for _, goals in self._goals.values()}
-        for name, (rows, numbers) in again.items():
-            choice[GOAL][name][rows] = from_numbers(spaces[name], numbers)
-        return choice, memory
+        for name, (at, numbers) in again.items():
+            choice[GOAL][name][at] = from_numbers(spaces[name], numbers)
+        return choice
 
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
@@ -255,7 +238,7 @@ def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
 def _play(
     recorder: Recorder,
     engine: Engine,
-    player: Player,
+    policy: InPlace,
     steps: int,
     turn: Turn,
     seed: int,
@@ -283,27 +266,28 @@ def _play(
         seeds.extend([-1] * len(rows))
         return engine.reset(seed) if fresh else engine.reset_some(rows)
 
-    memory, obs = player.start(n), np.array(begin(np.arange(n)))
-    turn.age = np.zeros(n, np.int64)
+    memory, obs = policy.start(n), np.array(begin(np.arange(n)))
+    turn.world.age = age = np.zeros(n, np.int64)
     rows, made, planned = np.arange(n), 0, 0
     try:
         while len(rows) and not stops():
             here = obs[rows]
-            action = player.act(memory, rows, here, allowed_rows(engine.mask(), rows), turn)
+            turn.mask = allowed_rows(engine.mask(), rows)
+            action = policy.act(memory, rows, here, turn)
             raw = engine.step(action, rows)
-            turn.age[rows] += 1
-            step = raw.seen(here, action, turn.age[rows])
-            end = player.observe(memory, rows, step)
-            feed.add(rows, step, {"": {k: v[rows] for k, v in calls_in(memory, goals).items()}})
+            age[rows] += 1
+            step = raw.seen(here, action, age[rows])
+            policy.observe(memory, rows, step)
+            feed.add(rows, step, {"": calls_in(memory, goals, rows)})
             made += len(rows)
             obs[rows] = raw.next_obs
             over = rows[raw.terminated | raw.truncated]
             if len(over):
                 obs[over] = begin(over)
-                player.restart(memory, over)
-                turn.age[over] = 0
+                restart(policy, memory, over)
+                age[over] = 0
             if made >= steps:
-                rows = rows[end == CallEnd.RUNNING]
+                rows = rows[memory["end"][rows] == CallEnd.RUNNING]
             elif isinstance(choose, LearnsFromCalls) and made - planned >= choose.every:
                 planned = made
                 feed.flush()

@@ -14,7 +14,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import LIMIT, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.collecting.user_code import Texts, environment_texts
 from skillweave.collecting.views import call_successes, info_numbers_of, judged
@@ -24,6 +23,7 @@ from skillweave.errors import DeclarationError
 from skillweave.experience import INFO, Batch, Trace
 from skillweave.paths import join
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
+from skillweave.policies.core import LIMIT, RUNNING
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype, obs_shape
@@ -364,7 +364,7 @@ class Recorder:
         return _Part(
             (
                 *(whole, obs, whole, whole, whole, whole),
-                *(goals.flat(goals.read(goals.start(0))) for goals in self.goals.values()),
+                *(goals.flat(goals.start(0)) for goals in self.goals.values()),
             ),
             steps if first is None else tuple(column[:0] for column in first),
             [(whole, np.zeros(0, np.int8), truth, truth, truth, self.skills.startable(obs))],
@@ -436,20 +436,18 @@ class TraceFeed:
         return Trace([_spread(info, place, lead[1]) for info, place in pairs], whole)
 
 
-def calls_in(memory: Memory, goals: Mapping[int, tuple[str, Goals]], prefix: str = "") -> Memory:
-    """Return what a ``TraceFeed`` takes of a player's memory.
+def calls_in(memory: Any, goals: Mapping[int, tuple[str, Goals]], rows: Array) -> Memory:
+    """Return what a ``TraceFeed`` takes of a hierarchy's memory.
 
     These are ``skill``, ``elapsed``, ``end`` and perhaps ``limit``, (k,) each, and the goals of
     skills that have some, (k, *goal_shape).
 
     Args:
         goals: of ``goals_in``.
-        prefix: of the level's names in the memory.
+        rows: (k,) environments.
     """
-    found = {key: memory[prefix + key] for key in CALL if prefix + key in memory}
-    for i, (name, own) in goals.items():
-        found[f"{name}/goal"] = own.read(memory[f"{prefix}goal.{i}"])
-    return found
+    found = {key: memory[key][rows] for key in CALL if key in memory}
+    return found | {f"{name}/goal": memory["goal"][str(i)][rows] for i, (name, _) in goals.items()}
 
 
 def goals_in(skills: SkillSet) -> dict[int, tuple[str, Goals]]:

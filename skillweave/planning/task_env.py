@@ -12,10 +12,11 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import last_observation
-from skillweave.envs.infos import OWN_REWARD, OWN_SUCCESS, SUCCESS, batched_infos
+from skillweave.envs.infos import batched_infos
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.task import Task
+from skillweave.policies.core import OWN_REWARD, OWN_SUCCESS, SUCCESS
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts, put_observation
 from skillweave.types import Array, Step

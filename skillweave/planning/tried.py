@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.guide import LastCall
 from skillweave.planning.graph import CallGraph, Near
 from skillweave.planning.neighbours import SOFT
+from skillweave.policies.core import CallEnd, LastCall
 from skillweave.types import Array, Memory
 
 LATEST = 16

@@ -15,9 +15,9 @@ from typing import Any, Protocol
 
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import error_text
+from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import say
-from skillweave.types import flat
 
 MLFLOW_EXPERIMENT = "skillweave"
 """The experiment of all runs, in MLflow."""
@@ -212,7 +212,7 @@ class MLflow:
         )
         settings = {k: v for k, v in manifest.items() if not isinstance(v, dict | list)}
         for stage in manifest["stages"]:
-            settings |= flat(stage["name"], stage.get("algorithm", {}))
+            settings |= flat(stage.get("algorithm", {}), f"{stage['name']}.")
         param = importlib.import_module("mlflow.entities").Param
         params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
         for i in range(0, len(params), MLFLOW_MOST_SETTINGS):

@@ -1,6 +1,6 @@
 """Ready selectors: functions, automata and behaviour trees that choose skills without training."""
 
-from skillweave.collecting.guide import LastCall
+from skillweave.policies.core import LastCall
 from skillweave.selectors import tree
 from skillweave.selectors.automaton import Automaton
 from skillweave.selectors.base import ReadySelector

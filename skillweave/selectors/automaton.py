@@ -13,10 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import observed, short
+from skillweave.messages import short
+from skillweave.policies.core import CallEnd, LastCall, observed
 from skillweave.selectors.base import (
     ReadySelector,
     function_name,

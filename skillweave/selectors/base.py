@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Dict
 
-from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError, SkillweaveError
-from skillweave.messages import observed, short, shortened
+from skillweave.messages import short, shortened
+from skillweave.policies.core import LastCall, observed
+from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goal_spaces import GOAL, blank_choices, number_of, repeated
+from skillweave.skills.goal_spaces import blank_choices, number_of, repeated
 from skillweave.skills.goals import as_goals
 from skillweave.skills.outputs import called
 from skillweave.terminal import one_line

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Dict, Discrete
 
-from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.guide import LastCall
 from skillweave.errors import SkillError
-from skillweave.messages import observed, short
+from skillweave.messages import short
+from skillweave.policies.core import CallEnd, LastCall, observed
 from skillweave.selectors.base import (
     ReadySelector,
     function_name,

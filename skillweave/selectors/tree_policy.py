@@ -12,10 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.guide import LastCall
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import observed
+from skillweave.policies.core import CallEnd, LastCall, observed
 from skillweave.selectors.base import (
     ReadySelector,
     goal_as_json,

@@ -1,7 +1,7 @@
 """Skills and reflexes, which users declare."""
 
 from skillweave.skills.answers import checked
-from skillweave.skills.base import Reflex, Skill, apply_reflexes, asked, is_trained, path_of
+from skillweave.skills.base import Reflex, Skill, asked, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
 from skillweave.skills.residual import Residual
@@ -13,7 +13,6 @@ __all__ = [
     "Reflex",
     "Residual",
     "Skill",
-    "apply_reflexes",
     "asked",
     "checked",
     "from_function",

@@ -47,6 +47,13 @@ def answer(
     return array
 
 
+def ask(function: Callable[[Any], Any], about: Any, rows: Array, path: str, name: str) -> Array:
+    """Ask a function of a user; see ``policies.core.Asks`` and ``answer``."""
+    elapsed = getattr(about, "elapsed", None)
+    who = f"skill {path!r}"
+    return answer(function, about, len(rows), bool, who, name, elapsed, rows)
+
+
 def checked(
     value: Any,
     n: int,

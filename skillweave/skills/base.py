@@ -411,20 +411,6 @@ class Reflex:
         return actions
 
 
-def apply_reflexes(
-    reflexes: tuple[Reflex, ...], obs: Array, action: Array, space: Space[Any]
-) -> tuple[Array, Array]:
-    """Apply all reflexes to actions; return them, and (n,) bool: where a reflex acted.
-
-    If several conditions hold, the last reflex acts.
-    """
-    overridden = np.zeros(len(obs), bool)
-    for reflex in reflexes:
-        action, holds = reflex.apply(obs, action, space)
-        overridden |= holds
-    return action, overridden
-
-
 def asked(
     skill: Skill,
     method: str,

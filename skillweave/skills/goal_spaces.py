@@ -6,17 +6,15 @@ Importing it needs no torch, so that skills can be declared without it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from skillweave.messages import short
+from skillweave.policies.hierarchy import SKILL
+from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.types import Array
-
-OBSERVATION, GOAL = "observation", "goal"
-"""The parts of what a skill with a goal observes."""
 
 
 def with_goal(observation_space: gym.Space[Any], goal_space: gym.Space[Any]) -> gym.spaces.Dict:
@@ -52,10 +50,6 @@ def other_goals(trained: gym.Space[Any], declared: gym.Space[Any]) -> str:
         f"was trained for goals of {short(trained, 300)}, but now its goal_space is "
         f"{short(declared, 300)}: declare goal_space as it was, or train again"
     )
-
-
-SKILL = "skill"
-"""The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
 
 
 def choice_space(
@@ -266,11 +260,3 @@ def from_numbers(space: gym.Space[Any], numbers: Array) -> Array:
         part[...] = numbers[:, first : first + size].reshape(part.shape)
         first += size
     return goals
-
-
-@lru_cache(64)
-def joint_dtype(
-    obs: np.dtype[Any], shape: tuple[int, ...], goal: np.dtype[Any], goal_shape: tuple[int, ...]
-) -> np.dtype[Any]:
-    """Return the dtype of observations with goals, as ``obs_dtype`` of ``with_goal`` has it."""
-    return np.dtype([(OBSERVATION, obs, shape), (GOAL, goal, goal_shape)], align=True)

@@ -1,4 +1,4 @@
-"""Goals of skills: drawn, checked, joined with observations, and stored in memories.
+"""Goals of skills: drawn, checked, and joined with observations.
 
 A skill with a goal is one policy for many tasks: its networks see the observation and the goal
 (universal value functions, Schaul et al. 2015). What they see is an element of
@@ -18,15 +18,14 @@ from gymnasium.spaces import Tuple
 
 from skillweave.errors import DeclarationError, EnvError, SkillError, SkillweaveError
 from skillweave.messages import short
+from skillweave.policies.hierarchy import TRIES
+from skillweave.policies.parts import GOAL, OBSERVATION, joined, joint_dtype
 from skillweave.skills.base import Skill, path_of
 from skillweave.skills.goal_spaces import (
-    GOAL,
-    OBSERVATION,
     example_of,
     given_parts,
     goals_space,
     in_words,
-    joint_dtype,
     leaf_paths,
     numbers_in,
     outside,
@@ -36,9 +35,6 @@ from skillweave.skills.goal_spaces import (
 )
 from skillweave.skills.outputs import called
 from skillweave.types import Array, Step, read_only
-
-TRIES = 16
-"""The most goals that are chosen for a call, where those before hold already."""
 
 
 def goals_of(skill: Skill | None) -> Goals | None:
@@ -70,7 +66,6 @@ class Goals:
             text = f"goal_{text}" if text.startswith("space ") else text
             raise DeclarationError(f"{self._who}: {text}") from error
         self._one = example_of(space)
-        self._bytes = self.dtype.fields is not None
         self.size = numbers_in(space)
         """The numbers of a goal."""
         if not self.size:
@@ -79,24 +74,12 @@ class Goals:
             )
 
     def start(self, n: int) -> Array:
-        """Return the goals of n environments without a call, as a memory stores them."""
-        return self.stored(np.repeat(self._one[None], n, axis=0))
+        """Return goals of n environments without a call, (n, *goal_shape)."""
+        return np.repeat(self._one[None], n, axis=0)
 
-    def stored(self, goal: Array) -> Array:
-        """Return goals (n, *goal_shape) as a memory stores them: numbers, or bytes of a Dict."""
-        if not self._bytes:
-            return goal
-        return np.ascontiguousarray(goal).view(np.uint8).reshape(len(goal), self.dtype.itemsize)
-
-    def read(self, stored: Array) -> Array:
-        """Return stored goals as arrays (n, *goal_shape)."""
-        if not self._bytes:
-            return stored
-        return np.ascontiguousarray(stored).view(self.dtype).reshape(len(stored))
-
-    def contains(self, stored: Array) -> bool:
-        """Return whether all stored goals are in the space."""
-        return outside(self.space, self.read(stored)) is None
+    def contains(self, goal: Array) -> bool:
+        """Return whether all goals (n, *goal_shape) are in the space."""
+        return outside(self.space, goal) is None
 
     def join(self, obs: Array, goal: Array) -> Array:
         """Return what the skill's networks see: one array (…) of observations and goals.
@@ -105,13 +88,7 @@ class Goals:
             obs: (…, *obs_shape).
             goal: (…, *goal_shape).
         """
-        lead = goal.shape[: goal.ndim - len(self.shape)]
-        # Zeros, because the bytes between parts are written to files.
-        joint = np.zeros(
-            lead, joint_dtype(obs.dtype, obs.shape[len(lead) :], self.dtype, self.shape)
-        )
-        joint[OBSERVATION], joint[GOAL] = obs, goal
-        return joint
+        return joined(obs, goal, goal.ndim - len(self.shape))
 
     def draw(self, obs: Array, rng: np.random.Generator) -> Array:
         """Return goals to practise in observations ``obs`` (n, …), from ``Skill.goals``.
@@ -121,7 +98,7 @@ class Goals:
         Raises:
             SkillError: the skill's ``goals`` failed, or returned something else.
         """
-        goal, rows = self.read(self.start(len(obs))).copy(), np.arange(len(obs))
+        goal, rows = self.start(len(obs)), np.arange(len(obs))
         for _ in range(TRIES):
             given = called(self.skill.goals, read_only(obs), self._label, more=(rng,))
             goal[rows] = self.fitted(obs, given, self._label)
@@ -196,7 +173,7 @@ class Goals:
 
     def flat(self, goal: Array) -> Array:
         """Return goals as numbers (n, G), for policies that take them so."""
-        if not self._bytes:
+        if self.dtype.fields is None:
             return goal.reshape(len(goal), self.size).astype(np.float64, copy=False)
         columns = (part_at(goal, path) for path in leaf_paths(self.space))
         flat = [x.reshape(len(goal), math.prod(x.shape[1:])).astype(np.float64) for x in columns]

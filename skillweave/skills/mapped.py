@@ -16,8 +16,9 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short
 from skillweave.notices import notice
+from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.skills.foreign_policy import SEES, Foreign
-from skillweave.skills.goal_spaces import GOAL, OBSERVATION, with_goal, without_goal
+from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import Goal, PolicyMapping
 from skillweave.skills.plan import Plan, Shapes

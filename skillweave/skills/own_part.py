@@ -19,7 +19,9 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 
 from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError, SkillError
-from skillweave.messages import observed, short
+from skillweave.messages import short
+from skillweave.policies.core import Around, Turn, observed
+from skillweave.policies.core import Policy as InPlace
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import example_of, leaf_paths, outside, part_at, parts_of
 from skillweave.skills.mapping import (
@@ -185,12 +187,10 @@ class Rest:
         self._leaves = _leaves(rest, space, "rest", ())
         self.holds = any(bool(leaf.held.any()) for leaf in self._leaves)
         """The last action counts."""
-        self._dtype, self._shape = obs_dtype(space), obs_shape(space)
-        self._one = np.zeros((1, *self._shape), self._dtype)
+        self._one = np.zeros((1, *obs_shape(space)), obs_dtype(space))
         for leaf in self._leaves:
             part_at(self._one, leaf.path)[...] = leaf.fixed
-        self._first = np.array(example_of(space))[None]
-        self._bytes = self._one.nbytes
+        self._first = np.array(example_of(space), self._one.dtype)[None]
 
     @property
     def held(self) -> Array:
@@ -198,26 +198,20 @@ class Rest:
         return self._leaves[0].held
 
     def start(self, n: int) -> Array:
-        """Return what is stored before the first action of n episodes: zeros."""
-        return self.stored(self._first.repeat(n, axis=0))
-
-    def stored(self, action: Array) -> Array:
-        """Return actions (n, …) as a memory stores them: as bytes (n, K)."""
-        action = np.ascontiguousarray(action, self._dtype)
-        return action.reshape(-1).view(np.uint8).reshape(len(action), self._bytes)
+        """Return what stands for the last actions where n episodes start: zeros, (n, …)."""
+        return self._first.repeat(n, axis=0)
 
     def filled(self, n: int, last: Array | None) -> Array:
         """Return n new actions that hold the rest everywhere.
 
         Args:
-            last: (n, K), the last actions as ``stored``; None: nothing is held.
+            last: (n, …), the last actions; None: nothing is held.
         """
         action = self._one.repeat(n, axis=0)
         if self.holds and last is not None:
-            before = np.ascontiguousarray(last).view(self._dtype).reshape(n, *self._shape)
             for leaf in self._leaves:
                 if leaf.held.any():
-                    held = part_at(before, leaf.path)
+                    held = part_at(last, leaf.path)
                     part_at(action, leaf.path)[...] = np.where(leaf.held, held, leaf.fixed)
         return action
 
@@ -637,12 +631,11 @@ class OwnPart:
         """Return whole actions (n, …) of its own ones (n, …).
 
         Args:
-            last: (n, K), the last actions as ``Rest.stored``; needed only where it ``holds``.
-            base: (n, …), the actions that it corrects, of the policy ``base``.
+            last: (n, …), the last actions; needed only where it ``holds``.
+            base: (n, …), the actions that it corrects; None: they are corrected already.
         """
         written = self.written
-        if self.correction is not None:
-            assert base is not None
+        if self.correction is not None and base is not None:
             own = self.correction.apply(base, own)
         if written is None:
             return own
@@ -657,3 +650,25 @@ class OwnPart:
         for path, inside in written.paths:
             part_at(action, path)[...] = part_at(own, inside)
         return action
+
+
+class PartOf(Around):
+    """A policy that sees and writes an own part."""
+
+    def __init__(self, part: OwnPart, policy: InPlace) -> None:
+        super().__init__(policy)
+        self._part = part
+
+    def act(self, memory: dict[str, Any], rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return whole actions (k, …)."""
+        part, last = self._part, turn.world.last_action
+        own = Turn(turn.world, part.mask(turn.mask), turn.goal, turn.greedy)
+        actions = super().act(memory, rows, part.see(obs), own)
+        actions = part.write(actions, None if last is None else last[rows])
+        part.check_mask(turn.mask, actions)
+        return actions
+
+    def observe(self, memory: dict[str, Any], rows: Array, step: Step) -> None:
+        """Notice the part of a step."""
+        if self.watches:
+            super().observe(memory, rows, self._part.own_step(step))

@@ -11,9 +11,10 @@ from gymnasium import Space
 
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
+from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
-from skillweave.skills.goal_spaces import GOAL, goal_part, other_goals, with_goal, without_goal
+from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.outputs import required_arguments

@@ -13,8 +13,8 @@ from gymnasium.spaces import Dict, Tuple
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
+from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.skills.foreign_policy import qualified
-from skillweave.skills.goal_spaces import GOAL, OBSERVATION
 from skillweave.skills.mapped import (
     MappedPolicy,
     model_state,

@@ -10,12 +10,12 @@ import gymnasium as gym
 
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_collector import NAMED_SHARE, SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Reflex, Skill
 from skillweave.training.role import Role, agent_role
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
+from skillweave.collecting.skill_set import in_place
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
-from skillweave.skills.outputs import blame
-from skillweave.types import Array, Memory, Policy, Step
+from skillweave.policies.core import Memory as InPlaceMemory
+from skillweave.policies.core import Turn, World, restart
+from skillweave.types import Array, Policy, Step
 
 
 @dataclass(slots=True)
@@ -24,12 +26,12 @@ class Played:
     reward: Array  # (k,) undiscounted; of a call the sum over its steps
     lasted: Array  # (k,) int64, environment steps that the action lasted
     cut: Array  # (k,) bool: the episode was cut at the step limit without an end
+    memory: InPlaceMemory = field(default_factory=dict)
+    """The policy's, of all environments, after the step."""
     acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
     call_start: Array | None = None  # (k,) bool: a call of that skill starts
     elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: unknown
     why: Array | None = None  # (k,) int8, ``CallEnd`` of its call; None: unknown
-    chosen: Memory | None = None  # the policy's memory after it has acted
-    after: Memory | None = None  # its memory after the step
 
     @property
     def over(self) -> Array:
@@ -70,20 +72,19 @@ def play(
     *,
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
-    before_step: Callable[[Memory], None] | None = None,
+    before_step: Callable[[InPlaceMemory], None] | None = None,
     seed: int = 0,
 ) -> Iterator[Played]:
     """Play all episodes, a step at a time.
 
     Args:
         deterministic: act greedily, else sample with ``rng``.
-        before_step: called with the policy's memory after it has chosen an action, before the
-            environments step.
+        before_step: called with the policy's memory, of all environments, after it has chosen an
+            action, before the environments step.
         seed: of the goals of a skill that acts alone: each episode has its own.
     """
-    n = episodes.num_envs
-    memory = policy.start(n)
-    choose_goals = getattr(policy, "choose_goals", None)
+    n, acts, world = episodes.num_envs, in_place(policy), World(rng)
+    memory, choose_goals = acts.start(n), getattr(policy, "choose_goals", None)
 
     def begin(rows: Array) -> None:
         """Let a skill that acts alone choose goals where episodes start."""
@@ -94,35 +95,21 @@ def play(
 
     begin(episodes.rows)
     while len(rows := episodes.rows):
-        rows_memory = {k: v[rows] for k, v in memory.items()}
-        obs, mask = episodes.obs[rows], episodes.mask()
-        try:
-            action, rows_memory = policy.act(
-                rows_memory, obs, mask, deterministic=deterministic, rng=rng
-            )
-        except (Exception, SystemExit) as error:
-            blame(error, "the policy's act()")
+        turn = Turn(world, episodes.mask(), greedy=deterministic)
+        action = acts.act(memory, rows, episodes.obs[rows], turn)
         if before_step is not None:
-            before_step(rows_memory)
-        acting = policy.acting(rows_memory)
-        starts = (
-            rows_memory["elapsed"] == 0 if "elapsed" in rows_memory else np.zeros(len(rows), bool)
-        )
+            before_step(memory)
+        acting = policy.acting({k: v[rows] for k, v in memory.items() if not isinstance(v, dict)})
+        before = memory["elapsed"][rows] if "elapsed" in memory else np.ones(len(rows))
         played = episodes.step(action)
-        played.acting = acting
-        played.call_start = starts
-        played.chosen = rows_memory
-        after = policy.observe(rows_memory, played.step)
-        played.elapsed = after.get("elapsed")
-        played.why = after.get("end")
-        played.after = after
-        for k, v in after.items():
-            memory[k][rows] = v
+        acts.observe(memory, rows, played.step)
+        played.memory, played.acting, played.call_start = memory, acting, before == 0
+        if acting is not None and "end" in memory:
+            played.elapsed, played.why = memory["elapsed"][rows], memory["end"][rows]
         yield played
         restarted = episodes.go_on(played)
         if len(restarted):
-            for k, v in policy.start(n).items():
-                memory[k][restarted] = v[restarted]
+            restart(acts, memory, restarted)
             begin(restarted)
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.collecting.call_end import EPISODE, RUNNING
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT
 from skillweave.planning.calls import CallLog
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
+from skillweave.policies.core import EPISODE, RUNNING
 from skillweave.skills import Skill
 from skillweave.training.play import Played
 from skillweave.types import Array, Memory, Policy
@@ -50,9 +50,8 @@ class PlayedCalls:
         """The episodes that were cut at the step limit."""
         agent: Skill = type(AGENT, (Skill,), {"name": AGENT})()
         self._levels = levels_below(SkillSet((agent,), (policy,)) if skills is None else skills)
-        self._prefix = {
-            path: "".join(f"{place}." for place in above.values())
-            for path, (_, above) in self._levels.items()
+        self._places = {
+            path: [*map(str, above.values())] for path, (_, above) in self._levels.items()
         }
         self._goals = {path: goals_in(below) for path, (below, _) in self._levels.items()}
         self._spaces = spaces
@@ -101,9 +100,10 @@ class PlayedCalls:
             nothing = np.zeros(len(over), np.int64)
             end = np.where(over, np.int8(EPISODE), np.int8(RUNNING))
             return {"skill": nothing, "elapsed": played.step.elapsed, "end": end}
-        assert played.after is not None
-        prefix, after = self._prefix[path], played.after
-        calls = calls_in(after, self._goals[path], prefix)
+        memory = played.memory
+        for place in self._places[path]:
+            memory = memory[place]
+        calls = calls_in(memory, self._goals[path], played.rows)
         if played.cut.any():  # the player sees the environment's own ends
             cut = played.cut & (calls["end"] == RUNNING)
             calls["end"] = np.where(cut, np.int8(EPISODE), calls["end"])

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.paths import join
 from skillweave.planning.recorder import Recorder
+from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal

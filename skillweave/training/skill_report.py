@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.call_end import CallEnd, end_with_episode
 from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import level_of
 from skillweave.planning.hand_over import HandOver
+from skillweave.policies.core import CallEnd, end_with_episode, part_of
+from skillweave.policies.parts import OWN_GOAL
 from skillweave.settings import Count
 from skillweave.skills import Skill, asked, is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import goals_of
 from skillweave.training.play import Played
-from skillweave.types import Array, Policy, unprefixed
+from skillweave.types import Array, Policy
 
-_MEMORIES = ("chosen", "after")
-"""Fields of a step that hold a policy's memory."""
 ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
 """Names of the ends of calls in reports."""
 
@@ -119,10 +118,10 @@ def judge_step(skills: SkillSet, played: Played) -> StepOutcome:
     success = np.zeros(len(acting), bool)
     for i, skill in enumerate(skills.skills):
         if skill.defines("reward") and len(rows := np.flatnonzero(acting == i)):
-            reward[rows] = _outcome(skill, played, played.elapsed, rows, f"goal.{i}").reward
+            reward[rows] = _outcome(skill, played, played.elapsed, rows, i).reward
         due = (acting == i) & (over | is_endless(skills, i))
         if skill.defines("success") and len(rows := np.flatnonzero(due)):
-            success[rows] = _outcome(skill, played, played.elapsed, rows, f"goal.{i}").success
+            success[rows] = _outcome(skill, played, played.elapsed, rows, i).success
     return StepOutcome(why, reward, success & over, success)
 
 
@@ -329,7 +328,7 @@ class CallTally:
         self.goals: Array | None = None
         """(episodes, …) the goal of each; None: the skill has none."""
         if self._goals_of is not None:
-            self.goals = self._goals_of.read(self._goals_of.start(episodes)).copy()
+            self.goals = self._goals_of.start(episodes)
         self.reached: Array | None = None
         """(episodes,) bool: the call in each has succeeded; None: the skill defines no success."""
         if skill.defines("success"):
@@ -339,9 +338,8 @@ class CallTally:
 
     def add(self, played: Played) -> None:
         """Count one step of each environment."""
-        if self.goals is not None and self._goals_of is not None:
-            assert played.chosen is not None
-            self.goals[played.episode] = self._goals_of.read(played.chosen["goal"])
+        if self.goals is not None:
+            self.goals[played.episode] = played.memory[OWN_GOAL][played.rows]
         waiting = np.flatnonzero(~self._running[played.episode] & ~self._done[played.episode])
         if len(waiting):
             obs = played.step.obs[waiting]
@@ -415,33 +413,24 @@ def rows_of(played: Played, rows: Array) -> Played:
     if len(rows) == len(played.rows):
         return played
     values = {f.name: getattr(played, f.name) for f in fields(played)}
-    step = seen_by(None, played.step, played.step.elapsed[rows], rows)
+    step = part_of(played.step, played.step.elapsed[rows], rows)
     arrays = {k: v[rows] for k, v in values.items() if isinstance(v, np.ndarray)}
-    memories = {k: values[k] and {n: v[rows] for n, v in values[k].items()} for k in _MEMORIES}
-    return Played(**values | arrays | memories | {"step": step})
+    return Played(**values | arrays | {"step": step})
 
 
 def played_below(played: Played, i: int, rows: Array) -> Played:
     """Return a step of ``rows`` (m,) inside the hierarchy that is skill ``i``."""
     assert played.elapsed is not None
-    assert played.chosen is not None
-    assert played.after is not None
-    chosen = {k: v[rows] for k, v in unprefixed(str(i), played.chosen).items()}
-    after = {k: v[rows] for k, v in unprefixed(str(i), played.after).items()}
-    step = seen_by(None, played.step, played.elapsed[rows], rows)
-    return Played(
-        played.rows[rows],
-        played.episode[rows],
-        step,
-        played.reward[rows],
-        played.lasted[rows],
-        played.cut[rows],
-        acting=chosen["skill"],
-        call_start=chosen["elapsed"] == 0,
-        elapsed=after["elapsed"],
-        why=after["end"],
-        chosen=chosen,
-        after=after,
+    part, memory = rows_of(played, rows), played.memory[str(i)]
+    elapsed = memory["elapsed"][part.rows]
+    return replace(
+        part,
+        step=part_of(part.step, played.elapsed[rows]),
+        memory=memory,
+        acting=memory["skill"][part.rows],
+        call_start=elapsed == 1,
+        elapsed=elapsed,
+        why=memory["end"][part.rows],
     )
 
 
@@ -460,16 +449,16 @@ def all_steps(skills: Mapping[str, SkillReport]) -> int:
 
 
 def _outcome(
-    skill: Skill, played: Played, elapsed: Array, rows: Array, key: str = "goal"
+    skill: Skill, played: Played, elapsed: Array, rows: Array, i: int | None = None
 ) -> Outcome:
     """Judge a step of ``rows`` (m,) of the acting environments; ``elapsed`` is of all.
 
     Args:
-        key: the name of the skill's goals in the policy's memory.
+        i: the skill's place in its hierarchy; None: it acts alone.
     """
     goal = None
-    if (goals := goals_of(skill)) is not None:
-        assert played.chosen is not None
-        goal = goals.read(played.chosen[key][rows])
+    if skill.goal_space is not None:
+        goals = played.memory[OWN_GOAL] if i is None else played.memory["goal"][str(i)]
+        goal = goals[played.rows[rows]]
     step = seen_by(skill, played.step, elapsed[rows], rows, goal)
     return judge(skill, step, played.rows[rows])

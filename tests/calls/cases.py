@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from reference_calls import EPISODE, POSITION, TAG, Counting, T, Walk, scripted
 
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.collecting.call_end import Interruption
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
+from skillweave.policies.hierarchy import ActiveGuide, Interruption
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.scripted import ScriptedPolicy

@@ -28,7 +28,7 @@ from calls.cases import (
     recorded,
 )
 
-from skillweave.collecting.call_end import CallEnd
+from skillweave.policies.core import CallEnd
 from skillweave.types import Array, Step
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = CallEnd

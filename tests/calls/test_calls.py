@@ -16,11 +16,10 @@ from calls.users import GAMMA, SEED, USERS, Got, Played
 from hypothesis import HealthCheck, given, settings
 from reference_calls import T, scripted, seeds_of
 
-from skillweave.collecting.call_end import CallEnd
-from skillweave.collecting.guide import SMOOTHED
+from skillweave.collecting.calls import SMOOTHED
 from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.player import Player
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, hierarchy_of
+from skillweave.policies.core import CallEnd
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.types import Array
@@ -52,8 +51,6 @@ def agree(played: Played, got: dict[str, Any], want: dict[str, Any], where: str)
     for name, value in want.items():
         if re.search(played.missing, name):
             continue
-        if played.ready_is_guide and name.startswith("selector."):
-            name = name.replace("selector", "guide", 1)
         if isinstance(value, list):
             assert near(got[name], value), f"{where}: {name} is {got[name]}, not {value}"
         else:
@@ -237,7 +234,7 @@ class AtFirst(Skill):
 
 def test_where_no_skill_may_start_all_choices_are_open_to_the_value_of_what_follows() -> None:
     skills = AtFirst(), AtFirst()
-    player = Player(SkillSet(skills, (scripted(0), scripted(2)), call_steps=Lengths(1, 2)))
+    policy = hierarchy_of(SkillSet(skills, (scripted(0), scripted(2)), call_steps=Lengths(1, 2)))
     obs = np.zeros((2, 4), np.float32)
     obs[1, T] = 1
-    assert player.allowed(player.start(2), np.arange(2), obs).all()
+    assert policy.allowed(policy.start(2), np.arange(2), obs).all()

@@ -17,21 +17,22 @@ from reference_calls import seeds_of
 
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.levels import UntrainedHierarchy
-from skillweave.collecting.player import Player, Turn
 from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.skill_set import acting_policy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.export import states
 from skillweave.export.graphs import Graph
 from skillweave.export.write import write_export
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.policies.core import Memory, Turn, World, flat, restart, take
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.training.play import SeededEpisodes, play
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Array, Step
 
 N, SEED = 3, 5
 GAMMA = 0.5  # so that sums are exact
@@ -65,8 +66,6 @@ class Played:
     """Return and length of the episodes that are over; None: this user does not report them."""
     missing: str = "never"
     """A pattern of the names in memories that it does not have."""
-    ready_is_guide: bool = False
-    """A ready selector is remembered as a guide."""
     restarts: bool = True
     """What it remembers after an episode's last step is that of the next episode."""
     chooses: bool = True
@@ -93,7 +92,7 @@ class Watch:
                 self._open[i] = []
                 self.episodes.append((next(self._seeds[i]), self._open[i]))
             row = k if aligned else i
-            remembered = {name: v[row].tolist() for name, v in memory.items()}
+            remembered = {name: v[row].tolist() for name, v in flat(memory).items()}
             overridden = remembered.pop("overridden", None)
             got = Got(
                 int(action[k]), raw.next_obs[k].tolist(), float(raw.reward[k]), remembered,
@@ -107,7 +106,7 @@ class Watch:
         """What is remembered after the latest step of environments ``ids``."""
         for k, i in enumerate(ids.tolist()):
             row = k if aligned else i
-            self._latest[i].observed = {name: v[row].tolist() for name, v in memory.items()}
+            self._latest[i].observed = {n: v[row].tolist() for n, v in flat(memory).items()}
 
     def on(self, engine: Any, memory: Callable[[], Memory]) -> None:
         """Watch every step of an engine.
@@ -119,7 +118,7 @@ class Watch:
 
         def watched(action: Array, ids: Array | None = None) -> Any:
             rows = np.arange(engine.num_envs) if ids is None else ids
-            before = {k: v.copy() for k, v in memory().items()}
+            before = {k: v.copy() for k, v in flat(memory()).items()}
             raw = step(action, ids)
             self.step(rows, action, raw, before, False)
             return raw
@@ -161,6 +160,9 @@ class Learner:
 
     def to_env(self, action: Array) -> Array:
         return action
+
+    def widened(self, mask: Array | None) -> Array | None:
+        return mask
 
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
         before = {} if memory is None else {"rnn": memory}
@@ -285,7 +287,7 @@ def _collect(
                     row["recurrent_state"] = batch["recurrent_state"][n]
                 columns[n].append(row)
     ready = case.level.ready
-    return Played(watch.episodes, None if ready else columns, finished, ready_is_guide=ready)
+    return Played(watch.episodes, None if ready else columns, finished)
 
 
 def leads_to_starts(case: Case) -> Played:
@@ -324,29 +326,31 @@ class Anything:
 def alone(case: Case) -> Played:
     """The player in a plain loop."""
     level, engine = case.level, engine_of(case)
-    player = Player(skill_set(level, policies_of(level)), selector_of(level), guide_of(level))
+    policy = acting_policy(
+        skill_set(level, policies_of(level)), selector_of(level), guide_of(level)
+    )
     watch, rows = Watch(seeds_of(SEED, N)), np.arange(N)
-    memory, age = player.start(N), np.zeros(N, np.int64)
+    memory, age = policy.start(N), np.zeros(N, np.int64)
     overridden = np.zeros(N, bool)
     watch.on(engine, lambda: memory | {"overridden": overridden})
     obs = engine.reset(SEED)
     for _ in range(case.steps):
         overridden[:] = False
-        turn = Turn(case.deterministic, overridden=overridden)
-        action = player.act(memory, rows, obs, engine.mask(), turn)
+        world = World(age=age, overridden=overridden)
+        turn = Turn(world, engine.mask(), greedy=case.deterministic)
+        action = policy.act(memory, rows, obs, turn)
         raw = engine.step(action)
         age += 1
         step = Step(
             obs, action, raw.next_obs, raw.reward, raw.terminated, raw.truncated,
             np.zeros(N, bool), age.copy(), raw.info,
         )  # fmt: skip
-        end = player.observe(memory, rows, step)
+        policy.observe(memory, rows, step)
         watch.observed(rows, memory)
-        np.testing.assert_array_equal(end, memory["end"])
         obs, over = raw.next_obs.copy(), np.flatnonzero(raw.terminated | raw.truncated)
         if len(over):
             obs[over], age[over] = engine.reset_some(over), 0
-            player.restart(memory, over)
+            restart(policy, memory, over)
     return Played(watch.episodes, restarts=False)
 
 
@@ -358,11 +362,15 @@ def evaluated(case: Case) -> Played:
     seeds = [11, 12, 13, 14, 15, 16, 17]
     watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
     episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
-    for played in play(hierarchy(case.level), episodes, deterministic=case.deterministic):
-        assert played.chosen is not None
-        assert played.after is not None
-        watch.step(played.episode, played.step.action, played.step, played.chosen, True)
-        watch.observed(played.episode, played.after, True)
+    chosen: list[Memory] = []
+
+    def keep(memory: Memory) -> None:
+        chosen.append(take(memory, episodes.rows))
+
+    how: Any = {"deterministic": case.deterministic, "before_step": keep}
+    for played in play(hierarchy(case.level), episodes, **how):
+        watch.step(played.episode, played.step.action, played.step, chosen[-1], True)
+        watch.observed(played.episode, take(played.memory, played.rows), True)
     return Played(watch.episodes, restarts=False)
 
 
@@ -382,7 +390,7 @@ def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
         reward, over = 0.0, False
         while not over:
             action = acts.act(obs, reward=reward, info=info)
-            remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in memory().items()}
+            remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in flat(memory()).items()}
             obs, reward, terminated, truncated, info = env.step(action)
             steps.append(Got(int(action), obs.tolist(), float(np.float32(reward)), remembered))
             over = terminated or truncated

@@ -8,11 +8,12 @@ from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, boun
 from toy_acting import Choices, requests
 
 from skillweave.collecting.acting import Acted
+from skillweave.collecting.calls import SMOOTHED, as_logits
 from skillweave.collecting.collector import joined_collected
-from skillweave.collecting.guide import SMOOTHED, ActiveGuide, as_logits
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import make_engine
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.seeding import Seeds
 from skillweave.selectors import Automaton
 
@@ -36,15 +37,16 @@ def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
     for greedy in (False, True):
         collector = HierarchyCollector(
-            make_engine(SPEC, N), Choices(N, len(SKILLS)), skills,
+            make_engine(SPEC, N), None, skills,
             guide=ActiveGuide(bound(AUTOMATON), decides=True),
         )  # fmt: skip
         collector.start(Seeds(2))
         request = next(requests(80))
         request = type(request)(80, (), request.gamma, request.seeds, greedy=greedy)
-        found = collector.collect(request).batches[""]
-        valid = found.valid_rows
-        taken = set(np.unique(found["action"][valid & (found["obs"][..., KEY] == 0)]).tolist())
+        collector.log_calls = ()
+        found = collector.collect(request).calls
+        starts = found["call_elapsed"] == 1
+        taken = set(np.unique(found["skill"][starts & (found["obs"][..., KEY] == 0)]).tolist())
         assert taken == ({0} if greedy else {0, 3})
 
 
@@ -64,9 +66,7 @@ def test_collectors_agree_on_what_they_tell_also_where_no_call_has_ended(tells):
     for call_steps, rows in ((30, 1), (1, 2)):
         collector = collector_of(ActiveGuide(bound(AUTOMATON), tells=tells), call_steps)
         if rows == 1:  # it waits for two steps
-            collector.selector.acting.some = lambda ids, *seen: Acted(
-                np.full(len(ids), 3), None, None
-            )
+            collector.acting.some = lambda ids, *seen: Acted(np.full(len(ids), 3), None, None)
         found.append(collector.collect(next(requests(rows))))
     assert not found[0].batches[""]["valid"].any(), "no call has ended"
     joined = joined_collected(found, 1).batches[""]

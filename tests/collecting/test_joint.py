@@ -11,11 +11,11 @@ from reference_calls import EPISODE, POSITION, Walk
 from toy_acting import Choices, requests, valid_rows
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.policies.core import CallEnd
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -123,7 +123,9 @@ def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
             at = -int(open_steps[n])
             for choice, steps in calls_of(experience, n):
                 first, at = max(0, at), at + steps
-                assert (owner[first:at, n] == int(skills.skill_of(np.array(choice)))).all()
+                assert (
+                    owner[first:at, n] == int(skills.hierarchy.skill_of(np.array(choice)))
+                ).all()
                 last[at - 1] = True
             elapsed = 1 + int(open_steps[n])
             for t in range(40):

@@ -4,8 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.restored import check_numbers, opened
+from skillweave.policies.core import CallEnd
 
 SPACE = gym.spaces.Discrete(5, start=1)
 SEEN = np.array([1, 4, 5])

@@ -34,6 +34,9 @@ class Choices:
     def begin(self, request: Request, every_step: bool = True) -> None:
         self.request = request
 
+    def widened(self, mask):
+        return mask
+
     def to_env(self, action: Array) -> Array:
         return action
 

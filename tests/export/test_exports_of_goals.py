@@ -292,8 +292,8 @@ def test_a_selector_that_samples_chooses_goals_that_do_not_hold(tmp_path: Path) 
         player = Player(policy, seed=seed)
         runner.reset()
         assert len({str(p.act(obs)) for p in (player, runner)}) == 1
-        assert player.memory["goal.0"][0] == runner.root.goal[0] == 3
-        seen += [player.memory.get("selector.rnn"), runner.root.selector.memory.get("memory")]
+        assert player.memory["goal"]["0"][0] == runner.root.goal[0] == 3
+        seen += [player.memory["selector"].get("rnn"), runner.root.selector.memory.get("memory")]
     for memory in seen[1:]:
         np.testing.assert_allclose(memory, seen[0], atol=1e-5)
 

@@ -14,7 +14,6 @@ from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
 from skillweave.api.policies import load_policy
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
 from skillweave.export.runner import Runner
@@ -29,6 +28,7 @@ from skillweave.planning import (
     held,
     record_calls,
 )
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 

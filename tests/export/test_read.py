@@ -32,11 +32,11 @@ from test_state_machine import (
 import skillweave as sw
 from skillweave import DQN, PPO, RNN, Network
 from skillweave.api.player import Player
-from skillweave.collecting.guide import ActiveGuide
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillweaveError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.selectors import ready_selector
 from skillweave.skills.foreign_policy import made_up
 from skillweave.types import Array, Policy

@@ -103,7 +103,7 @@ def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None
     assert seen is not None
     goals = goals_of(skill)
     assert goals is not None
-    assert seen.dtype == goals.join(log.start[:1], goals.read(goals.start(1))).dtype
+    assert seen.dtype == goals.join(log.start[:1], goals.start(1)).dtype
     pairs = {(*o, *g) for o, g in zip(seen["observation"], goals.flat(seen["goal"]), strict=True)}
     first = np.flatnonzero((log.skill == 0) & log.succeeded & (log.order == 0))
     assert len(first)

@@ -14,9 +14,9 @@ from worlds import SMALL, SPACES, Point, Rest, declared, go_to
 import skillweave as sw
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.call_end import INTERRUPTED, RUNNING, Interruption
-from skillweave.collecting.player import Player
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, hierarchy_of
+from skillweave.policies.core import INTERRUPTED, RUNNING
+from skillweave.policies.hierarchy import Interruption
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import draw_from, goals_space, with_goal
 from skillweave.skills.goals import CallGoals, goals_of
@@ -76,14 +76,15 @@ def test_a_call_is_cut_for_its_goal():
     )
     assert policy.observation_space == space
     skills = SkillSet((skill,), (policy,), interruption=Interruption(worth, 0.2))
-    player = Player(skills)
-    memory, rows = player.start(3), np.arange(3)
+    policy = hierarchy_of(skills)
+    memory, rows = policy.start(3), np.arange(3)
     goals = np.float32([[-0.9, 0], [-0.1, 0], [0.9, 0]])  # 0 is worth 0.9, 0.1 and -0.9 more
-    player.begin(memory, rows, np.zeros(3, int), {0: goals})
+    policy.begin(memory, rows, np.zeros(3, int), {0: goals})
     obs = np.zeros((3, 2), np.float32)
     no = np.zeros(3, bool)
     step = Step(obs, obs, obs + 2, np.zeros(3), no, no, no, np.ones(3, int), {})
-    assert player.observe(memory, rows, step).tolist() == [INTERRUPTED, RUNNING, RUNNING]
+    policy.observe(memory, rows, step)
+    assert memory["end"].tolist() == [INTERRUPTED, RUNNING, RUNNING]
 
 
 @pytest.mark.fast_cases(1)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from goals.worlds import ON, GoTo, Point, declared, go_to
 
-from skillweave.skills.goals import TRIES, Goals
+from skillweave.policies.hierarchy import TRIES
+from skillweave.skills.goals import Goals
 
 
 class Grid(GoTo):

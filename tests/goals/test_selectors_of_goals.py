@@ -210,7 +210,7 @@ def test_a_goal_out_of_reach_is_clipped(tmp_path):
     run = declared([skill], selector=rule).train(tmp_path / "run", quiet=True)
     player = run.player()
     player.act(np.zeros(2, np.float32))
-    assert np.allclose(player.memory["goal.0"], 0.3)
+    assert np.allclose(player.memory["goal"]["0"], 0.3)
 
 
 def test_an_environment_of_options_takes_goals(tmp_path):

@@ -14,6 +14,8 @@ import skillweave as sw
 from skillweave.collecting.judge import JudgedBy
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.experience import Batch
+from skillweave.policies.core import Turn, World
+from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype
@@ -379,7 +381,9 @@ def test_goals_are_the_same_for_the_same_seed(tmp_path):
         found = {}
 
         def watch(played):
-            for episode, goal in zip(played.episode, played.chosen["goal"], strict=True):
+            for episode, goal in zip(
+                played.episode, played.memory[OWN_GOAL][played.rows], strict=True
+            ):
                 found.setdefault(int(episode), goal.tolist())
 
         alone = run._policy("go_to")
@@ -400,8 +404,6 @@ def test_goals_are_drawn_and_joined(name):
     drawn = goals.draw(obs, rng)
     assert len(drawn) == 50
     assert not np.array_equal(drawn[0], drawn[1]) or name in ("number", "bits", "numbers")
-    stored = goals.stored(drawn)
-    assert np.array_equal(goals.read(stored), drawn)
     joint = goals.join(obs, drawn)
     assert joint.dtype == obs_dtype(with_goal(Point.observation_space, skill.goal_space))
     assert np.array_equal(joint["observation"], obs)
@@ -412,7 +414,7 @@ def test_goals_are_drawn_and_joined(name):
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
     )
-    goals.fitted(obs[:2], goals.read(goals.start(2)), "test")
+    goals.fitted(obs[:2], goals.start(2), "test")
 
 
 def test_rows_are_judged_again_with_their_goals():
@@ -445,8 +447,8 @@ def test_captions_show_the_goal():
 def test_goals_reach_the_label_of_a_film(tmp_path):
     run = declared([go_to(), Rest()], selector=far_corner).train(tmp_path / "run", quiet=True)
     policy = run.policy
-    memory = policy.start(1)
-    _, memory = policy.act(memory, np.zeros((1, 2), np.float32))
+    memory = policy.in_place.start(1)
+    policy.in_place.act(memory, np.arange(1), np.zeros((1, 2), np.float32), Turn(World()))
     assert np.allclose(policy.goal_now(memory), 0.9)
 
 

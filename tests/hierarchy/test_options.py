@@ -23,8 +23,7 @@ from toys import cartpole
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.player import Player
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
@@ -415,4 +414,4 @@ def test_a_memory_that_no_checkpoint_could_hold_is_refused_by_the_skills_name():
 
     skills = SkillSet((Left(),), (Wordy(),), (), 5)
     with pytest.raises(SkillweaveError, match="skill 'left': its policy remembers 'said' as obj"):
-        Player(skills)
+        hierarchy_of(skills)

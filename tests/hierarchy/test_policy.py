@@ -203,7 +203,7 @@ def test_where_no_skill_may_start_a_large_observation_is_told_in_part():
             return np.zeros(len(obs), bool)
 
     with pytest.raises(SkillweaveError, match="no skill may start") as found:
-        skill_set(Never).mask(np.zeros((1, 7, 7, 3), np.uint8))
+        skill_set(Never).hierarchy.mask(np.zeros((1, 7, 7, 3), np.uint8))
     assert len(str(found.value)) < 400
     assert "\n" not in str(found.value)
 

@@ -254,7 +254,7 @@ def louder(policy: Any) -> Any:
     if not isinstance(policy, HierarchyPolicy):
         return policy
     below = replace(policy.skills, policies=tuple(map(louder, policy.skills.policies)))
-    return HierarchyPolicy(louder(policy.selector), below, None, policy.player.own_goals)
+    return HierarchyPolicy(louder(policy.selector), below, None, policy.goals)
 
 
 @pytest.mark.fast_cases(4)

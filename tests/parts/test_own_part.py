@@ -124,7 +124,7 @@ def test_its_choices_of_several():
 def test_its_bits():
     own = part(acts=(1,), space=MultiBinary(3), rest="hold")
     assert own.action_space == MultiBinary(1)
-    last = own.rest.stored(np.array([[1, 1, 0]], np.int8))
+    last = np.array([[1, 1, 0]], np.int8)
     assert own.write(np.array([[0]], np.int8), last).tolist() == [[1, 0, 0]]
     mask = np.array([[1, 1, 0, 1, 1, 0]], bool)
     assert own.mask(mask).tolist() == [[False, True]]
@@ -150,7 +150,7 @@ def test_its_names_of_a_dict():
     assert own.action_space == ROBOT["arm"]
     last = pack(ROBOT, {"arm": {"joints": np.ones((1, 2)), "brake": [1]}, "hand": [[0.5]]})
     mine = pack(ROBOT["arm"], {"joints": np.full((1, 2), 0.25), "brake": [0]})
-    action = own.write(mine, own.rest.stored(last))
+    action = own.write(mine, last)
     assert action["arm"]["joints"].tolist() == [[0.25, 0.25]]
     assert action["arm"]["brake"].tolist() == [0]
     assert action["hand"].tolist() == [[0.5]]
@@ -168,8 +168,8 @@ def test_the_last_action_is_held_as_it_was(space):
     batch = gym.vector.utils.batch_space(space, 3)
     batch.seed(0)
     actions = pack(space, batch.sample())
-    assert rest.filled(3, rest.stored(actions)).tobytes() == actions.tobytes()
-    assert rest.start(0).shape == (0, rest.start(2).shape[1])
+    assert rest.filled(3, actions).tobytes() == actions.tobytes()
+    assert rest.start(0).shape == (0, *rest.start(2).shape[1:])
 
 
 def test_zero_is_the_nearest_to_zero():

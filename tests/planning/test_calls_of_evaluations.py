@@ -22,12 +22,12 @@ from ready_selectors.chain import (
 )
 
 from skillweave import Automaton, EnvSpec, Lengths
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.planning import CallLog, record_calls
 from skillweave.planning.calls import columns_of
+from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.types import Array, Step

@@ -13,7 +13,6 @@ from planning.steps import step_to
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
 
 from skillweave import EnvSpec, Hierarchy, HierarchyPolicy, Lengths, evaluate
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import (
@@ -30,6 +29,7 @@ from skillweave.planning import (
 )
 from skillweave.planning.neighbours import nearest, tie_order
 from skillweave.planning.states import LEVELS, PlanningStates
+from skillweave.policies.core import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy

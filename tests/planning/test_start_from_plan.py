@@ -29,7 +29,6 @@ from ready_selectors.chain import (
 
 import skillweave as sw
 from skillweave.api import Run
-from skillweave.collecting.call_end import CallEnd
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError, SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -37,6 +36,7 @@ from skillweave.networks.config import RNN, Network
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, held
 from skillweave.planning.task import as_task
 from skillweave.planning.task_env import OwnView, Tasked
+from skillweave.policies.core import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted, made_up

@@ -9,8 +9,8 @@ import pytest
 from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
 
 from skillweave import Automaton
-from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.core import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.types import Step
 

@@ -10,8 +10,8 @@ import pytest
 from ready_selectors.chain import Corridor, has_key, hierarchy, story
 
 from skillweave import tree
-from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import DeclarationError, SkillError
+from skillweave.policies.core import CallEnd
 from skillweave.selectors import LastCall
 from skillweave.selectors.ready import ready_selector
 from skillweave.selectors.tree_policy import TreeSelector

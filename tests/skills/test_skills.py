@@ -6,7 +6,9 @@ from gymnasium.spaces import Box, Discrete
 
 from skillweave.errors import SkillweaveError
 from skillweave.messages import short, whole_number
-from skillweave.skills import Reflex, Skill, apply_reflexes, asked, checked, from_function
+from skillweave.policies.core import Policy
+from skillweave.policies.parts import Reflexes
+from skillweave.skills import Reflex, Skill, asked, checked, from_function
 from skillweave.types import Step
 
 
@@ -91,7 +93,7 @@ def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds()
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    action, overridden = apply_reflexes(reflexes, OBS, np.zeros(3, int), Discrete(3))
+    action, overridden = Reflexes(Policy(), reflexes, Discrete(3)).over(OBS, np.zeros(3, int))
     assert action.tolist() == [0, 1, 2]
     assert overridden.tolist() == [False, True, True]
 

@@ -14,10 +14,10 @@ from gymnasium.spaces import Box, Discrete
 from test_asked_twice import step
 
 from skillweave import tree
-from skillweave.collecting.guide import LastCall
 from skillweave.errors import PolicyError
 from skillweave.notices import collected_notices
 from skillweave.planning import GoalTask, Predicate, RewardMachine
+from skillweave.policies.core import LastCall
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.selectors.base import goals_at
 from skillweave.skills import Reflex, Skill, asked, from_function

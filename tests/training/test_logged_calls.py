@@ -27,11 +27,11 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.collecting import placement
-from skillweave.collecting.call_end import CallEnd
 from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import CallLog
 from skillweave.planning.calls import LEARNING, columns_of
+from skillweave.policies.core import CallEnd
 from skillweave.skills.scripted import ScriptedPolicy
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from skillweave.policies.core import flat
 from skillweave.reporting.report.numbers import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.types import flat
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
@@ -126,7 +126,7 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
 
 def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    values: dict[str, Any] = {"env": manifest["env"]} | flat("env_kwargs", manifest["env_kwargs"])
+    values: dict[str, Any] = {"env": manifest["env"]} | flat(manifest["env_kwargs"], "env_kwargs.")
     names = (
         "kind",
         "learn",
@@ -148,12 +148,12 @@ def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
     values |= {k: manifest[k] for k in names if k in manifest}
     for skill in manifest.get("skills", ()):
         fields = {k: v for k, v in skill.items() if k != "name"}
-        values |= flat(f"skills.{skill['name']}", fields)
+        values |= flat(fields, f"skills.{skill['name']}.")
     for entry in manifest["stages"]:
         fields = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
         # From which run differs from seed to seed.
         fields |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}
-        values |= flat(entry["name"], fields)
+        values |= flat(fields, f"{entry['name']}.")
     return values
 
 

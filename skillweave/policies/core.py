@@ -1,0 +1,342 @@
+"""Policies as values: how they act in N environments at once, and what they remember there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[Any]
+Memory: TypeAlias = dict[str, Any]
+"""Arrays whose first axis is the environment, and the memories of parts, by name."""
+
+
+class CallEnd(IntEnum):
+    """Why a call ended."""
+
+    RUNNING = 0
+    """It has not ended."""
+    OWN = 1
+    """The skill's ``termination`` ended it, perhaps in the episode's last step."""
+    LIMIT = 2
+    """A limit was reached: ``max_steps``, ``call_steps``, or the length that was chosen."""
+    INTERRUPTED = 3
+    """The selector ended it, as a new decision was worth more."""
+    EPISODE = 4
+    """The episode ended the call, or has just started: no call runs."""
+
+
+RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = map(int, CallEnd)
+"""The same as plain integers, with which arrays are compared six times as fast."""
+
+
+def end_with_episode(end: Array, over: Array) -> None:
+    """Set in ``end`` (n,) that episodes ended calls, but for those that ended by themselves.
+
+    Args:
+        over: (n,) bool, the episode is over.
+    """
+    end[over & (end != OWN)] = EPISODE
+
+
+# Steps ------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Step:
+    """An environment transition in the form that a skill's methods receive, of N environments.
+
+    Its arrays are read-only, because they are shared.
+
+    ``elapsed`` counts the steps of the current episode or call, this one included (so it is 1
+    on the first). ``timed_out`` is True where the skill's ``max_steps`` ended the call. ``goal`` is
+    what the call is for, where the skill has goals (``Skill.goal_space``).
+    """
+
+    obs: Array  # (N, *obs_shape)
+    action: Array  # (N,) or (N, *action_shape)
+    next_obs: Array  # (N, *obs_shape), always the true successor
+    reward: Array  # (N,) float32, the environment's own reward
+    terminated: Array  # (N,) bool
+    truncated: Array  # (N,) bool, the environment's time limit
+    timed_out: Array  # (N,) bool, the skill's time limit
+    elapsed: Array  # (N,) int64, steps
+    info: Mapping[str, Any]  # the environment's, arrays over N
+    goal: Any = None  # (N, *goal_shape), the same in all steps of a call; None: a skill without
+
+    def __post_init__(self) -> None:
+        # Runs in every step of training: a loop over the names takes three times as long.
+        self.obs = read_only(self.obs)
+        self.next_obs = read_only(self.next_obs)
+        self.action = read_only(self.action)
+        self.reward = read_only(self.reward)
+        self.terminated = read_only(self.terminated)
+        self.truncated = read_only(self.truncated)
+        self.timed_out = read_only(self.timed_out)
+        self.elapsed = read_only(self.elapsed)
+        if self.goal is not None:
+            self.goal = read_only(self.goal)
+
+
+def read_only(array: Array) -> Array:
+    """Return a view that cannot be written to."""
+    view = array.view()
+    view.setflags(False)  # type: ignore[call-arg]  # a keyword takes three times as long
+    return view
+
+
+def part_of(
+    step: Step,
+    elapsed: Array,
+    rows: Array | None = None,
+    limit: int | None = None,
+    goal: Array | None = None,
+) -> Step:
+    """Return a step as seen by someone with a time and a limit of its own.
+
+    Args:
+        elapsed: (m,) steps so far, this one included.
+        rows: (m,) ascending, some rows of the step; None: all.
+        limit: steps after which its time is over; None: never.
+        goal: (m, *goal_shape); None: it has no goals.
+    """
+    every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
+    at = slice(None) if every else rows
+    terminated = step.terminated[at]
+    late = np.zeros(len(terminated), bool)
+    if limit is not None:
+        late = (elapsed >= limit) & ~terminated
+    info = step.info if rows is None or every else info_rows(step.info, rows, len(step.reward))
+    return Step(
+        step.obs[at],
+        step.action[at],
+        step.next_obs[at],
+        step.reward[at],
+        terminated,
+        step.truncated[at],
+        late,
+        elapsed,
+        info,
+        goal,
+    )
+
+
+def info_rows(info: Mapping[str, Any], rows: Array, n: int) -> dict[str, Any]:
+    """Return the part of ``rows`` (k,) of a batched info of n environments, nested dicts included.
+
+    Values that are not arrays over the n environments are returned unchanged.
+    """
+    return {key: _rows(value, rows, n) for key, value in info.items()}
+
+
+def _rows(value: Any, rows: Array, n: int) -> Any:
+    if isinstance(value, dict):
+        return info_rows(value, rows, n)
+    batched = isinstance(value, np.ndarray) and value.ndim > 0 and len(value) == n
+    return value[rows] if batched else value
+
+
+OWN_REWARD, OWN_SUCCESS, SUCCESS = "env_reward", "env_success", "success"
+"""Keys of info: the first two where a task gives the reward and says what success is."""
+
+
+def own_step(step: Step) -> Step:
+    """Return a step of a task's environment as the environment itself gave it.
+
+    A task's environment (``planning.task_env``) has the task's reward and success, and keeps the
+    environment's own in ``info``. A step of another environment is returned unchanged.
+    """
+    if OWN_REWARD not in step.info:
+        return step
+    info = {k: v for k, v in step.info.items() if k.removeprefix("_") not in (SUCCESS, OWN_REWARD)}
+    for mark in ("", "_"):  # batches mark under "_key" where a key is there
+        if mark + OWN_SUCCESS in info:
+            info[mark + SUCCESS] = info.pop(mark + OWN_SUCCESS)
+    return replace(step, reward=np.asarray(step.info[OWN_REWARD], np.float32), info=info)
+
+
+@dataclass(frozen=True, slots=True)
+class LastCall:
+    """The last call of n environments, and how it ended; RUNNING where it has not."""
+
+    skill: Array  # (n,) int64, its place in the hierarchy's list; −1: the episode has just begun
+    why: Array  # (n,) int8, ``CallEnd`` it ended
+    succeeded: Array  # (n,) bool: by the skill's success(), where it has none by its own end
+
+
+# Policies ---------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class World:
+    """The state of all N environments while policies act in them."""
+
+    rng: np.random.Generator | None = None
+    """The source of chance for policies that sample."""
+    age: Array | None = None
+    """(N,), steps of the episodes so far, for messages."""
+    last_action: Array | None = None
+    """(N, …), the last actions of the environments; None: nobody needs them."""
+    overridden: Array | None = None
+    """(N,) bool, set where a reflex acts."""
+    trace: Any = None
+    """Where those who learn write what they choose, ``write(rows, **columns)``; None: nowhere."""
+
+
+@dataclass(slots=True)
+class Turn:
+    """The way to act in k of these environments."""
+
+    world: World
+    mask: Array | None = None
+    """(k, A) bool, what is allowed; None: all."""
+    goal: Array | None = None
+    """(k, *goal_shape), what the call is for; None: the policy has no goals."""
+    greedy: bool = True
+    """Else it samples."""
+
+    def some(self, at: Array) -> Turn:
+        """Return the turn of some of these rows."""
+        mask, goal = self.mask, self.goal
+        return Turn(
+            self.world,
+            None if mask is None else mask[at],
+            None if goal is None else goal[at],
+            self.greedy,
+        )
+
+
+class Policy:
+    """Acts in some of N environments; the base of all that do, for those that remember nothing."""
+
+    watches = False
+    """``observe`` has something to notice."""
+    restricts = False
+    """It may not start everywhere."""
+    fresh_calls = False
+    """Each call with a goal begins with a fresh memory."""
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of n environments in which it has not acted yet."""
+        return {}
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, …) in environments ``rows`` (k,); ``obs`` and ``turn`` are of these.
+
+        Args:
+            memory: of all N environments; changed in place.
+        """
+        raise NotImplementedError
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """Notice a step of environments ``rows`` (k,); ``memory`` is changed in place."""
+
+    def startable(self, obs: Array) -> Array:
+        """Return where it may start, (k,) bool, for observations (k, …)."""
+        return np.ones(len(obs), bool)
+
+    def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array | bool:
+        """Return where it cannot go on, (k,) bool."""
+        return False
+
+    def redraws(self, greedy: bool) -> bool:
+        """Return whether it may choose otherwise where it is asked the same again."""
+        return not greedy
+
+    def values(self) -> dict[str, Any]:
+        """Return what numbers in its memory may be, by dotted name: a range, or has ``contains``.
+
+        Of what users remember nothing is known.
+        """
+        return {}
+
+
+class Around(Policy):
+    """A policy that changes what another one sees or does; the base of combinators."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.watches = policy.watches
+        self.restricts = policy.restricts
+        self.fresh_calls = policy.fresh_calls
+
+    def start(self, n: int) -> Memory:
+        """As of the policy."""
+        return self.policy.start(n)
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """As of the policy."""
+        return self.policy.act(memory, rows, obs, turn)
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """As of the policy."""
+        self.policy.observe(memory, rows, step)
+
+    def startable(self, obs: Array) -> Array:
+        """As of the policy."""
+        return self.policy.startable(obs)
+
+    def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array | bool:
+        """As of the policy."""
+        return self.policy.stuck(memory, rows, obs)
+
+    def redraws(self, greedy: bool) -> bool:
+        """As of the policy."""
+        return self.policy.redraws(greedy)
+
+    def values(self) -> dict[str, Any]:
+        """As of the policy."""
+        return self.policy.values()
+
+
+Asks: TypeAlias = Callable[[Callable[..., Any], Any, Array, str, str], Array]
+"""How functions of users are asked: of a function, a step or observations, the environments (k,)
+that they are of, the skill's path and its name: what it answers, (k,) bool."""
+
+
+def observed(obs: Array) -> str:
+    """Return an observation for a message, in one line, its middle left out where it is long."""
+    text = " ".join(np.array2string(obs, precision=3, threshold=20).split())
+    return text if len(text) <= 200 else f"{text[:100]} … {text[-100:]}"
+
+
+# Memories ---------------------------------------------------------------------------------------
+
+
+def put(memory: Memory, rows: Array, values: Memory) -> None:
+    """Write the memory of environments ``rows`` (k,) in place."""
+    for k, v in values.items():
+        if isinstance(v, dict):
+            put(memory[k], rows, v)
+        else:
+            memory[k][rows] = v
+
+
+def take(memory: Memory, rows: Array) -> Memory:
+    """Return a copy of the memory of environments ``rows`` (k,)."""
+    return {k: take(v, rows) if isinstance(v, dict) else v[rows] for k, v in memory.items()}
+
+
+def restart(policy: Policy, memory: Memory, rows: Array) -> None:
+    """Start new episodes in environments ``rows`` (k,): nothing of earlier ones is remembered."""
+    put(memory, rows, policy.start(len(rows)))
+
+
+def flat(memory: Memory, prefix: str = "") -> dict[str, Array]:
+    """Return the arrays of a memory, the same ones, by dotted names."""
+    found: dict[str, Array] = {}
+    for k, v in memory.items():
+        found |= flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v}
+    return found
+
+
+def nested(like: Memory, arrays: Mapping[str, Array], prefix: str = "") -> Memory:
+    """Return arrays by dotted names as a memory with the names of ``like``; undoes ``flat``."""
+    return {
+        k: nested(v, arrays, f"{prefix}{k}.") if isinstance(v, dict) else arrays[prefix + k]
+        for k, v in like.items()
+    }

@@ -1,0 +1,505 @@
+"""The life of a call, in one place: which skill acts in each environment, and until when.
+
+A ``Hierarchy`` remembers, for each environment:
+
+- ``skill``: the running one, −1 where no call has started in the episode;
+- ``elapsed``: steps of its call; ``limit``: the length that was chosen, where one is;
+- ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
+- ``goal``: by the place of a skill with goals, that of its latest call;
+- by the place of each skill what its policy remembers; ``selector`` and ``guide``: the same;
+- ``chances``: how likely the guide's latest choices were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .core import (
+    EPISODE,
+    INTERRUPTED,
+    LIMIT,
+    OWN,
+    RUNNING,
+    Array,
+    Asks,
+    CallEnd,
+    LastCall,
+    Memory,
+    Policy,
+    Step,
+    Turn,
+    end_with_episode,
+    observed,
+    own_step,
+    part_of,
+    put,
+    take,
+)
+from .errors import SkillError
+from .leaves import Ready
+from .parts import GOAL, joined
+
+SKILL = "skill"
+"""The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
+TRIES = 16
+"""The most goals that are chosen for a call, where those before hold already."""
+
+
+@dataclass
+class Skill:
+    """A skill of a hierarchy: its policy, and when calls of it start and end."""
+
+    name: str
+    path: str
+    """Its name in messages."""
+    policy: Policy
+    limit: int | None = None
+    """Steps after which a call is cut; None: never."""
+    max_steps: int | None = None
+    """Of these the skill's own: its functions see that it is ``timed_out``."""
+    initiation: Callable[..., Any] | None = None
+    termination: Callable[..., Any] | None = None
+    success: Callable[..., Any] | None = None
+    goals: Any = None
+    """``start``, ``fitted`` and ``hold`` goals (see ``Goals``); None: it has none."""
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """When the selector ends a call (Sutton, Precup & Singh 1999, sec. 4)."""
+
+    worth: Callable[[Array], Array]
+    """From observations (n, …), the value of each skill and last of a new decision, (n, S + 1), in
+    deviations of the return."""
+    margin: float
+    """How much more a new decision must be worth, in the same unit."""
+    critic: Any = None
+    """The trained critic, if there is one."""
+
+
+@dataclass(frozen=True)
+class ActiveGuide:
+    """A ready selector that is asked wherever a selector decides."""
+
+    selector: Any
+    restricts: bool = True
+    """Only what it may choose is allowed."""
+    tells: bool = False
+    """Record its action probabilities for the KL penalty."""
+    decides: bool = False
+    """It is the selector itself."""
+
+
+NEVER = np.iinfo(np.int64).max
+
+
+class Hierarchy(Policy):
+    """Skills in calls, and the selector that starts them where a call has ended.
+
+    A choice is a number: of a skill, or of a skill and one of the ``lengths``; where skills have
+    goals, a record of such a number and a goal for each of them, by name.
+
+    Args:
+        selector: chooses; None: the caller does, by ``begin``.
+        skills: in order.
+        ask: how functions of users are asked.
+        lengths: that are chosen from together with skills; (): none is chosen.
+        guide: with a ``Ready``: restricts the choices, or only tells what it would choose.
+        interruption: when the selector cuts a call; None: never.
+        call_goals: ``join`` makes of observations, running skills and their goals what the critic
+            sees; None: no skill has goals.
+        fresh_calls: it is a skill that has goals: selector and guide see them beside observations,
+            the skills do not, and each of its calls begins with a fresh memory.
+        greedy: its skills are; else they sample.
+        greedy_selector: its selector is, where its caller acts greedily; else it samples.
+    """
+
+    watches = True
+
+    def __init__(
+        self,
+        selector: Policy | None,
+        skills: Sequence[Skill],
+        ask: Asks,
+        *,
+        lengths: tuple[int, ...] = (),
+        guide: ActiveGuide | None = None,
+        interruption: Interruption | None = None,
+        call_goals: Any = None,
+        fresh_calls: bool = False,
+        greedy: bool = True,
+        greedy_selector: bool = True,
+    ) -> None:
+        self.selector = selector
+        self.skills = tuple(skills)
+        self.lengths = lengths
+        self.guide = guide
+        self.fresh_calls = fresh_calls
+        self._ask = ask
+        self._interruption = interruption
+        self._call_goals = call_goals
+        self._greedy = greedy
+        self._greedy_selector = greedy_selector
+        self._each = max(1, len(lengths))
+        self.choices = len(self.skills) * self._each
+        """The number of choices: the first skill with each length, then the next skill."""
+        self.restricts = any(s.initiation or s.policy.restricts for s in self.skills)
+        self._limits = np.array([NEVER if s.limit is None else s.limit for s in self.skills])
+        self._asked = [
+            i for i, s in enumerate(self.skills) if s.policy.watches or s.termination is not None
+        ]
+        self.goals = {i: s.goals for i, s in enumerate(self.skills) if s.goals is not None}
+        """The goals of skills that have some, by their place in the list."""
+        self._fresh = np.array(
+            [s.goals is not None and s.policy.fresh_calls for s in self.skills], bool
+        )
+        ready = {"selector": selector, "guide": None if guide is None else guide.selector}
+        self._ready = {name: who for name, who in ready.items() if isinstance(who, Ready)}
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of n environments whose episodes start: no call has started."""
+        memory: Memory = {
+            "skill": np.full(n, -1),
+            "elapsed": np.zeros(n, np.int64),
+            "end": np.full(n, EPISODE, np.int8),
+        }
+        if self.lengths:
+            memory["limit"] = np.zeros(n, np.int64)
+        if self.goals:
+            memory["goal"] = {str(i): goals.start(n) for i, goals in self.goals.items()}
+        memory |= {str(i): skill.policy.start(n) for i, skill in enumerate(self.skills)}
+        if self.selector is not None:
+            memory["selector"] = self.selector.start(n)
+        if self.guide is not None:
+            memory["guide"] = self.guide.selector.start(n)
+            memory["chances"] = np.zeros((n, self.choices), np.float32)
+        return memory
+
+    # Acting -------------------------------------------------------------------------------------
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, …) in environments ``rows`` (k,), after decisions where calls ended.
+
+        Args:
+            memory: of all environments.
+            obs: (k, …).
+            turn: its mask are actions that the environments allow. Networks keep to it; policies
+                made elsewhere may take another action.
+        """
+        ended = np.flatnonzero(memory["end"][rows] != RUNNING)
+        if len(ended) == len(rows):
+            self._decide(memory, rows, obs, turn)
+        elif len(ended):
+            self._decide(memory, rows[ended], obs[ended], turn.some(ended))
+        running, actions = memory["skill"][rows], None
+        own = Turn(turn.world, turn.mask, None, self._greedy)
+        for i, skill in enumerate(self.skills):
+            mine = np.flatnonzero(running == i)
+            if not len(mine):
+                continue
+            every = len(mine) == len(rows)
+            part, at = own if every else own.some(mine), rows if every else rows[mine]
+            part.goal = self.goal_of(memory, i, at)
+            some = skill.policy.act(memory[str(i)], at, obs if every else obs[mine], part)
+            if every:
+                return some
+            if actions is None:
+                actions = np.zeros((len(rows), *some.shape[1:]), some.dtype)
+            actions[mine] = some
+        assert actions is not None, "no call runs"
+        return actions
+
+    def _decide(
+        self, memory: Memory, rows: Array, obs: Array, turn: Turn, tries: int = TRIES
+    ) -> None:
+        """Choose in environments ``rows`` (k,), and start the calls.
+
+        A call whose goal holds already ends at no step, and is no decision: a selector that samples
+        chooses again. After the last of its ``tries`` the call runs; so does that of a selector
+        that would choose the same again.
+        """
+        world, selector = turn.world, self.selector
+        may = self.mask(obs, None if world.age is None else world.age[rows])
+        assert selector is not None, "nothing chooses"
+        seen = obs
+        if self.fresh_calls:
+            assert turn.goal is not None
+            seen = joined(obs, turn.goal)
+        if self.guide is not None:
+            may = self.may_start(obs) if may is None else may
+            chances = self.guide.selector.chances(memory["guide"], rows, seen, may)
+            memory["chances"][rows] = chances
+            may = chances > 0.0 if self.guide.restricts else may
+        how = Turn(world, may, None, turn.greedy and self._greedy_selector)
+        redraws = bool(self.goals) and tries > 1 and selector.redraws(how.greedy)
+        before = take(memory["selector"], rows) if redraws else {}
+        choice = np.asarray(selector.act(memory["selector"], rows, seen, how))
+        if choice.dtype.fields is None:
+            self.begin(memory, rows, choice)
+        else:
+            self.begin(memory, rows, choice[SKILL], self.goals_in(choice, obs, "the selector"))
+        if redraws and len(again := np.flatnonzero(self._holds(memory, rows, obs))):
+            put(memory["selector"], rows[again], take(before, again))
+            self._decide(memory, rows[again], obs[again], turn.some(again), tries - 1)
+
+    def begin(
+        self,
+        memory: Memory,
+        rows: Array,
+        choice: Array,
+        goals: Mapping[int, Array] | None = None,
+    ) -> None:
+        """Start the calls of ``choice`` (k,) in environments ``rows`` (k,).
+
+        A skill that is called again at once, in the same episode, goes on with its memory; after
+        another skill's call, or in a new episode, it starts with a fresh one. So does a hierarchy
+        that has goals, in each call.
+
+        Args:
+            goals: by the places of skills that have goals, (k, *goal_shape), checked; they count
+                where the skill is chosen. None: no chosen skill has goals.
+
+        Raises:
+            SkillError: a chosen skill has goals, and there is none for it.
+        """
+        skill = self.skill_of(choice)
+        for i in self.goals:
+            mine = np.flatnonzero(skill == i)
+            if not len(mine):
+                continue
+            if goals is None or i not in goals:
+                raise SkillError(
+                    f"skill {self.skills[i].path!r} has goals (goal_space), but was called without "
+                    f"one: choose it with a goal, ({self.skills[i].name!r}, goal)"
+                )
+            memory["goal"][str(i)][rows[mine]] = goals[i][mine]
+        if self.lengths:
+            memory["limit"][rows] = np.array(self.lengths)[choice % self._each]
+        fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
+        memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
+        for i, own in enumerate(self.skills):
+            if memory[str(i)] and len(mine := rows[fresh & (skill == i)]):
+                put(memory[str(i)], mine, own.policy.start(len(mine)))
+
+    def _holds(self, memory: Memory, rows: Array, obs: Array) -> Array:
+        """Return where the goals of calls that start in ``obs`` (k, …) hold already, (k,) bool."""
+        holds = np.zeros(len(rows), bool)
+        for i, goals in self.goals.items():
+            if len(mine := np.flatnonzero(memory["skill"][rows] == i)):
+                holds[mine] = goals.hold(obs[mine], memory["goal"][str(i)][rows[mine]])
+        return holds
+
+    def goals_in(self, choice: Array, obs: Array, who: str) -> dict[int, Array]:
+        """Return the goals of choices (k,) with goals, checked, for ``begin``.
+
+        Args:
+            obs: (k, …), where the calls start.
+            who: whose choices they are, for messages.
+
+        Raises:
+            SkillError: a goal is out of its space.
+        """
+        skill, found = self.skill_of(choice[SKILL]), dict[int, Array]()
+        for i, goals in self.goals.items():
+            mine = np.flatnonzero(skill == i)
+            if len(mine):
+                found[i] = np.array(choice[GOAL][self.skills[i].name])
+                found[i][mine] = goals.fitted(obs[mine], found[i][mine], who)
+        return found
+
+    def skill_of(self, choice: Array) -> Array:
+        """Return the skills that choices (k,) are of."""
+        return choice // self._each
+
+    def goal_of(self, memory: Memory, i: int, rows: Array) -> Array | None:
+        """Return the goals of skill ``i`` in ``rows`` (k,); None: it has none."""
+        return memory["goal"][str(i)][rows] if i in self.goals else None
+
+    # Where skills may start ---------------------------------------------------------------------
+
+    def mask(self, obs: Array, age: Array | None = None) -> Array | None:
+        """Return the allowed choices, (k, choices) bool; None: all, everywhere.
+
+        Args:
+            age: (k,), steps of the episodes so far, for messages.
+
+        Raises:
+            SkillError: in some observation no skill may start.
+        """
+        if not self.restricts:
+            return None
+        may = self.may_start(obs)
+        if not may.any(axis=1).all():
+            row = int(np.flatnonzero(~may.any(axis=1))[0])
+            names = ", ".join(repr(skill.path) for skill in self.skills)
+            where = observed(obs[row])
+            where += "" if age is None else f", after {int(age[row])} steps of the episode"
+            raise SkillError(
+                f"no skill may start in observation {where}: the initiation() of {names} is False "
+                "there. Let at least one start everywhere"
+            )
+        return may
+
+    def may_start(self, obs: Array) -> Array:
+        """Return the choices whose skill may start, (k, choices); perhaps none somewhere."""
+        may, rows = np.empty((len(obs), len(self.skills)), bool), np.arange(len(obs))
+        for i, skill in enumerate(self.skills):
+            may[:, i] = skill.policy.startable(obs) if skill.policy.restricts else True
+            if skill.initiation is not None:
+                may[:, i] &= self._ask(skill.initiation, obs, rows, skill.path, "initiation")
+        return may.repeat(self._each, axis=1)
+
+    def startable(self, obs: Array) -> Array:
+        """Return where some skill may start, (k,) bool."""
+        return np.asarray(self.may_start(obs).any(axis=1))
+
+    def guided(self, memory: Memory, rows: Array, may: Array) -> Array:
+        """Return which choices (k, choices) the guide leaves, as far as is known before it acts."""
+        if self.guide is None or not self.guide.restricts:
+            return may
+        left: Array = self.guide.selector.ahead(memory["guide"], rows, may)
+        return left
+
+    def allowed(self, memory: Memory, rows: Array, obs: Array) -> Array | None:
+        """Return the choices that may be made next in environments ``rows`` (k,), (k, choices).
+
+        Nothing changes: of a guide, only what is known before it sees ``obs`` (k, …) counts. None:
+        all, always. Where none is left, all are True.
+        """
+        if not self.restricts and self.guide is None:
+            return None
+        may = self.guided(memory, rows, self.may_start(obs))
+        return may | ~may.any(axis=1, keepdims=True)
+
+    def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array:
+        """(k,) bool, the selector must decide, but no skill may start; its own call ends there."""
+        stuck, end = np.zeros(len(rows), bool), memory["end"][rows]
+        waits = np.flatnonzero((end != RUNNING) & (end != EPISODE))
+        if len(waits):
+            stuck[waits] = ~self.startable(obs[waits])
+        return stuck
+
+    def check_lengths(self, memory: Memory, longest: int) -> None:
+        """Raise a SkillError where a call has run for ``longest`` steps: nothing may end it."""
+        steps = memory["elapsed"]
+        if steps.max() >= longest:
+            row = int(steps.argmax())
+            raise SkillError(
+                f"skill {self.skills[memory['skill'][row]].path!r} has run for {steps[row]:,} "
+                f"steps in environment {row}, and neither its termination() nor the episode's end "
+                "has come: give it max_steps, or the hierarchy call_steps"
+            )
+
+    # After a step -------------------------------------------------------------------------------
+
+    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
+        """Notice a step of environments ``rows`` (k,): ``end`` says where calls ended, and why.
+
+        Args:
+            step: of these environments; ``elapsed`` counts as the caller does; each skill sees the
+                time of its own call.
+        """
+        memory["elapsed"][rows] += 1
+        elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
+        end = np.zeros(len(rows), np.int8)
+        if self.lengths:
+            end[elapsed >= memory["limit"][rows]] = LIMIT
+        end[elapsed >= self._limits[running]] = LIMIT
+        own = own_step(step)
+        for i in self._asked:
+            mine = np.flatnonzero(running == i)
+            if len(mine):
+                self._observe_skill(memory, i, rows, mine, elapsed, own, end)
+        if self._interruption is not None:
+            self._interrupt(self._interruption, memory, rows, step, end)
+        end_with_episode(end, step.terminated | step.truncated)
+        memory["end"][rows] = end
+        if self._ready:
+            succeeded = self._succeeded(memory, rows, own, running, elapsed, end)
+            for name, who in self._ready.items():
+                who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
+
+    def _observe_skill(
+        self,
+        memory: Memory,
+        i: int,
+        rows: Array,
+        mine: Array,
+        elapsed: Array,
+        step: Step,
+        end: Array,
+    ) -> None:
+        """Let skill ``i`` notice a step in ``rows[mine]``; where its call ends, set ``end``."""
+        skill, at = self.skills[i], rows[mine]
+        part = self._seen_by(memory, i, rows, mine, elapsed, step)
+        if skill.policy.watches:
+            skill.policy.observe(memory[str(i)], at, part)
+            if skill.policy.restricts:
+                end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
+        if skill.termination is not None:
+            end[mine[self._ask(skill.termination, part, at, skill.path, "termination")]] = OWN
+
+    def _seen_by(
+        self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step
+    ) -> Step:
+        """Return a step as skill ``i`` sees it in ``rows[mine]``."""
+        goal, limit = self.goal_of(memory, i, rows[mine]), self.skills[i].max_steps
+        return part_of(step, elapsed[mine], mine, limit, goal)
+
+    def _interrupt(
+        self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
+    ) -> None:
+        """End calls where a new decision is worth clearly more, in place.
+
+        What a call is worth is that of its skill with its goal.
+        """
+        mine = np.flatnonzero(end == RUNNING)
+        if not len(mine):
+            return
+        rows, obs, n = rows[mine], step.next_obs[mine], len(self.skills)
+        running, seen = memory["skill"][rows], obs
+        if self.fresh_calls:
+            seen = joined(obs, step.goal[mine])
+        if self._call_goals is not None:
+            goals = {i: memory["goal"][str(i)][rows] for i in self.goals}
+            seen = self._call_goals.join(seen, running, goals)
+        worth = how.worth(seen)
+        # Where no skill could be called, a new decision is worth nothing.
+        again = np.where(self.startable(obs), worth[:, n], -np.inf)
+        end[mine[again - worth[np.arange(len(rows)), running] > how.margin]] = INTERRUPTED
+
+    def _succeeded(
+        self, memory: Memory, rows: Array, step: Step, running: Array, elapsed: Array, end: Array
+    ) -> Array:
+        """(k,) bool: the calls that are over have succeeded.
+
+        By the skill's ``success``; of a skill without one, if its own termination ended the call.
+        """
+        found: Array = np.array(end == OWN)
+        for i, skill in enumerate(self.skills):
+            if skill.success is None:
+                continue
+            over = np.flatnonzero((running == i) & (end != RUNNING))
+            if len(over):
+                part = self._seen_by(memory, i, rows, over, elapsed, step)
+                found[over] = self._ask(skill.success, part, rows[over], skill.path, "success")
+        return found
+
+    def values(self) -> dict[str, Any]:
+        """Return what numbers in its memory may be, by dotted name."""
+        found: dict[str, Any] = {
+            "skill": range(-1, len(self.skills)),
+            "elapsed": range(2**31),
+            "end": range(len(CallEnd)),
+        }
+        if self.lengths:
+            found["limit"] = range(max(self.lengths) + 1)
+        found |= {f"goal.{i}": goals for i, goals in self.goals.items()}
+        parts = {str(i): skill.policy for i, skill in enumerate(self.skills)}
+        for name, part in {**parts, **self._ready}.items():
+            found |= {f"{name}.{k}": v for k, v in part.values().items()}
+        return found
