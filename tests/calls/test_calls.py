@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from calls.cases import BY_HAND, LEFT, SEEN, ZIGZAG, Case, LevelCase, SkillCase, cases
 from calls.reference import Call, Moment, calls, episode, moments_of
-from calls.users import GAMMA, SEED, USERS, Got, Played
+from calls.users import GAMMA, SEED, USERS, Got, Played, plain
 from hypothesis import HealthCheck, given, settings
 from reference_calls import T, scripted, seeds_of
 
@@ -28,16 +29,27 @@ from skillweave.types import Array
 
 def compare(case: Case, played: Played) -> list[list[Moment]]:
     """Every step is the reference's; returns the reference's episodes."""
+
+    def wanted(seed: int, steps: list[Got]) -> list[Moment]:
+        return episode(case, seed, None if played.chooses else choices_of(case.level, steps))
+
+    return compare_with(wanted, played)
+
+
+def compare_with(
+    episode_of: Callable[[int, list[Got]], list[Moment]], played: Played
+) -> list[list[Moment]]:
+    """The same; ``episode_of``: from a seed, and the steps of the user."""
     found = []
     assert played.episodes
     for seed, steps in played.episodes:
-        wanted = episode(case, seed, None if played.chooses else choices_of(case.level, steps))
+        wanted = episode_of(seed, steps)
         assert len(steps) <= len(wanted)
         for t, (got, want) in enumerate(zip(steps, wanted, strict=False)):
             where = f"step {t} of the episode from seed {seed}"
             agree(played, got.acted, want.acted, f"{where}, after acting")
-            assert got.action == want.action, where
-            assert got.next_obs == want.next_obs.tolist(), where
+            assert got.action == plain(want.action), where
+            assert got.next_obs == plain(want.next_obs), where
             assert got.reward == want.reward, where
             assert got.overridden in (None, want.overridden), where
             if got.observed:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -44,8 +44,8 @@ GAMMA = 0.5  # so that sums are exact
 class Got:
     """One step, as a user made it; memories by name, of this environment."""
 
-    action: int
-    next_obs: list[float]
+    action: Any
+    next_obs: Any
     reward: float
     acted: dict[str, Any]
     observed: dict[str, Any] = field(default_factory=dict)
@@ -73,6 +73,12 @@ class Played:
     """The case's selector chooses; else the user does, and the reference follows it."""
 
 
+def plain(x: Any) -> Any:
+    """An observation or an action as numbers, lists and dicts."""
+    names = x.keys() if isinstance(x, dict) else np.asarray(x).dtype.names
+    return {k: plain(x[k]) for k in names} if names else np.asarray(x).tolist()
+
+
 class Watch:
     """Writes down the steps of N environments.
 
@@ -96,7 +102,7 @@ class Watch:
             remembered = {name: v[row].tolist() for name, v in memory.items()}
             overridden = remembered.pop("overridden", None)
             got = Got(
-                int(action[k]), raw.next_obs[k].tolist(), float(raw.reward[k]), remembered,
+                plain(action[k]), plain(raw.next_obs[k]), float(raw.reward[k]), remembered,
                 overridden=overridden,
             )  # fmt: skip
             self._open[i].append(got)
@@ -187,7 +193,7 @@ def decisions(case: Case) -> Played:
     """A selector that learns, above skills that can act."""
     guide, selector = _first(case)
     skills = skill_set(case.level, policies_of(case.level))
-    return _collect(
+    return collected(
         case, lambda: HierarchyCollector(engine_of(case), selector, skills, True, guide), "", {}
     )  # fmt: skip
 
@@ -226,7 +232,7 @@ def joint(case: Case) -> Played:
         how = {"guide": guide, "learners": learners, "margins": margins}
         return HierarchyCollector(engine_of(case), selector, skills, **how)
 
-    return _collect(case, make, "selector", learners)
+    return collected(case, make, "selector", learners)
 
 
 def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
@@ -239,7 +245,7 @@ def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
 
 
 def _rounds(
-    case: Case, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
+    case: Any, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
     learners: dict[str, Any],
 ) -> Iterator[Any]:  # fmt: skip
     """What a collector returns, request by request; perhaps another one goes on half way."""
@@ -254,17 +260,17 @@ def _rounds(
         request = Request(
             case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
         )  # fmt: skip
-        collected = collector.collect(
-            replace(request, below=dict.fromkeys(learners, request))
-        )  # fmt: skip
-        assert collected.steps == case.rows * N, "an environment waited"
+        found = collector.collect(replace(request, below=dict.fromkeys(learners, request)))
+        assert found.steps == case.rows * N, "an environment waited"
         watch.observed(np.arange(N), memory_of(collector))
-        yield collected
+        yield found
 
 
-def _collect(
-    case: Case, make: Callable[[], Any], path: str, learners: dict[str, Any]
+def collected(
+    case: Any, make: Callable[[], Any], path: str, learners: dict[str, Any]
 ) -> Played:  # fmt: skip
+    """What a collector does that ``make`` returns; ``path``: of its first selector."""
+
     def memory_of(collector: Any) -> Memory:
         overridden = getattr(collector, "overridden", None)
         more = {} if overridden is None else {"overridden": overridden}
@@ -273,9 +279,9 @@ def _collect(
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
     columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
     finished: list[tuple[float, float]] = []
-    for collected in _rounds(case, watch, make, memory_of, learners):
-        batches = collected.batches
-        finished += map(tuple, collected.episodes[:, [0, 2]].tolist())
+    for found in _rounds(case, watch, make, memory_of, learners):
+        batches = found.batches
+        finished += map(tuple, found.episodes[:, [0, 2]].tolist())
         if path in batches:
             batch = batches[path]
             names = batch.keys() - {"valid", "recurrent_state"}
@@ -354,11 +360,14 @@ def alone(case: Case) -> Played:
 
 
 def evaluated(case: Case) -> Played:
+    return in_evaluation(case, hierarchy(case.level), [11, 12, 13, 14, 15, 16, 17])
+
+
+def in_evaluation(case: Any, policy: Any, seeds: list[int]) -> Played:
     """Whole episodes, in environments of which fewer and fewer act in the end."""
-    seeds = [11, 12, 13, 14, 15, 16, 17]
     watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
     episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
-    for played in play(hierarchy(case.level), episodes, deterministic=case.deterministic):
+    for played in play(policy, episodes, deterministic=case.deterministic):
         assert played.chosen is not None
         assert played.after is not None
         watch.step(played.episode, played.step.action, played.step, played.chosen, True)
@@ -369,13 +378,16 @@ def evaluated(case: Case) -> Played:
 def deployed(case: Case) -> Played:
     """One observation at a time."""
     player = Deployed(hierarchy(case.level), deterministic=case.deterministic)
-    return _one_by_one(case, player, lambda: player.memory)
+    return one_by_one(case, player, lambda: player.memory)
 
 
-def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
+def one_by_one(
+    case: Any, acts: Any, memory: Callable[[], Memory], seeds: Iterable[int] = range(21, 25)
+) -> Played:  # fmt: skip
+    """One observation at a time; ``acts``: of them."""
     found = Played()
     env = case.env()
-    for seed in range(21, 25):
+    for seed in seeds:
         steps: list[Got] = []
         obs, info = env.reset(seed=seed)
         acts.reset()
@@ -384,7 +396,7 @@ def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
             action = acts.act(obs, reward=reward, info=info)
             remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in memory().items()}
             obs, reward, terminated, truncated, info = env.step(action)
-            steps.append(Got(int(action), obs.tolist(), float(np.float32(reward)), remembered))
+            steps.append(Got(plain(action), plain(obs), float(np.float32(reward)), remembered))
             over = terminated or truncated
         found.episodes.append((seed, steps))
     return found
@@ -465,7 +477,7 @@ def exported(case: Case) -> Played:
     ):
         export = write_export(Path(folder), hierarchy(case.level), "walk")
         runner = file.Runner(folder, export.functions)
-        found = _one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
+        found = one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
     found.missing = r"\blimit$|chances$|(selector|guide)\.(skill|why|succeeded)$"
     return found
 
