@@ -6,7 +6,7 @@ Nothing here uses the player, the collectors or the policies that are compared w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,7 @@ from calls.cases import (
 )
 
 from skillweave.collecting.call_end import CallEnd
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Array, Memory
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = CallEnd
 
@@ -33,6 +33,23 @@ def row(x: Any) -> Any:
 def only(x: Any) -> Any:
     """The only one of a batch of one."""
     return {k: only(v) for k, v in x.items()} if isinstance(x, dict) else x[0]
+
+
+@dataclass
+class Shown:
+    """A step as skills and policies see it, in batches of one; of a Dict a dict of these."""
+
+    obs: Any
+    action: Any
+    next_obs: Any
+    reward: Array
+    terminated: Array
+    truncated: Array
+    timed_out: Array
+    elapsed: Array
+    info: dict[str, Any]
+    goal: Any = None
+    """Of the call, where the skill has goals."""
 
 
 @dataclass
@@ -55,6 +72,11 @@ class Moment:
     """The choices that may be made next, as far as is known before the next observation counts."""
     overridden: bool
     """A reflex acted, here or below."""
+
+    @property
+    def over(self) -> bool:
+        """It is the episode's last."""
+        return self.terminated or self.truncated
 
 
 @dataclass
@@ -85,7 +107,7 @@ class Ready:
         given = last if self.kind == "last" else None
         return [int(self.level.by_function(row(obs), given)[0])]
 
-    def watch(self, step: Step, last: tuple[int, int, bool]) -> None:
+    def watch(self, step: Shown, last: tuple[int, int, bool]) -> None:
         self.last = last
         _, why, succeeded = last
         ended = {"success": succeeded, "failure": not succeeded}
@@ -159,7 +181,7 @@ class Life:
             if reflex.condition(row(obs))[0]:
                 self.overridden = True
                 answer: Any = reflex.action
-                action = answer(row(obs))[0] if callable(answer) else answer
+                action = only(answer(row(obs))) if callable(answer) else answer
         return action
 
     def act_skill(self, obs: Array, mask: Array | None) -> Any:
@@ -204,7 +226,7 @@ class Life:
 
     # After a step
 
-    def observe(self, step: Step) -> None:
+    def observe(self, step: Shown) -> None:
         """Notice a step, whose time is the caller's."""
         self.elapsed += 1
         case = self.level.skills[self.skill]
@@ -239,22 +261,21 @@ class Life:
             if who is not None:
                 who.watch(step, (self.skill, self.end, succeeded))
 
-    def watch_skill(self, own: Step) -> None:
+    def watch_skill(self, own: Shown) -> None:
         """Let the policy of the running skill notice a step."""
         policy = policy_of(self.level.skills[self.skill].policy)
         self.part = policy.observe(self.part, own)
 
-    def worth(self, step: Step) -> Array:
+    def worth(self, step: Shown) -> Array:
         """What a critic says of the calls after a step, and last of a new decision."""
         return Worth(self.count).heads(step.next_obs)[0]
 
-    def seen(self, step: Step) -> Step:
+    def seen(self, step: Shown) -> Shown:
         """The step with the time as the running skill counts it."""
         limit = self.level.skills[self.skill].max_steps
         timed_out = limit is not None and self.elapsed >= limit and not step.terminated[0]
-        return Step(
-            step.obs, step.action, step.next_obs, step.reward, step.terminated, step.truncated,
-            np.array([timed_out]), np.array([self.elapsed]), step.info,
+        return replace(
+            step, timed_out=np.array([timed_out]), elapsed=np.array([self.elapsed]), goal=None
         )  # fmt: skip
 
     # What it remembers
@@ -322,7 +343,7 @@ def lived(life: Life, case: Any, seed: int) -> Iterator[Moment]:
         next_obs, reward, terminated, truncated, info = env.step(action)
         over, t = terminated or truncated, t + 1
         truncated = truncated and not terminated  # as engines say it
-        step = Step(
+        step = Shown(
             row(obs), row(action), row(next_obs), np.array([reward], np.float32),
             np.array([terminated]), np.array([truncated]), np.zeros(1, bool), np.array([t]),
             {k: np.array([v]) for k, v in info.items() if k == "t"},

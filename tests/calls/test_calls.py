@@ -53,7 +53,7 @@ def compare_with(
             assert got.reward == want.reward, where
             assert got.overridden in (None, want.overridden), where
             if got.observed:
-                over = played.restarts and (want.terminated or want.truncated)
+                over = played.restarts and want.over
                 after = {"end": CallEnd.EPISODE} if over else want.observed
                 agree(played, got.observed, after, f"{where}, after the step")
         found.append(wanted[: len(steps)])
@@ -74,7 +74,7 @@ def agree(played: Played, got: dict[str, Any], want: dict[str, Any], where: str)
 
 def compare_finished(played: Played, found: list[list[Moment]]) -> None:
     """The episodes that are over have the reference's returns and lengths."""
-    over = [moments for moments in found if moments[-1].terminated or moments[-1].truncated]
+    over = [moments for moments in found if moments[-1].over]
     wanted = sorted((sum(m.reward for m in moments), len(moments)) for moments in over)
     assert played.finished is not None
     assert near(sorted(played.finished), wanted)

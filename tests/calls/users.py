@@ -267,9 +267,13 @@ def _rounds(
 
 
 def collected(
-    case: Any, make: Callable[[], Any], path: str, learners: dict[str, Any]
+    case: Any, make: Callable[[], Any], path: str | None, learners: dict[str, Any]
 ) -> Played:  # fmt: skip
-    """What a collector does that ``make`` returns; ``path``: of its first selector."""
+    """What a collector does that ``make`` returns.
+
+    Args:
+        path: of its first selector, whose decisions are kept; None: nobody's are.
+    """
 
     def memory_of(collector: Any) -> Memory:
         overridden = getattr(collector, "overridden", None)
@@ -277,12 +281,12 @@ def collected(
         return collector.memory | more
 
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
-    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    columns: list[list[dict[str, Any]]] | None = [[] for _ in range(N)]
     finished: list[tuple[float, float]] = []
     for found in _rounds(case, watch, make, memory_of, learners):
         batches = found.batches
         finished += map(tuple, found.episodes[:, [0, 2]].tolist())
-        if path in batches:
+        if path in batches and columns is not None:
             batch = batches[path]
             names = batch.keys() - {"valid", "recurrent_state"}
             for t, n in zip(*np.nonzero(batch.valid_rows), strict=True):
@@ -291,7 +295,9 @@ def collected(
                     row["recurrent_state"] = batch["recurrent_state"][n]
                 columns[n].append(row)
     ready = case.level.ready
-    return Played(watch.episodes, None if ready else columns, finished, ready_is_guide=ready)
+    if ready or path is None:
+        columns = None
+    return Played(watch.episodes, columns, finished, ready_is_guide=ready)
 
 
 def leads_to_starts(case: Case) -> Played:
