@@ -434,7 +434,7 @@ class Dice:
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.kind = self.of("box", "box", "several", "one", "named")
-        self.watches = self.of(True, False, False)
+        self.watches = self.of(True, False)
         self.masked = self.kind in ("several", "one") and self.of(True, False)
 
     def of(self, *values: Any) -> Any:
@@ -470,7 +470,7 @@ class Dice:
 
     def skill(self, path: str, depth: int, greedy: bool, starts: bool) -> WorldSkill:
         """A skill; ``starts``: not everywhere."""
-        goal = self.of(None, None, *GOALS)
+        goal = self.of(None, None, None, *GOALS)
         about_calls: dict[str, Any] = {
             "goal": goal,
             "clips": goal == "place" and self.of(True, False),
@@ -488,7 +488,7 @@ class Dice:
         sees, acts = self.of(None, *SEES), self.of(None, *ACTS[self.kind])
         corrects, scale = None, 0.3
         if isinstance(space := own_space(self.kind, acts), Box):
-            corrects = self.of(None, None, "function", *watching)
+            corrects = self.of(None, "function", *watching, *watching)
             scale = self.of(0.3, [0.2, 1.5, 0.5][: space.shape[0]])
         if corrects is not None:
             policy = self.of("network", "recurrent")  # what corrects is learnt
