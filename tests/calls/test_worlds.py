@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from calls.plain_worlds import episode
 from calls.test_calls import compare_finished, compare_with
-from calls.users import Learner, Played, collected, engine_of, in_evaluation, one_by_one
+from calls.users import Learner, Played, collected, engine_of, in_a_loop, in_evaluation, one_by_one
 from calls.worlds import (
     ACTIONS,
     GOALS,
@@ -103,6 +103,10 @@ def trained(world: World, together: bool) -> Played:
 
 
 # Those that act ---------------------------------------------------------------------------------
+
+
+def alone(world: World) -> Played:
+    return in_a_loop(world, made(world).hierarchy().player)
 
 
 def evaluated(world: World) -> Played:
@@ -238,6 +242,7 @@ class User:
 
 
 USERS = {
+    "player": User(alone),
     "decisions": User(decisions, learns="first"),
     "joint": User(joint, learns="all"),
     "evaluation": User(evaluated),

@@ -334,9 +334,14 @@ class Anything:
 
 
 def alone(case: Case) -> Played:
+    level = case.level
+    skills = skill_set(level, policies_of(level))
+    return in_a_loop(case, Player(skills, selector_of(level), guide_of(level)))
+
+
+def in_a_loop(case: Any, player: Player) -> Played:
     """The player in a plain loop."""
-    level, engine = case.level, engine_of(case)
-    player = Player(skill_set(level, policies_of(level)), selector_of(level), guide_of(level))
+    engine = engine_of(case)
     watch, rows = Watch(seeds_of(SEED, N)), np.arange(N)
     memory, age = player.start(N), np.zeros(N, np.int64)
     overridden = np.zeros(N, bool)

@@ -287,7 +287,7 @@ class WorldSkill:
 
         whole, least = self.stops == "whole", -0.9 if self.stops == "often" else 0.4
         declared = {
-            "initiation": (self.starts, 0.0, lambda obs: leaves(obs, "obs")),
+            "initiation": (self.starts, 0.2, lambda obs: leaves(obs, "obs")),
             "termination": (self.stops, least, lambda step: about(step, whole)),
             "success": (self.wins, 0.0, lambda step: about(step, True)),
         }
@@ -448,7 +448,7 @@ class Dice:
         if selector == "automaton" and not greedy:  # it would draw its choices
             selector = "function"
         greedy_skills = self.of(True, True, False)
-        confined = "/" in path and learns and self.of(True, False)  # it may get stuck
+        confined = "/" in path and learns and self.of(True, True, False)  # it may get stuck
         skills = tuple(
             self.skill(
                 f"{path}/s{i}", depth * (i > 0), greedy_skills,
