@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from calls.reference import RUNNING, Life, Moment, Shown, lived, only, row
+from calls.reference import EPISODE, RUNNING, Life, Moment, Shown, lived, only, row
 from calls.worlds import (
     ACTIONS,
     Chooser,
@@ -275,7 +275,8 @@ class WorldLife(Life):
         super().observe(step)
         if self.running.below is not None:
             nothing = not any(self.startable(self.running.below, only(step.next_obs)))
-            self.course.seen["stuck"] += nothing and self.part.end != RUNNING
+            waits = self.part.end not in (RUNNING, EPISODE)
+            self.course.seen["stuck"] += nothing and waits and not self.limited
 
     def seen(self, step: Shown) -> Shown:
         return replace(super().seen(step), goal=None if self.goal is None else row(self.goal))

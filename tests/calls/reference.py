@@ -230,11 +230,7 @@ class Life:
         """Notice a step, whose time is the caller's."""
         self.elapsed += 1
         case = self.level.skills[self.skill]
-        most = case.call_steps or self.level.call_steps
-        limits = (self.limit, case.max_steps, most if isinstance(most, int) else None)
-        self.end = RUNNING
-        if any(limit is not None and self.elapsed >= limit for limit in limits):
-            self.end = LIMIT
+        self.end = LIMIT if self.limited else RUNNING
         own = self.seen(step)
         next_obs = only(step.next_obs)
         if isinstance(self.part, Life):
@@ -260,6 +256,14 @@ class Life:
         for who in (self.guide, self.ready):
             if who is not None:
                 who.watch(step, (self.skill, self.end, succeeded))
+
+    @property
+    def limited(self) -> bool:
+        """The running call has reached a limit."""
+        case = self.level.skills[self.skill]
+        most = case.call_steps or self.level.call_steps
+        limits = (self.limit, case.max_steps, most if isinstance(most, int) else None)
+        return any(limit is not None and self.elapsed >= limit for limit in limits)
 
     def watch_skill(self, own: Shown) -> None:
         """Let the policy of the running skill notice a step."""

@@ -110,7 +110,7 @@ def alone(world: World) -> Played:
 
 
 def evaluated(world: World) -> Played:
-    return in_evaluation(world, made(world).hierarchy(), [11, 12, 13, 14, 15])
+    return in_evaluation(world, made(world).hierarchy(), [11, 12, 13, 14])
 
 
 def deployed(world: World) -> Played:
@@ -190,7 +190,7 @@ def folder_of(world: World) -> Iterator[tuple[str, Export]]:
 def exported(world: World) -> Played:
     with folder_of(world) as (folder, export):
         runner = runner_file.Runner(folder, export.functions)
-        return one_by_one(world, runner, lambda: remembered_by(runner.root), range(31, 34))
+        return one_by_one(world, runner, lambda: remembered_by(runner.root), range(31, 37))
 
 
 def remembered_by(part: Any) -> dict[str, Any]:
@@ -204,7 +204,7 @@ def remembered_by(part: Any) -> dict[str, Any]:
 def read_again(world: World) -> Played:
     with folder_of(world) as (folder, export):
         policy = sw.load_policy(folder, code=export.functions)
-        return in_evaluation(world, policy, [41, 42, 43])
+        return in_evaluation(world, policy, [41, 42])
 
 
 def anything(world: World) -> bool:

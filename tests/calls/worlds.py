@@ -418,7 +418,7 @@ class World:
     rows: int
     resumed: bool
     deterministic = True
-    steps = 20
+    steps = 16
 
     @property
     def env(self) -> Any:
@@ -434,7 +434,7 @@ class Dice:
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.kind = self.of("box", "box", "several", "one", "named")
-        self.watches = self.of(True, False)
+        self.watches = self.of(True, False, False)
         self.masked = self.kind in ("several", "one") and self.of(True, False)
 
     def of(self, *values: Any) -> Any:
@@ -482,7 +482,8 @@ class Dice:
         }
         if depth and self.of(True, True, False):
             below = self.level(path, depth - 1, greedy)
-            return WorldSkill(path, self.kind, "hierarchy", below, **about_calls)
+            longer = {"max_steps": self.of(None, None, 5), "call_steps": self.of(None, 6)}
+            return WorldSkill(path, self.kind, "hierarchy", below, **about_calls | longer)
         watching = ["watching"] if self.watches and goal is None else []
         policy = self.of("network", "recurrent", "function", *watching)
         sees, acts = self.of(None, *SEES), self.of(None, *ACTS[self.kind])
