@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calls.users import plain
-from calls.worlds import ACTIONS, OBSERVATIONS, as_action, choice_counts, leaves, numbers, width
+from calls.worlds import ACTIONS, OBSERVATIONS, as_action, choice_counts, numbers, width
 
 import skillweave as sw
 from skillweave.export.write import write_export
@@ -143,7 +143,7 @@ def model(seed: int) -> Model:
 
 
 def is_refused(model: Model) -> bool:
-    """Of some choices alone a chunk is asked for scores, also of a function, which returns choices."""
+    """A chunk of some of the choices is asked for scores, which functions do not return."""
     return model.kind == "one" and model.acts == "part" and not model.logits
 
 

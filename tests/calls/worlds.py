@@ -387,18 +387,17 @@ class WorldLevel:
 
     @property
     def machine(self) -> Machine:
-        """The automaton: in its first state goals are fixed, in the other functions give them."""
+        """The automaton: in its first state goals are fixed, in others functions give them."""
         count, free = len(self.skills), self.free[0]
-        states = [[*range(count - 1, -1, -1)], [free, *(k for k in {0, count - 1} if k != free)]]
+        others = [k for k in range(count) if k != free]
+        states = [[*range(count - 1, -1, -1)], [free, *others], [*others[-1:], free]]
 
         def event(step: Step) -> Any:
             return numbers(f"{self.path} event", about(step, True), 1)[:, 0] > 0.3
 
-        arrows = [(0, 1, "event"), (1, 0, "success"), (0, 1, "failure")]
-        return Machine(
-            states, arrows[:2] if len(self.path) % 2 else arrows[1:],
-            {"event": event, "success": "success", "failure": "failure"},
-        )  # fmt: skip
+        arrows = [(0, 1, "event"), (0, 2, "failure"), (1, 0, "success"), (2, 0, "event")]
+        events = {"event": event, "success": "success", "failure": "failure"}
+        return Machine(states, arrows, events)
 
     def goal_in_state(self, state: int, name: str) -> Any:
         """The goal of a skill in a state of the automaton: fixed, or a function."""
@@ -542,8 +541,12 @@ class Network(AgentPolicy):
         self, memory: Memory, obs: Any, mask: Any = None, *, deterministic: bool = True,
         rng: Any = None,
     ) -> Any:  # fmt: skip
-        action, after = self.named(memory, leaves(obs, "obs"), mask, deterministic)
-        return packed(action, self.action_space), after
+        found, after = self.named(memory, leaves(obs, "obs"), mask, deterministic)
+        return self.packed(found), after
+
+    def packed(self, found: Any) -> Array:
+        """What ``named`` returned, as the library has it."""
+        return packed(found, self.action_space)
 
 
 class Chooser(Network):
@@ -574,15 +577,12 @@ class Chooser(Network):
         }
         return (number, goals), after
 
-    def act(
-        self, memory: Memory, obs: Any, mask: Any = None, *, deterministic: bool = True,
-        rng: Any = None,
-    ) -> Any:  # fmt: skip
-        (number, goals), after = self.named(memory, leaves(obs, "obs"), mask, deterministic)
+    def packed(self, found: Any) -> Array:
+        number, goals = found
         choice = blank_choices(self.action_space, number)
         for name, goal in goals.items():
             choice["goal"][name] = packed(goal, GOALS[self.goals[name]])
-        return choice, after
+        return choice
 
 
 class Worths(AgentPolicy):
@@ -607,8 +607,7 @@ class Watching(ScriptedPolicy):
     """
 
     def __init__(self, salt: str, acts: Any) -> None:
-        function = lambda obs: as_action(np.zeros((len(obs), width(acts))), acts)  # noqa: E731
-        super().__init__(function)
+        super().__init__(lambda obs: self.act(self.start(len(obs)), obs)[0])
         self.salt, self.acts = salt, acts
 
     def start(self, n: int) -> Memory:
