@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from calls.plain_worlds import episode
+from calls.reference import Moment
 from calls.test_calls import compare_finished, compare_with
 from calls.users import Learner, Played, collected, engine_of, in_a_loop, in_evaluation, one_by_one
 from calls.worlds import (
@@ -102,6 +104,9 @@ def trained(world: World, together: bool) -> Played:
     return collected(world, make, None, learners if together else {})
 
 
+SEEDS = range(21, 26)
+"""Of episodes; users share them, so that the reference need not play as many."""
+
 # Those that act ---------------------------------------------------------------------------------
 
 
@@ -110,12 +115,12 @@ def alone(world: World) -> Played:
 
 
 def evaluated(world: World) -> Played:
-    return in_evaluation(world, made(world).hierarchy(), [11, 12, 13, 14])
+    return in_evaluation(world, made(world).hierarchy(), [*SEEDS])
 
 
 def deployed(world: World) -> Played:
     player = Player(made(world).hierarchy())
-    return one_by_one(world, player, lambda: player.memory, range(21, 24))
+    return one_by_one(world, player, lambda: player.memory, SEEDS[:3])
 
 
 class Session:
@@ -190,7 +195,7 @@ def folder_of(world: World) -> Iterator[tuple[str, Export]]:
 def exported(world: World) -> Played:
     with folder_of(world) as (folder, export):
         runner = runner_file.Runner(folder, export.functions)
-        return one_by_one(world, runner, lambda: remembered_by(runner.root), range(31, 37))
+        return one_by_one(world, runner, lambda: remembered_by(runner.root), SEEDS)
 
 
 def remembered_by(part: Any) -> dict[str, Any]:
@@ -204,7 +209,7 @@ def remembered_by(part: Any) -> dict[str, Any]:
 def read_again(world: World) -> Played:
     with folder_of(world) as (folder, export):
         policy = sw.load_policy(folder, code=export.functions)
-        return in_evaluation(world, policy, [41, 42])
+        return in_evaluation(world, policy, [*SEEDS[:2]])
 
 
 def anything(world: World) -> bool:
@@ -252,12 +257,17 @@ USERS = {
 }
 
 
+@lru_cache(64)
+def expected(number: int, seed: int, learns: str) -> list[Moment]:
+    return episode(world(number), seed, learns)
+
+
 def check(user: User, world: World) -> None:
     if not user.can_play(world):
         return
     played = user.plays(world)
     played.missing = user.missing
-    wanted = {seed: episode(world, seed, user.learns) for seed, _ in played.episodes}
+    wanted = {s: expected(world.seed, s, user.learns) for s, _ in played.episodes}
     whole = all(moments and moments[-1].over for moments in wanted.values())
     played.episodes = [(seed, steps[: len(wanted[seed])]) for seed, steps in played.episodes]
     found = compare_with(lambda seed, steps: wanted[seed], played)

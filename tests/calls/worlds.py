@@ -636,7 +636,7 @@ def network(skill: WorldSkill) -> Network:
 
 
 def declared_skill(skill: WorldSkill, env: Any) -> sw.Skill:
-    ready: dict[Any, Any] = {
+    acts: dict[Any, Any] = {
         "function": lambda what: sw.from_function(skill.function(what, skill.action_space)),
         "watching": lambda what: watching(skill, what),
     }
@@ -644,9 +644,9 @@ def declared_skill(skill: WorldSkill, env: Any) -> sw.Skill:
     if skill.below is not None:
         policy = declared(skill.below, env)
     elif skill.corrects is not None:
-        policy = sw.Residual(ready[skill.corrects]("base"), skill.scale)
-    elif skill.policy in ready:
-        policy = ready[skill.policy]("policy")
+        policy = sw.Residual(acts[skill.corrects]("base"), skill.scale)
+    elif skill.policy in acts:
+        policy = acts[skill.policy]("policy")
     attributes: dict[str, Any] = {
         name: lambda self, x, said=said: said(x) for name, said in skill.methods.items()
     }
@@ -731,9 +731,17 @@ class Made:
         return {x.critic_path: x.together.margin for x in levels if x.together.interrupt}
 
 
+@functools.lru_cache(4)
+def ready(seed: int) -> tuple[Roles, dict[str, Any]]:
+    """What is ready in a world, for all that play it one after another."""
+    drawn = world(seed)
+    roles = roles_of(declared(drawn.level, drawn.env))
+    return roles, {**ready_policies(roles), **ready_selectors(roles)}
+
+
 def made(world: World) -> Made:
-    roles = roles_of(declared(world.level, world.env))
-    policies: dict[str, Any] = {**ready_policies(roles), **ready_selectors(roles)}
+    roles, policies = ready(world.seed)
+    policies = dict(policies)
     for level in world.level.all:
         path = level.path.partition("/")[2]
         stands = {s.path.partition("/")[2]: network(s) for s in level.skills if s.below is None}
