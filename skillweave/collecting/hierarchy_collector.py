@@ -367,8 +367,8 @@ class HierarchyCollector(Collector):
         # Elsewhere it is called again at once.
         ends = trace.ended | timed_out(trace, skill, elapsed)
         if goal is not None:  # with another goal another trajectory begins
-            other = (goal[1:] != goal[:-1]).reshape(len(goal) - 1, self.num_envs, -1).any(axis=2)
-            ends[:-1] |= other
+            other = goal[1:] != goal[:-1]
+            ends[:-1] |= other.any(axis=tuple(range(2, other.ndim)))
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
         part = level.skill_set.part(level.skills.index(skill))
         batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)

@@ -475,13 +475,13 @@ class _Hierarchy(_Code):  # a selector and its skills; it decides where a call e
                 choice, goals = self.as_selector(lambda: self.decided(may, len(lengths)))
                 skill, length = divmod(int(choice), len(lengths))
                 self.goal = self.fitted(self.skills[skill], goals.get(skill))
-                part = self.policies[skill]
-                if skill != self.skill or (self.goal is not None and isinstance(part, _Hierarchy)):
-                    part.reset()
-                self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
-                self.skill, self.elapsed, self.why = skill, 0, RUNNING
                 if not self.holds(self.skills[skill]["termination"]):
                     break
+            part = self.policies[skill]
+            if skill != self.skill or (self.goal is not None and isinstance(part, _Hierarchy)):
+                part.reset()
+            self.limit = min(lengths[length], self.skills[skill]["limit"] or np.inf)
+            self.skill, self.elapsed, self.why = skill, 0, RUNNING
         action = self.with_goal(lambda: self.policies[self.skill].act(mask))
         for condition, code, fixed in self.entry["reflexes"]:
             if runner.asks(condition, runner.obs):

@@ -103,14 +103,12 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
             DeclarationError: an action is no skill, or the skill may not start there.
         """
         n = self.num_envs
-        goals = None
         if self._hierarchy.goals:
-            choice = self._choices(actions)
+            choice = self._hierarchy.fitted(self._choices(actions), self._obs, "OptionsEnv.step")
             skill = choice[SKILL]
-            goals = self._hierarchy.goals_in(choice, self._obs, "OptionsEnv.step")
         else:
-            skill = self._checked(actions)
-        self._hierarchy.begin(self._memory, self._all, skill, goals)
+            choice = skill = self._checked(actions)
+        self._hierarchy.begin(self._memory, self._all, choice)
         world = World((Seeds(self._seed) / "call" / self._calls).numpy())
         self._calls += 1
         obs = self._obs

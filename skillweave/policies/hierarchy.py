@@ -12,7 +12,7 @@ A ``Hierarchy`` remembers, for each environment:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -192,9 +192,10 @@ class Hierarchy(Policy):
         """
         ended = np.flatnonzero(memory["end"][rows] != RUNNING)
         if len(ended) == len(rows):
-            self._decide(memory, rows, obs, turn)
+            self.begin(memory, rows, self._choice(memory, rows, obs, turn))
         elif len(ended):
-            self._decide(memory, rows[ended], obs[ended], turn.some(ended))
+            at, part = rows[ended], turn.some(ended)
+            self.begin(memory, at, self._choice(memory, at, obs[ended], part))
         running, actions = memory["skill"][rows], None
         own = Turn(turn.world, turn.mask, None, self._greedy)
         for i, skill in enumerate(self.skills):
@@ -213,19 +214,18 @@ class Hierarchy(Policy):
         assert actions is not None, "no call runs"
         return actions
 
-    def _decide(
+    def _choice(
         self, memory: Memory, rows: Array, obs: Array, turn: Turn, tries: int = TRIES
-    ) -> None:
-        """Choose in environments ``rows`` (k,), and start the calls.
+    ) -> Array:
+        """Return choices (k,), with checked goals where skills have some.
 
         A call whose goal holds already ends at no step, and is no decision: a selector that samples
-        chooses again. After the last of its ``tries`` the call runs; so does that of a selector
-        that would choose the same again.
+        chooses again. Its last of ``tries`` counts; so does that of a selector that would choose
+        the same again.
         """
-        world, selector = turn.world, self.selector
+        world, selector, seen = turn.world, self.selector, obs
         may = self.mask(obs, None if world.age is None else world.age[rows])
         assert selector is not None, "nothing chooses"
-        seen = obs
         if self.fresh_calls:
             assert turn.goal is not None
             seen = joined(obs, turn.goal)
@@ -235,16 +235,18 @@ class Hierarchy(Policy):
             memory["chances"][rows] = chances
             may = chances > 0.0 if self.guide.restricts else may
         how = Turn(world, may, None, turn.greedy and self._greedy_selector)
-        redraws = bool(self.goals) and tries > 1 and selector.redraws(how.greedy)
-        before = take(memory["selector"], rows) if redraws else {}
+        before = take(memory["selector"], rows) if self.goals else {}
         choice = np.asarray(selector.act(memory["selector"], rows, seen, how))
         if choice.dtype.fields is None:
-            self.begin(memory, rows, choice)
-        else:
-            self.begin(memory, rows, choice[SKILL], self.goals_in(choice, obs, "the selector"))
-        if redraws and len(again := np.flatnonzero(self._holds(memory, rows, obs))):
-            put(memory["selector"], rows[again], take(before, again))
-            self._decide(memory, rows[again], obs[again], turn.some(again), tries - 1)
+            return choice
+        choice = self.fitted(choice, obs, "the selector")
+        if tries > 1 and selector.redraws(how.greedy):
+            again = np.flatnonzero(self._holds(choice, obs))
+            if len(again):
+                put(memory["selector"], rows[again], take(before, again))
+                some = turn.some(again)
+                choice[again] = self._choice(memory, rows[again], obs[again], some, tries - 1)
+        return choice
 
     def begin(
         self,
@@ -260,12 +262,16 @@ class Hierarchy(Policy):
         that has goals, in each call.
 
         Args:
-            goals: by the places of skills that have goals, (k, *goal_shape), checked; they count
-                where the skill is chosen. None: no chosen skill has goals.
+            choice: perhaps with checked goals.
+            goals: else by the places of skills that have goals, (k, *goal_shape), checked; they
+                count where the skill is chosen.
 
         Raises:
             SkillError: a chosen skill has goals, and there is none for it.
         """
+        if choice.dtype.fields is not None:
+            goals = {i: choice[GOAL][self.skills[i].name] for i in self.goals}
+            choice = choice[SKILL]
         skill = self.skill_of(choice)
         for i in self.goals:
             mine = np.flatnonzero(skill == i)
@@ -285,16 +291,16 @@ class Hierarchy(Policy):
             if memory[str(i)] and len(mine := rows[fresh & (skill == i)]):
                 put(memory[str(i)], mine, own.policy.start(len(mine)))
 
-    def _holds(self, memory: Memory, rows: Array, obs: Array) -> Array:
-        """Return where the goals of calls that start in ``obs`` (k, …) hold already, (k,) bool."""
-        holds = np.zeros(len(rows), bool)
-        for i, goals in self.goals.items():
-            if len(mine := np.flatnonzero(memory["skill"][rows] == i)):
-                holds[mine] = goals.hold(obs[mine], memory["goal"][str(i)][rows[mine]])
+    def _holds(self, choice: Array, obs: Array) -> Array:
+        """Return where the goals of choices (k,) hold in ``obs`` (k, …) already, (k,) bool."""
+        holds = np.zeros(len(choice), bool)
+        for i, mine in self._with_goals(choice):
+            goal = choice[GOAL][self.skills[i].name][mine]
+            holds[mine] = self.goals[i].hold(obs[mine], goal)
         return holds
 
-    def goals_in(self, choice: Array, obs: Array, who: str) -> dict[int, Array]:
-        """Return the goals of choices (k,) with goals, checked, for ``begin``.
+    def fitted(self, choice: Array, obs: Array, who: str) -> Array:
+        """Return choices (k,) with checked goals.
 
         Args:
             obs: (k, …), where the calls start.
@@ -303,13 +309,18 @@ class Hierarchy(Policy):
         Raises:
             SkillError: a goal is out of its space.
         """
-        skill, found = self.skill_of(choice[SKILL]), dict[int, Array]()
-        for i, goals in self.goals.items():
-            mine = np.flatnonzero(skill == i)
-            if len(mine):
-                found[i] = np.array(choice[GOAL][self.skills[i].name])
-                found[i][mine] = goals.fitted(obs[mine], found[i][mine], who)
-        return found
+        choice = choice.copy()
+        for i, mine in self._with_goals(choice):
+            given = choice[GOAL][self.skills[i].name]
+            given[mine] = self.goals[i].fitted(obs[mine], given[mine], who)
+        return choice
+
+    def _with_goals(self, choice: Array) -> Iterator[tuple[int, Array]]:
+        """Yield the skills with goals that are chosen, and where in choices (k,)."""
+        skill = self.skill_of(choice[SKILL])
+        for i in self.goals:
+            if len(mine := np.flatnonzero(skill == i)):
+                yield i, mine
 
     def skill_of(self, choice: Array) -> Array:
         """Return the skills that choices (k,) are of."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -221,6 +221,21 @@ class SkillCase:
     stops: str | None = None
     wins: str | None = None
 
+    @property
+    def methods(self) -> dict[str, Any]:
+        """Its functions of observations and steps, by the names that a skill gives them."""
+        found = {
+            "initiation": STARTS.get(self.starts),
+            "termination": recorded if self.stops == "recorded" else STOPS.get(self.stops),
+            "success": WINS.get(self.wins),
+        }
+        return {name: function for name, function in found.items() if function is not None}
+
+    @property
+    def below(self) -> LevelCase | None:
+        """The hierarchy that it is."""
+        return self.policy if isinstance(self.policy, LevelCase) else None
+
 
 @dataclass(frozen=True)
 class LevelCase:
@@ -248,7 +263,7 @@ class LevelCase:
     @property
     def below(self) -> Iterator[LevelCase]:
         """The levels of skills that are hierarchies."""
-        return (s.policy for s in self.skills if isinstance(s.policy, LevelCase))
+        return (s.below for s in self.skills if s.below is not None)
 
     @property
     def all(self) -> Iterator[LevelCase]:
@@ -264,8 +279,20 @@ class LevelCase:
     @property
     def free(self) -> list[int]:
         """The skills that may start everywhere."""
-        plain = (s.starts is None and isinstance(s.policy, str) for s in self.skills)
+        plain = (s.starts is None and s.below is None for s in self.skills)
         return [i for i, yes in enumerate(plain) if yes]
+
+    @property
+    def rules(self) -> tuple[Reflex, ...]:
+        return tuple(REFLEXES[name] for name in self.reflexes)
+
+    @property
+    def machine(self) -> Machine:
+        return machine(self)
+
+    def by_function(self, obs: Array, last: Any = None) -> Array:
+        """What a function as a selector returns."""
+        return chosen_by_function(self, obs, last)
 
 
 @dataclass(frozen=True)
@@ -298,9 +325,10 @@ class Machine:
 
     states: list[list[int]]
     arrows: list[tuple[int, int, str]]
+    events: dict[str, Any] = field(default_factory=lambda: EVENTS)
 
     def declared(self) -> Automaton:
-        arrows = {(f"q{a}", f"q{b}"): EVENTS[event] for a, b, event in self.arrows}
+        arrows = {(f"q{a}", f"q{b}"): self.events[event] for a, b, event in self.arrows}
         states = {f"q{i}": [f"s{k}" for k in skills] for i, skills in enumerate(self.states)}
         return Automaton(states, arrows)
 
@@ -337,15 +365,7 @@ def ready(level: LevelCase, kind: str) -> Any:
 
 
 def skill_of(case: SkillCase, name: str) -> Skill:
-    methods = {}
-    for method, table, key in (
-        ("initiation", STARTS, case.starts),
-        ("termination", STOPS, case.stops),
-        ("success", WINS, case.wins),
-    ):
-        if key is not None:
-            said = recorded if key == "recorded" else table[key]
-            methods[method] = lambda self, x, said=said: said(x)
+    methods = {method: lambda self, x, said=said: said(x) for method, said in case.methods.items()}
     fields = {"name": name, "max_steps": case.max_steps, "call_steps": case.call_steps}
     return type("Drawn", (Skill,), fields | methods)()
 
@@ -359,7 +379,7 @@ def skill_set(level: LevelCase, policies: tuple[Any, ...]) -> SkillSet:
     return SkillSet(
         tuple(skill_of(s, f"s{i}") for i, s in enumerate(level.skills)),
         policies,
-        tuple(REFLEXES[name] for name in level.reflexes),
+        level.rules,
         Lengths(*level.lengths) if level.lengths else level.call_steps,
         greedy=level.greedy,
         interruption=interruption,
@@ -510,8 +530,7 @@ def cases(draw: Any) -> Case:
     level = draw(level_cases(draw(of(0, 1, 1, 2)), deterministic))
     if draw(st.booleans()):  # so that hierarchies below get stuck
         below = (
-            replace(s, policy=confined(s.policy)) if isinstance(s.policy, LevelCase) else s
-            for s in level.skills
+            s if s.below is None else replace(s, policy=confined(s.below)) for s in level.skills
         )
         level = replace(level, skills=tuple(below))
     level = replace(level, env=draw(of("stroll", "masked")))

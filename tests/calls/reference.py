@@ -6,41 +6,59 @@ Nothing here uses the player, the collectors or the policies that are compared w
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from calls.cases import (
-    EVENTS,
-    REFLEXES,
-    STARTS,
-    STOPS,
-    WINS,
     Case,
-    LevelCase,
     Net,
     Worth,
-    chosen_by_function,
-    machine,
     policy_of,
-    recorded,
 )
 
 from skillweave.policies.core import CallEnd
-from skillweave.types import Array, Step
+from skillweave.types import Array, Memory
 
 RUNNING, OWN, LIMIT, INTERRUPTED, EPISODE = CallEnd
+
+
+def row(x: Any) -> Any:
+    """One observation, action or goal as a batch of one; of a dict each part."""
+    return {k: row(v) for k, v in x.items()} if isinstance(x, dict) else np.asarray(x)[None]
+
+
+def only(x: Any) -> Any:
+    """The only one of a batch of one."""
+    return {k: only(v) for k, v in x.items()} if isinstance(x, dict) else x[0]
+
+
+@dataclass
+class Shown:
+    """A step as skills and policies see it, in batches of one; of a Dict a dict of these."""
+
+    obs: Any
+    action: Any
+    next_obs: Any
+    reward: Array
+    terminated: Array
+    truncated: Array
+    timed_out: Array
+    elapsed: Array
+    info: dict[str, Any]
+    goal: Any = None
+    """Of the call, where the skill has goals."""
 
 
 @dataclass
 class Moment:
     """One step of an episode."""
 
-    obs: Array
-    action: int
-    next_obs: Array
+    obs: Any
+    action: Any
+    next_obs: Any
     reward: float
     terminated: bool
     truncated: bool
@@ -54,6 +72,11 @@ class Moment:
     """The choices that may be made next, as far as is known before the next observation counts."""
     overridden: bool
     """A reflex acted, here or below."""
+
+    @property
+    def over(self) -> bool:
+        """It is the episode's last."""
+        return self.terminated or self.truncated
 
 
 @dataclass
@@ -69,29 +92,30 @@ class Decision:
 class Ready:
     """A ready selector."""
 
-    def __init__(self, level: LevelCase, kind: str) -> None:
+    def __init__(self, level: Any, kind: str) -> None:
         self.level, self.kind = level, kind
         self.state, self.last = 0, (-1, EPISODE, False)
 
     def allowed(self, obs: Array | None) -> list[int]:
         """The skills that it may choose, best first; ``obs`` None: as far as it knows before."""
         if self.kind == "automaton":
-            return machine(self.level).states[self.state]
+            return self.level.machine.states[self.state]
         if obs is None:
             return [*range(len(self.level.skills))]
         keys = ("skill", "why", "succeeded")
         last = SimpleNamespace(**dict(zip(keys, map(np.array, self.last), strict=True)))
         given = last if self.kind == "last" else None
-        return [int(chosen_by_function(self.level, obs[None], given)[0])]
+        return [int(self.level.by_function(row(obs), given)[0])]
 
-    def watch(self, step: Step, last: tuple[int, int, bool]) -> None:
+    def watch(self, step: Shown, last: tuple[int, int, bool]) -> None:
         self.last = last
         _, why, succeeded = last
         ended = {"success": succeeded, "failure": not succeeded}
-        for origin, target, name in machine(self.level).arrows:
+        machine = self.level.machine
+        for origin, target, name in machine.arrows:
             if origin != self.state:
                 continue
-            event = EVENTS[name]
+            event = machine.events[name]
             if bool(event(step)[0]) if callable(event) else (why != RUNNING and ended[event]):
                 self.state = target
                 return
@@ -106,7 +130,7 @@ class Ready:
 class Life:
     """The calls of one level, from the start of an episode, or of a call of the whole."""
 
-    def __init__(self, level: LevelCase, choices: list[int] | None = None) -> None:
+    def __init__(self, level: Any, choices: list[int] | None = None) -> None:
         self.level, self.choices = level, choices
         self.count = len(level.skills)
         self.lengths = level.lengths or (None,)
@@ -115,49 +139,60 @@ class Life:
         self.part: Any = None  # of the running skill: a Life, or what its policy remembers
         self.ready = Ready(level, level.selector) if level.ready else None
         self.guide = None if level.guide is None else Ready(level, level.guide)
-        self.net = None if level.ready else Net(
-            self.count * len(self.lengths), int(level.selector == "counts"), turn=2
-        )  # fmt: skip
+        self.net = None if level.ready else self.network()
         self.memory = {} if self.net is None else self.net.start(1)
         self.decision: Decision | None = None
+
+    # What runs
+
+    def network(self) -> Any:
+        """The selector that is trained."""
+        recurrent = int(self.level.selector == "counts")
+        return Net(self.count * len(self.lengths), recurrent, turn=2)
+
+    def fresh(self, skill: int) -> Life | Memory:
+        """What a skill remembers where it has not acted."""
+        case = self.level.skills[skill]
+        return policy_of(case.policy).start(1) if case.below is None else Life(case.below)
 
     # May it start?
 
     @staticmethod
-    def startable(level: LevelCase, obs: Array) -> list[bool]:
+    def startable(level: Any, obs: Any) -> list[bool]:
         found = []
         for case in level.skills:
-            may = case.starts is None or bool(STARTS[case.starts](obs[None])[0])
-            if isinstance(case.policy, LevelCase):
-                may = may and any(Life.startable(case.policy, obs))
-            found.append(may)
+            starts = case.methods.get("initiation")
+            may = starts is None or bool(starts(row(obs))[0])
+            found.append(may and (case.below is None or any(Life.startable(case.below, obs))))
         return found
 
     # Acting
 
-    def act(self, obs: Array, mask: Array | None, deterministic: bool) -> int:
+    def act(self, obs: Any, mask: Array | None, deterministic: bool) -> Any:
         self.decision, self.overridden = None, False
         if self.end != RUNNING:
             self.decide(obs, deterministic)
-        case = self.level.skills[self.skill]
-        if isinstance(case.policy, LevelCase):
+        if isinstance(self.part, Life):
             action = self.part.act(obs, mask, self.level.greedy)
             self.overridden = self.part.overridden
         else:
-            allowed = None if mask is None else mask[None]
-            found, self.part = policy_of(case.policy).act(
-                self.part, obs[None], allowed, deterministic=self.level.greedy
-            )
-            action = int(found[0])
-        for name in self.level.reflexes:
-            reflex = REFLEXES[name]
-            if reflex.condition(obs[None])[0]:
+            action = self.act_skill(obs, mask)
+        for reflex in self.level.rules:
+            if reflex.condition(row(obs))[0]:
                 self.overridden = True
                 answer: Any = reflex.action
-                action = int(answer(obs[None])[0]) if callable(answer) else answer
+                action = only(answer(row(obs))) if callable(answer) else answer
         return action
 
-    def decide(self, obs: Array, deterministic: bool) -> None:
+    def act_skill(self, obs: Array, mask: Array | None) -> Any:
+        allowed = None if mask is None else mask[None]
+        policy = policy_of(self.level.skills[self.skill].policy)
+        found, self.part = policy.act(
+            self.part, obs[None], allowed, deterministic=self.level.greedy
+        )  # fmt: skip
+        return found[0]
+
+    def decide(self, obs: Any, deterministic: bool) -> None:
         may = self.startable(self.level, obs)
         if self.guide is not None:
             wanted = [k for k in self.guide.allowed(obs) if may[k]]
@@ -181,58 +216,70 @@ class Life:
         self.decision = Decision(choice, mask, before, self.chances)
         skill, length = divmod(choice, len(self.lengths))
         if skill != self.skill:
-            policy = self.level.skills[skill].policy
-            self.part = (
-                Life(policy) if isinstance(policy, LevelCase) else policy_of(policy).start(1)
-            )
+            self.part = self.fresh(skill)
+        self.begin(skill, length)
+
+    def begin(self, skill: int, length: int) -> None:
+        """Start a call."""
         self.skill, self.elapsed, self.end = skill, 0, RUNNING
         self.limit = self.lengths[length]
 
     # After a step
 
-    def observe(self, step: Step) -> None:
+    def observe(self, step: Shown) -> None:
         """Notice a step, whose time is the caller's."""
         self.elapsed += 1
         case = self.level.skills[self.skill]
-        most = case.call_steps or self.level.call_steps
-        limits = (self.limit, case.max_steps, most if isinstance(most, int) else None)
-        self.end = RUNNING
-        if any(limit is not None and self.elapsed >= limit for limit in limits):
-            self.end = LIMIT
+        self.end = LIMIT if self.limited else RUNNING
         own = self.seen(step)
-        if isinstance(case.policy, LevelCase):
+        next_obs = only(step.next_obs)
+        if isinstance(self.part, Life):
             below = self.part
             below.observe(own)
             ended = below.end not in (RUNNING, EPISODE)
-            if ended and not any(self.startable(case.policy, step.next_obs[0])):
+            if ended and not any(self.startable(case.below, next_obs)):
                 self.end = LIMIT  # nothing below could follow
         else:
-            self.part = policy_of(case.policy).observe(self.part, own)
-        if case.stops == "recorded":
-            recorded(own)
-        elif case.stops is not None and STOPS[case.stops](own)[0]:
+            self.watch_skill(own)
+        if "termination" in case.methods and case.methods["termination"](own)[0]:
             self.end = OWN
         if self.level.margin is not None and self.end == RUNNING:
-            worth = Worth(self.count).heads(step.next_obs)[0]
+            worth = self.worth(step)
             gain = worth[-1] - worth[self.skill]
-            if any(self.startable(self.level, step.next_obs[0])) and gain > self.level.margin:
+            if any(self.startable(self.level, next_obs)) and gain > self.level.margin:
                 self.end = INTERRUPTED
         if (step.terminated[0] or step.truncated[0]) and self.end != OWN:
             self.end = EPISODE
         succeeded = self.end == OWN
-        if case.wins is not None and self.end != RUNNING:
-            succeeded = bool(WINS[case.wins](own)[0])
+        if "success" in case.methods and self.end != RUNNING:
+            succeeded = bool(case.methods["success"](own)[0])
         for who in (self.guide, self.ready):
             if who is not None:
                 who.watch(step, (self.skill, self.end, succeeded))
 
-    def seen(self, step: Step) -> Step:
+    @property
+    def limited(self) -> bool:
+        """The running call has reached a limit."""
+        case = self.level.skills[self.skill]
+        most = case.call_steps or self.level.call_steps
+        limits = (self.limit, case.max_steps, most if isinstance(most, int) else None)
+        return any(limit is not None and self.elapsed >= limit for limit in limits)
+
+    def watch_skill(self, own: Shown) -> None:
+        """Let the policy of the running skill notice a step."""
+        policy = policy_of(self.level.skills[self.skill].policy)
+        self.part = policy.observe(self.part, own)
+
+    def worth(self, step: Shown) -> Array:
+        """What a critic says of the calls after a step, and last of a new decision."""
+        return Worth(self.count).heads(step.next_obs)[0]
+
+    def seen(self, step: Shown) -> Shown:
         """The step with the time as the running skill counts it."""
         limit = self.level.skills[self.skill].max_steps
         timed_out = limit is not None and self.elapsed >= limit and not step.terminated[0]
-        return Step(
-            step.obs, step.action, step.next_obs, step.reward, step.terminated, step.truncated,
-            np.array([timed_out]), np.array([self.elapsed]), step.info,
+        return replace(
+            step, timed_out=np.array([timed_out]), elapsed=np.array([self.elapsed]), goal=None
         )  # fmt: skip
 
     # What it remembers
@@ -257,7 +304,7 @@ class Life:
             found["chances"] = self.chances
         return found
 
-    def ahead(self, next_obs: Array) -> list[bool]:
+    def ahead(self, next_obs: Any) -> list[bool]:
         may = self.startable(self.level, next_obs)
         if self.guide is not None and self.level.guide_restricts:
             may = [yes and k in self.guide.allowed(None) for k, yes in enumerate(may)]
@@ -284,7 +331,12 @@ def _episode(case: Case, seed: int) -> list[Moment]:
 
 def moments_of(case: Case, seed: int, choices: list[int] | None) -> Iterator[Moment]:
     """As ``episode``; nothing is remembered of earlier episodes."""
-    env, life = case.env(), Life(case.level, choices)
+    return lived(Life(case.level, choices), case, seed)
+
+
+def lived(life: Life, case: Any, seed: int) -> Iterator[Moment]:
+    """The steps of an episode."""
+    env, choices = case.env(), life.choices
     obs, info = env.reset(seed=seed)
     over, t = False, 0
     while not over:
@@ -295,8 +347,8 @@ def moments_of(case: Case, seed: int, choices: list[int] | None) -> Iterator[Mom
         next_obs, reward, terminated, truncated, info = env.step(action)
         over, t = terminated or truncated, t + 1
         truncated = truncated and not terminated  # as engines say it
-        step = Step(
-            obs[None], np.array([action]), next_obs[None], np.array([reward], np.float32),
+        step = Shown(
+            row(obs), row(action), row(next_obs), np.array([reward], np.float32),
             np.array([terminated]), np.array([truncated]), np.zeros(1, bool), np.array([t]),
             {k: np.array([v]) for k, v in info.items() if k == "t"},
         )  # fmt: skip

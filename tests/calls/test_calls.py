@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from calls.cases import BY_HAND, LEFT, SEEN, ZIGZAG, Case, LevelCase, SkillCase, cases
 from calls.reference import Call, Moment, calls, episode, moments_of
-from calls.users import GAMMA, SEED, USERS, Got, Played
+from calls.users import GAMMA, SEED, USERS, Got, Played, plain
 from hypothesis import HealthCheck, given, settings
 from reference_calls import T, scripted, seeds_of
 
@@ -27,20 +28,31 @@ from skillweave.types import Array
 
 def compare(case: Case, played: Played) -> list[list[Moment]]:
     """Every step is the reference's; returns the reference's episodes."""
+
+    def wanted(seed: int, steps: list[Got]) -> list[Moment]:
+        return episode(case, seed, None if played.chooses else choices_of(case.level, steps))
+
+    return compare_with(wanted, played)
+
+
+def compare_with(
+    episode_of: Callable[[int, list[Got]], list[Moment]], played: Played
+) -> list[list[Moment]]:
+    """The same; ``episode_of``: from a seed, and the steps of the user."""
     found = []
     assert played.episodes
     for seed, steps in played.episodes:
-        wanted = episode(case, seed, None if played.chooses else choices_of(case.level, steps))
+        wanted = episode_of(seed, steps)
         assert len(steps) <= len(wanted)
         for t, (got, want) in enumerate(zip(steps, wanted, strict=False)):
             where = f"step {t} of the episode from seed {seed}"
             agree(played, got.acted, want.acted, f"{where}, after acting")
-            assert got.action == want.action, where
-            assert got.next_obs == want.next_obs.tolist(), where
+            assert got.action == plain(want.action), where
+            assert got.next_obs == plain(want.next_obs), where
             assert got.reward == want.reward, where
             assert got.overridden in (None, want.overridden), where
             if got.observed:
-                over = played.restarts and (want.terminated or want.truncated)
+                over = played.restarts and want.over
                 after = {"end": CallEnd.EPISODE} if over else want.observed
                 agree(played, got.observed, after, f"{where}, after the step")
         found.append(wanted[: len(steps)])
@@ -59,7 +71,7 @@ def agree(played: Played, got: dict[str, Any], want: dict[str, Any], where: str)
 
 def compare_finished(played: Played, found: list[list[Moment]]) -> None:
     """The episodes that are over have the reference's returns and lengths."""
-    over = [moments for moments in found if moments[-1].terminated or moments[-1].truncated]
+    over = [moments for moments in found if moments[-1].over]
     wanted = sorted((sum(m.reward for m in moments), len(moments)) for moments in over)
     assert played.finished is not None
     assert near(sorted(played.finished), wanted)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from skillweave.export.graphs import Graph
 from skillweave.export.write import write_export
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.policies.core import Memory, Turn, World, flat, restart, take
+from skillweave.policies.core import Memory, Policy, Turn, World, flat, restart, take
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -45,8 +45,8 @@ GAMMA = 0.5  # so that sums are exact
 class Got:
     """One step, as a user made it; memories by name, of this environment."""
 
-    action: int
-    next_obs: list[float]
+    action: Any
+    next_obs: Any
     reward: float
     acted: dict[str, Any]
     observed: dict[str, Any] = field(default_factory=dict)
@@ -72,6 +72,12 @@ class Played:
     """The case's selector chooses; else the user does, and the reference follows it."""
 
 
+def plain(x: Any) -> Any:
+    """An observation or an action as numbers, lists and dicts."""
+    names = x.keys() if isinstance(x, dict) else np.asarray(x).dtype.names
+    return {k: plain(x[k]) for k in names} if names else np.asarray(x).tolist()
+
+
 class Watch:
     """Writes down the steps of N environments.
 
@@ -95,7 +101,7 @@ class Watch:
             remembered = {name: v[row].tolist() for name, v in flat(memory).items()}
             overridden = remembered.pop("overridden", None)
             got = Got(
-                int(action[k]), raw.next_obs[k].tolist(), float(raw.reward[k]), remembered,
+                plain(action[k]), plain(raw.next_obs[k]), float(raw.reward[k]), remembered,
                 overridden=overridden,
             )  # fmt: skip
             self._open[i].append(got)
@@ -189,7 +195,7 @@ def decisions(case: Case) -> Played:
     """A selector that learns, above skills that can act."""
     guide, selector = _first(case)
     skills = skill_set(case.level, policies_of(case.level))
-    return _collect(
+    return collected(
         case, lambda: HierarchyCollector(engine_of(case), selector, skills, True, guide), "", {}
     )  # fmt: skip
 
@@ -228,7 +234,7 @@ def joint(case: Case) -> Played:
         how = {"guide": guide, "learners": learners, "margins": margins}
         return HierarchyCollector(engine_of(case), selector, skills, **how)
 
-    return _collect(case, make, "selector", learners)
+    return collected(case, make, "selector", learners)
 
 
 def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
@@ -241,7 +247,7 @@ def _first(case: Case) -> tuple[ActiveGuide | None, Learner | None]:
 
 
 def _rounds(
-    case: Case, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
+    case: Any, watch: Watch, make: Callable[[], Any], memory_of: Callable[[Any], Memory],
     learners: dict[str, Any],
 ) -> Iterator[Any]:  # fmt: skip
     """What a collector returns, request by request; perhaps another one goes on half way."""
@@ -256,29 +262,33 @@ def _rounds(
         request = Request(
             case.rows, (), np.array([GAMMA]), Seeds(0) / i, greedy=case.deterministic
         )  # fmt: skip
-        collected = collector.collect(
-            replace(request, below=dict.fromkeys(learners, request))
-        )  # fmt: skip
-        assert collected.steps == case.rows * N, "an environment waited"
+        found = collector.collect(replace(request, below=dict.fromkeys(learners, request)))
+        assert found.steps == case.rows * N, "an environment waited"
         watch.observed(np.arange(N), memory_of(collector))
-        yield collected
+        yield found
 
 
-def _collect(
-    case: Case, make: Callable[[], Any], path: str, learners: dict[str, Any]
+def collected(
+    case: Any, make: Callable[[], Any], path: str | None, learners: dict[str, Any]
 ) -> Played:  # fmt: skip
+    """What a collector does that ``make`` returns.
+
+    Args:
+        path: of its first selector, whose decisions are kept; None: nobody's are.
+    """
+
     def memory_of(collector: Any) -> Memory:
         overridden = getattr(collector, "overridden", None)
         more = {} if overridden is None else {"overridden": overridden}
         return collector.memory | more
 
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
-    columns: list[list[dict[str, Any]]] = [[] for _ in range(N)]
+    columns: list[list[dict[str, Any]]] | None = [[] for _ in range(N)]
     finished: list[tuple[float, float]] = []
-    for collected in _rounds(case, watch, make, memory_of, learners):
-        batches = collected.batches
-        finished += map(tuple, collected.episodes[:, [0, 2]].tolist())
-        if path in batches:
+    for found in _rounds(case, watch, make, memory_of, learners):
+        batches = found.batches
+        finished += map(tuple, found.episodes[:, [0, 2]].tolist())
+        if path in batches and columns is not None:
             batch = batches[path]
             names = batch.keys() - {"valid", "recurrent_state"}
             for t, n in zip(*np.nonzero(batch.valid_rows), strict=True):
@@ -287,7 +297,9 @@ def _collect(
                     row["recurrent_state"] = batch["recurrent_state"][n]
                 columns[n].append(row)
     ready = case.level.ready
-    return Played(watch.episodes, None if ready else columns, finished)
+    if ready or path is None:
+        columns = None
+    return Played(watch.episodes, columns, finished)
 
 
 def leads_to_starts(case: Case) -> Played:
@@ -324,11 +336,14 @@ class Anything:
 
 
 def alone(case: Case) -> Played:
+    level = case.level
+    skills = skill_set(level, policies_of(level))
+    return in_a_loop(case, acting_policy(skills, selector_of(level), guide_of(level)))
+
+
+def in_a_loop(case: Any, policy: Policy) -> Played:
     """The player in a plain loop."""
-    level, engine = case.level, engine_of(case)
-    policy = acting_policy(
-        skill_set(level, policies_of(level)), selector_of(level), guide_of(level)
-    )
+    engine = engine_of(case)
     watch, rows = Watch(seeds_of(SEED, N)), np.arange(N)
     memory, age = policy.start(N), np.zeros(N, np.int64)
     overridden = np.zeros(N, bool)
@@ -358,8 +373,11 @@ def alone(case: Case) -> Played:
 
 
 def evaluated(case: Case) -> Played:
+    return in_evaluation(case, hierarchy(case.level), [11, 12, 13, 14, 15, 16, 17])
+
+
+def in_evaluation(case: Any, policy: Any, seeds: list[int]) -> Played:
     """Whole episodes, in environments of which fewer and fewer act in the end."""
-    seeds = [11, 12, 13, 14, 15, 16, 17]
     watch = Watch([iter([seed]) for seed in seeds])  # each episode counts as an environment
     episodes = SeededEpisodes(engine_of(case), seeds, 1_000)
     chosen: list[Memory] = []
@@ -368,7 +386,7 @@ def evaluated(case: Case) -> Played:
         chosen.append(take(memory, episodes.rows))
 
     how: Any = {"deterministic": case.deterministic, "before_step": keep}
-    for played in play(hierarchy(case.level), episodes, **how):
+    for played in play(policy, episodes, **how):
         watch.step(played.episode, played.step.action, played.step, chosen[-1], True)
         watch.observed(played.episode, take(played.memory, played.rows), True)
     return Played(watch.episodes, restarts=False)
@@ -377,13 +395,16 @@ def evaluated(case: Case) -> Played:
 def deployed(case: Case) -> Played:
     """One observation at a time."""
     player = Deployed(hierarchy(case.level), deterministic=case.deterministic)
-    return _one_by_one(case, player, lambda: player.memory)
+    return one_by_one(case, player, lambda: player.memory)
 
 
-def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
+def one_by_one(
+    case: Any, acts: Any, memory: Callable[[], Memory], seeds: Iterable[int] = range(21, 25)
+) -> Played:  # fmt: skip
+    """One observation at a time; ``acts``: of them."""
     found = Played()
     env = case.env()
-    for seed in range(21, 25):
+    for seed in seeds:
         steps: list[Got] = []
         obs, info = env.reset(seed=seed)
         acts.reset()
@@ -392,7 +413,7 @@ def _one_by_one(case: Case, acts: Any, memory: Callable[[], Memory]) -> Played:
             action = acts.act(obs, reward=reward, info=info)
             remembered = {k: np.atleast_1d(v)[0].tolist() for k, v in flat(memory()).items()}
             obs, reward, terminated, truncated, info = env.step(action)
-            steps.append(Got(int(action), obs.tolist(), float(np.float32(reward)), remembered))
+            steps.append(Got(plain(action), plain(obs), float(np.float32(reward)), remembered))
             over = terminated or truncated
         found.episodes.append((seed, steps))
     return found
@@ -473,7 +494,7 @@ def exported(case: Case) -> Played:
     ):
         export = write_export(Path(folder), hierarchy(case.level), "walk")
         runner = file.Runner(folder, export.functions)
-        found = _one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
+        found = one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
     found.missing = r"\blimit$|chances$|(selector|guide)\.(skill|why|succeeded)$"
     return found
 
