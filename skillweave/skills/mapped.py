@@ -265,7 +265,10 @@ class MappedPolicy(Foreign):
         )
         outputs = [output]
         if chunk is not None:
-            if output.ndim < (2 if plan.outputs.count <= 1 else 3) or output.shape[1] < chunk:
+            several = plan.outputs.count > 1 and (
+                self.logits or isinstance(plan.outputs.space, Box)
+            )
+            if output.ndim < 2 + several or output.shape[1] < chunk:
                 raise PolicyError(
                     f"{self._who} returned shape {output.shape}, but chunk={chunk} needs "
                     f"(n, {chunk}, ...): {chunk} actions for each environment"

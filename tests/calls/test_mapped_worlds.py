@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -134,17 +134,11 @@ def model(seed: int) -> Model:
 
     kind = of("box", "box", "several", "one")
     acts = {"box": ("as they are", "scaled", "part"), "one": ("as they are", "part")}
-    drawn = Model(
+    return Model(
         seed, kind, kind != "box" and of(True, False), of(True, False), of(True, False),
         kind == "box" and of(True, False), of(1, 1, 2, 3), of(None, None, 2, 3), of(*STATES),
         of(*acts.get(kind, ("as they are",))),
     )  # fmt: skip
-    return replace(drawn, chunk=None) if is_refused(drawn) else drawn
-
-
-def is_refused(model: Model) -> bool:
-    """A chunk of some of the choices is asked for scores, which functions do not return."""
-    return model.kind == "one" and model.acts == "part" and not model.logits
 
 
 @dataclass
