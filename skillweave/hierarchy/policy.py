@@ -133,12 +133,10 @@ class HierarchyPolicy(Functional):
     def goal_now(self, memory: InPlaceMemory, row: int = 0) -> Array | None:
         """Return the goal of the skill that acts in environment ``row``; None: it has none.
 
-        Args:
-            memory: of ``in_place``.
-
         Returns:
             (…) an element of ``goal_space``, or None.
         """
+        memory = self._whole(memory)
         i = str(memory["skill"][row])
         policy = self.skills.policies[int(i)]
         if isinstance(policy, HierarchyPolicy):
@@ -147,15 +145,17 @@ class HierarchyPolicy(Functional):
         return None if goals is None else goals[row]
 
     def acts(self, memory: InPlaceMemory, row: int = 0) -> str:
-        """Return the path of the skill that acts in environment ``row``: ``inner/skill``.
-
-        ``memory`` is that of ``in_place``.
-        """
+        """Return the path of the skill that acts in environment ``row``: ``inner/skill``."""
+        memory = self._whole(memory)
         i = int(memory["skill"][row])
         name, policy = self.labels[i], self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
             return name
         return f"{name}/{policy.acts(memory[str(i)], row)}"
+
+    def _whole(self, memory: InPlaceMemory) -> InPlaceMemory:
+        """Return a memory as that of ``in_place``, which has the memories of parts in it."""
+        return memory if "selector" in memory else nested(self._like, memory)
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:

@@ -149,9 +149,9 @@ class Hierarchy(Policy):
         """The number of choices: the first skill with each length, then the next skill."""
         self.restricts = any(s.initiation or s.policy.restricts for s in self.skills)
         self._limits = np.array([NEVER if s.limit is None else s.limit for s in self.skills])
-        self._asked = [
+        self._asked = {
             i for i, s in enumerate(self.skills) if s.policy.watches or s.termination is not None
-        ]
+        }
         self.goals = {i: s.goals for i, s in enumerate(self.skills) if s.goals is not None}
         """The goals of skills that have some, by their place in the list."""
         self._fresh = np.array(
@@ -198,14 +198,12 @@ class Hierarchy(Policy):
             self.begin(memory, at, self._choice(memory, at, obs[ended], part))
         running, actions = memory["skill"][rows], None
         own = Turn(turn.world, turn.mask, None, self._greedy)
-        for i, skill in enumerate(self.skills):
-            mine = np.flatnonzero(running == i)
-            if not len(mine):
-                continue
+        for i, mine in _by_skill(running):
             every = len(mine) == len(rows)
             part, at = own if every else own.some(mine), rows if every else rows[mine]
             part.goal = self.goal_of(memory, i, at)
-            some = skill.policy.act(memory[str(i)], at, obs if every else obs[mine], part)
+            seen = obs if every else obs[mine]
+            some = self.skills[i].policy.act(memory[str(i)], at, seen, part)
             if every:
                 return some
             if actions is None:
@@ -421,9 +419,8 @@ class Hierarchy(Policy):
             end[elapsed >= memory["limit"][rows]] = LIMIT
         end[elapsed >= self._limits[running]] = LIMIT
         own = own_step(step)
-        for i in self._asked:
-            mine = np.flatnonzero(running == i)
-            if len(mine):
+        for i, mine in _by_skill(running):
+            if i in self._asked:
                 self._observe_skill(memory, i, rows, mine, elapsed, own, end)
         if self._interruption is not None:
             self._interrupt(self._interruption, memory, rows, step, end)
@@ -514,3 +511,13 @@ class Hierarchy(Policy):
         for name, part in {**parts, **self._ready}.items():
             found |= {f"{name}.{k}": v for k, v in part.values().items()}
         return found
+
+
+def _by_skill(running: Array) -> Iterator[tuple[int, Array]]:
+    """Yield the skills that run, in order, and where they do in ``running`` (k,)."""
+    present = sorted(set(running.tolist()))
+    if len(present) == 1:
+        yield present[0], np.arange(len(running))
+        return
+    for i in present:
+        yield i, np.flatnonzero(running == i)

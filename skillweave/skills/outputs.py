@@ -175,7 +175,7 @@ def checked_actions(
             f"{who} returned shape {action.shape}, but {shape} was expected: one action of {space} "
             f"for each of the {n} environments"
         )
-    real = np.issubdtype(space.dtype, np.floating)
+    real = space.dtype is not None and space.dtype.kind == "f"
     if action.dtype.kind not in ("iubf" if real else "iub"):
         wanted = "numbers" if real else "whole numbers"
         advice = ""

@@ -14,7 +14,6 @@ import skillweave as sw
 from skillweave.collecting.judge import JudgedBy
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.experience import Batch
-from skillweave.policies.core import Turn, World
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import Goals, goals_of
@@ -447,9 +446,12 @@ def test_captions_show_the_goal():
 def test_goals_reach_the_label_of_a_film(tmp_path):
     run = declared([go_to(), Rest()], selector=far_corner).train(tmp_path / "run", quiet=True)
     policy = run.policy
-    memory = policy.in_place.start(1)
-    policy.in_place.act(memory, np.arange(1), np.zeros((1, 2), np.float32), Turn(World()))
+    memory = policy.start(1)
+    _, memory = policy.act(memory, np.zeros((1, 2), np.float32))
     assert np.allclose(policy.goal_now(memory), 0.9)
+    player = run.player()
+    player.act(np.zeros(2, np.float32))
+    assert np.allclose(policy.goal_now(player.memory), 0.9)
 
 
 def test_the_policy_of_a_skill_with_goals_is_saved_and_loaded(tmp_path):
