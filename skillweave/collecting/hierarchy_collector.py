@@ -114,7 +114,7 @@ class HierarchyCollector(Collector):
         self.policy = acting_policy(self.skills, selector, guide, self._goals)
         self.memory = self.policy.start(n)
         """The policy's, of all environments; changed in place."""
-        self.kept |= prefixed("player", flat(self.memory))
+        self.kept |= flat(self.memory, "player.")
         self.values |= prefixed("player", self.policy.values())
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)

@@ -37,7 +37,7 @@ from skillweave.policies.parts import Reflexes
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import ZERO, OwnPart, Rest
-from skillweave.types import Array, Memory, Step, prefixed
+from skillweave.types import Array, Memory, Step
 
 PATIENCE = 5_000
 """Steps of an environment in search of a state where the skill may start, if none is ever found."""
@@ -124,7 +124,7 @@ class SkillCollector(Collector):
         if part is not None and part.base is not None:
             self._base = base_of(part, goals_of(skill))
             self._base_memory: Memory = self._base.start(n)
-            self.kept |= prefixed("base", flat(self._base_memory))
+            self.kept |= flat(self._base_memory, "base.")
         self._goals = goals_of(skill)
         if self._goals is not None:
             self.kept["goal"] = self._goals.start(n)

@@ -206,8 +206,19 @@ def _outermost(policy: Policy, skills: SkillSet, remembers: bool) -> Policy:
 
 
 def policy_of(policy: Any, goals: Goals | None, part: OwnPart | None, who: str) -> Policy:
-    """Return a skill's policy, whose actions are those of its own part; ``who`` for messages."""
-    own = _policy(policy, goals, who)
+    """Return a skill's policy, whose actions are those of its own part.
+
+    Args:
+        policy: of any form; None: it is not there yet.
+        goals, part: of the skill.
+        who: for messages.
+    """
+    if policy is None:
+        return Policy()
+    if (below := skills_below(policy)) is not None and hasattr(policy, "selector"):
+        return acting_policy(below, policy.selector, policy.guide, goals, outermost=False)
+    own = _leaf(policy, who)
+    own = own if goals is None else Joined(own)
     if part is None or part.correction is None:
         return own
     return Corrects(own, base_of(part, goals), part.correction.apply)
@@ -218,21 +229,11 @@ def base_of(part: OwnPart, goals: Goals | None) -> Policy:
     base: Any = part.base
     if (below := skills_below(base)) is not None:
         return acting_policy(below, base.selector, base.guide, goals)
-    return _policy(base, goals, f"{part.who}: the act() of the policy that it corrects")
+    return policy_of(base, goals, None, f"{part.who}: the act() of the policy that it corrects")
 
 
 ENDS = ("initiation", "termination", "success")
 """The methods of a skill that are asked while it acts."""
-
-
-def _policy(policy: Any, goals: Goals | None, who: str) -> Policy:
-    """Return a policy that acts in calls, with these goals; None: it is not there yet."""
-    if policy is None:
-        return Policy()
-    if (below := skills_below(policy)) is not None and hasattr(policy, "selector"):
-        return acting_policy(below, policy.selector, policy.guide, goals, outermost=False)
-    leaf = _leaf(policy, who)
-    return leaf if goals is None else Joined(leaf)
 
 
 def _leaf(policy: Any, who: str) -> Policy:

@@ -54,7 +54,7 @@ class StartPolicy:
             self._policy = acting_policy(self.skills, outermost=False)
             self._hierarchy = within(self._policy)
             self._calls: Memory = self._policy.start(num_envs)
-            self.kept = prefixed("starters", flat(self._calls))
+            self.kept = flat(self._calls, "starters.")
             self.values = prefixed("starters", self._policy.values())
 
     def act(

@@ -14,14 +14,15 @@ from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import PlanningStates
-from skillweave.types import Array, Memory, Memoryless
+from skillweave.policies.core import Memory, Policy, Turn
+from skillweave.types import Array
 
 PER_FEATURE = 0.25
 """Standard deviations of each feature from which on a call is new."""
 
 
 @checked_names
-class Explorer(Memoryless):
+class Explorer(Policy):
     """A selector for ``record_calls`` that prefers calls which differ from the logged ones.
 
     Where the nearest logged call of a skill is further than ``radius``, calling it is worth the
@@ -100,20 +101,13 @@ class Explorer(Memoryless):
         may = self._graph.may[:, self._graph.choice_of]
         return float((self._graph.after.distance > self._far)[may].mean())
 
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,), sampled."""
-        return self.decide(obs, mask, rng)[0], memory
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return choices (k,), sampled."""
+        assert turn.world.rng is not None
+        return self.decide(obs, turn.mask, turn.world.rng)[0]
 
     def decide(
-        self, obs: Array, mask: Array | None, rng: np.random.Generator | None
+        self, obs: Array, mask: Array | None, rng: np.random.Generator
     ) -> tuple[Array, dict[str, tuple[Array, Array]]]:
         """Return choices (n,), and goals of logged calls that are made again.
 
@@ -121,7 +115,6 @@ class Explorer(Memoryless):
             Choices, and by skill with goals the rows (k,) with the numbers of their goals (k, G).
             All other calls are new, and need new goals.
         """
-        rng = rng or np.random.default_rng()
         graph = self._graph
         if graph is None:
             score = rng.random((len(obs), self._choices))
