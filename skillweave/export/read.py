@@ -520,9 +520,7 @@ def _method(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _samples(entry: dict[str, Any]) -> bool:
-    """Return whether an entry, or one below it, draws its actions."""
-    if entry.get("kind") == "Part":
-        return _samples(entry["policy"])
-    skills = entry["skills"] if entry.get("kind") == "Hierarchy" else ()
-    below = any(_samples(skill["policy"]) for skill in skills)
-    return bool(entry.get("noise")) or entry.get("sampled") is True or below
+    """Return whether an entry draws its actions; of a hierarchy, whether its selector does."""
+    if inside := {"Part": "policy", "Hierarchy": "selector"}.get(entry.get("kind", "")):
+        return _samples(entry[inside])
+    return bool(entry.get("noise")) or entry.get("sampled") is True

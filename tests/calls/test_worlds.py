@@ -214,13 +214,6 @@ def anything(world: World) -> bool:
     return True
 
 
-def can_be_read(world: World) -> bool:
-    """What is read lets hierarchies sample that are beside a hierarchy in which skills do."""
-    below = [skill.below for level in world.level.all for skill in level.skills if skill.below]
-    greedy = all(level.greedy and level.greedy_selector for level in below)
-    return can_be_exported(world) and greedy
-
-
 def can_be_exported(world: World) -> bool:
     """ONNX has no policy that remembers what it observes, and the runner returns one array."""
     skills = [skill for level in world.level.all for skill in level.skills]
@@ -245,7 +238,7 @@ USERS = {
     "evaluation": User(evaluated),
     "deployment": User(deployed),
     "exported": User(exported, can_be_exported, missing=r"rnn$|limit$|selector\.|goal\."),
-    "read again": User(read_again, can_be_read, missing=r"rnn$"),
+    "read again": User(read_again, can_be_exported, missing=r"rnn$"),
 }
 
 
