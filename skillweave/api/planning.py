@@ -131,7 +131,7 @@ def start_of(
     seeds = Seeds(0) / "plan"
     log = planner.log
     obs, state = planner.situations(PAIRS, GOALS, (seeds / "pairs").numpy())
-    may = policy.skills.startable(obs)
+    may = policy.skills.hierarchy.may_start(obs)
     may |= ~may.any(axis=1, keepdims=True)
     chosen, call = planner.choices(obs, state, may)
     chances = np.exp(as_logits(np.eye(log.choices, dtype=np.float32)[chosen], may)) * may

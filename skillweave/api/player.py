@@ -92,7 +92,6 @@ class Player:
                     'with goals, run.player(skill="go_to", goal=...)'
                 )
             self.policy = self.policy.with_goal(goal, "the player")
-        self._needs_goal = isinstance(self.policy, SkillAlone)
         self._acts = in_place(self.policy)
         self.memory: Memory = self._acts.start(1)
         self._before: tuple[Array, Array] | None = None
@@ -136,10 +135,8 @@ class Player:
         if mask is None and observes_mask(self._space, self.policy.action_space):
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
-        if self._needs_goal:  # where the episode starts
-            assert isinstance(self.policy, SkillAlone)
+        if self._before is None and isinstance(self.policy, SkillAlone):
             self.policy.choose_goals(self.memory, ROW, seen, [self._world.rng])
-            self._needs_goal = False  # only now: without its goal it must not act
         turn = Turn(self._world, allowed, greedy=self._deterministic)
         action = self._acts.act(self.memory, ROW, seen, turn)
         self._before = seen, action

@@ -14,6 +14,7 @@ from skillweave.collecting.levels import Level
 from skillweave.collecting.restored import known
 from skillweave.experience import Batch, Trace, padded_last_axis
 from skillweave.paths import SELECTOR
+from skillweave.policies.hierarchy import unless_none
 from skillweave.policies.parts import OBSERVATION
 from skillweave.types import Array
 
@@ -196,8 +197,7 @@ class OpenCalls:
             may = level.hierarchy.may_start(seen if level.goals is None else seen[OBSERVATION])
             if (allows := trace.get(level.path + "guide_allows")) is not None:
                 may &= allows[row[on], env[on]]
-            may = may | ~may.any(axis=1, keepdims=True)
-            mask[on] = may
+            mask[on] = unless_none(may)
         return mask
 
     def _laid_out(self, values: dict[str, Array], env: Array) -> Batch:

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
@@ -123,13 +121,14 @@ class HierarchyCollector(Collector):
         self.root = Level(self.skills, within(self.policy), self.memory, self.learners, self._goals)
         self.levels = tuple(self.root.all())
         """The levels in which something learns."""
-        ready = acting is None and guide is not None and guide.decides
         self._together = learners is not None
         self._whole = self._together or as_skill is not None
         """All learn from the steps, or what they are judged by needs them as a whole."""
         self._open: dict[str, OpenCalls] = {}  # by the paths of levels whose selectors learn
         for level in self.levels:
-            if level.selector is not None or (level is self.root and not ready):
+            if level.selector is not None or (
+                level is self.root and level.hierarchy.selector is None
+            ):
                 calls = OpenCalls(level, n, self.open, keep_rewards=keep_rewards)
                 self._open[level.path] = calls
                 if level.goals is not None:
@@ -250,9 +249,9 @@ class HierarchyCollector(Collector):
         own = seen_by(self.as_skill, step, step.elapsed, goal=step.goal)
         outcome = judge(self.as_skill, own, self._all)
         terminated, truncated = outcome.terminated, step.truncated | outcome.truncated
-        if self.skills.restricts:
+        if self.skills.hierarchy.restricts:
             waits = np.flatnonzero(end != RUNNING)
-            truncated[waits] |= ~self.skills.startable(step.next_obs[waits]).any(axis=1)
+            truncated[waits] |= ~self.skills.hierarchy.may_start(step.next_obs[waits]).any(axis=1)
         return terminated, truncated & ~terminated
 
     def _write(self, out: TraceWriter, step: Step, end: Array) -> None:
@@ -329,7 +328,7 @@ class HierarchyCollector(Collector):
             yield level.path + SELECTOR if self._together else "", calls
         if not self._together:
             return
-        if level.has_critic:
+        if level.path + CRITIC in self.learners:
             yield level.path + CRITIC, self._of_critic(trace, level, steps)
         for i, skill in enumerate(level.skills):
             acts = steps["valid"] & (trace[level.path + "skill"] == i)
@@ -374,7 +373,7 @@ class HierarchyCollector(Collector):
         batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)
         if "action" not in batch:
             space = self.engine.action_space if part is None else part.action_space
-            batch = batch.replace(action=self._no_actions(trace.lead, space))
+            batch = batch.replace(action=action_codec(space).zeros(*trace.lead))
         if path not in self._states:
             return batch
         before = self.kept[f"{path}/acted"]
@@ -382,11 +381,6 @@ class HierarchyCollector(Collector):
         starts = ~np.concatenate([before[None], goes_on[:-1]])
         before[:] = goes_on[-1]
         return batch.replace(recurrent_state=self._states[path], episode_start=starts)
-
-    @staticmethod
-    def _no_actions(lead: tuple[int, int], space: gym.Space[Any]) -> Array:
-        """Return the actions of a skill that has not acted, (T, N, …) in policy units."""
-        return action_codec(space).zeros(*lead)
 
     @staticmethod
     def _inside(

@@ -32,6 +32,8 @@ class UntrainedHierarchy:
     """None: it learns."""
     guide: ActiveGuide | None = None
     """A ready selector beside it."""
+    goals: Goals | None = None
+    """Its own, as a skill that has goals."""
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -60,7 +62,7 @@ def with_learners(
         if (chooser := f"{name}/{SELECTOR}") in learners:
             selector = Learning(learners[chooser], chooser, decides=True)
         below = with_learners(policy.skills, learners, margins, f"{name}/")
-        return UntrainedHierarchy(below, selector, policy.guide)
+        return UntrainedHierarchy(below, selector, policy.guide, goals_of(skill))
 
     pairs = zip(skills.skills, skills.policies, strict=True)
     critic, interruption = path + CRITIC, None
@@ -117,11 +119,6 @@ class Level:
         """Return the column ``name``, "obs" or "next_obs", as selector and critic see it."""
         own = self.goals
         return trace[name] if own is None else own.join(trace[name], trace[self.path + "goal"])
-
-    @property
-    def has_critic(self) -> bool:
-        """A critic learns what its skills are worth."""
-        return self.path + CRITIC in self.learners
 
     @cached_property
     def below(self) -> dict[int, Level]:

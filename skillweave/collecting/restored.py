@@ -43,8 +43,11 @@ def check_numbers(
     for name, of_skill in values.items():
         if not isinstance(of_skill, range) and not of_skill.contains(kept[name]):
             raise ValueError(f"{name!r} of an open call is no goal of its skill")
-    known_by = {*values} - {*ranges}
-    own = {k: x for k, x in kept.items() if not k.startswith(OF_OTHERS) and k not in known_by}
+    own = {
+        k: x
+        for k, x in kept.items()
+        if not k.startswith(OF_OTHERS) and (k not in values or k in ranges)
+    }
     counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
     for name, those in (counts | ranges).items():
         wrong = kept[name][(kept[name] < those[0]) | (kept[name] > those[-1])]

@@ -95,6 +95,7 @@ class SkillCollector(Collector):
         if acting is not None:
             self.acting = acting
         self.skill, self.reflexes = skill, reflexes
+        self._reflexes = Reflexes(Policy(), reflexes, engine.action_space)
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
         self._named_share = named_share
@@ -208,7 +209,8 @@ class SkillCollector(Collector):
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
         if part is not None and step is not None and self._base is not None and self._base.watches:
             rows = self._all if playing is None else np.flatnonzero(playing)
-            seen_step = part_of(step, self.kept["elapsed"][rows], rows)
+            aim = None if goal is None else goal[rows]
+            seen_step = part_of(step, self.kept["elapsed"][rows], rows, None, aim)
             self._base.observe(self._base_memory, rows, part.own_step(seen_step))
         end = self._ends(raw, step, playing, goal)
         out.write(
@@ -264,11 +266,10 @@ class SkillCollector(Collector):
         last = self.kept.get("last_action")
         if self._part is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
-            action = self._part.write(action, last, self._corrected(own, goal, rows))
+            action = self._part.write(self._corrected(action, own, goal, rows), last)
             self._part.check_mask(None if mask is None else mask[rows], action[rows])
         if self.reflexes:
-            reflexes = Reflexes(Policy(), self.reflexes, self.engine.action_space)
-            action, overridden = reflexes.over(obs, action)
+            action, overridden = self._reflexes.over(obs, action)
         if playing is not None:
             searching, action = np.flatnonzero(~playing), action.copy()
             action[searching] = self._starters.act(
@@ -276,22 +277,21 @@ class SkillCollector(Collector):
             )
         return action, overridden
 
-    def _corrected(self, own: Array, goal: Array | None, rows: Array) -> Array | None:
-        """Return the actions (N, …) of the policy that the skill corrects; None: it has none.
+    def _corrected(self, action: Array, own: Array, goal: Array | None, rows: Array) -> Array:
+        """Return the actions (N, …) of the skill, added to those of the policy that it corrects.
 
         Args:
             own: (N, …), its part of the observation.
             goal: of the skill, (N, …).
-            rows: (k,) where it acts; elsewhere they are 0.
+            rows: (k,) where it acts; elsewhere what it corrects is 0.
         """
-        if self._part is None or self._base is None:
-            return None
-        shape = self._part.action_space.shape or ()
-        action = np.zeros((self.num_envs, *shape), np.float64)
+        if self._part is None or self._part.correction is None:
+            return action
+        base = np.zeros((self.num_envs, *(self._part.action_space.shape or ())), np.float64)
         if len(rows):
             turn = Turn(World(self._rng), None, None if goal is None else goal[rows])
-            action[rows] = self._base.act(self._base_memory, rows, own[rows], turn)
-        return action
+            base[rows] = self._base.act(self._base_memory, rows, own[rows], turn)
+        return self._part.correction.apply(base, action)
 
     def _search(self, step: Step, searching: Array) -> None:
         """Let environments ``searching`` (k,) go on until the skill may start in them."""
@@ -346,7 +346,7 @@ class SkillCollector(Collector):
     def _ends(
         self, raw: RawStep, step: Step | None, playing: Array | None, goal: Array | None
     ) -> Array:
-        """Return why the skill's call ended in each environment, (N,) int8; as of ``Player``."""
+        """Return why the skill's call ended in each environment, (N,) int8; as of ``CallEnd``."""
         end, skill, elapsed = np.zeros(self.num_envs, np.int8), self.skill, self.kept["elapsed"]
         if self.call_limit is not None:
             end[elapsed >= self.call_limit] = LIMIT

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
 
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import PolicyError
-from skillweave.policies.core import Around, Policy, flat
+from skillweave.policies.core import Around, Policy
+from skillweave.policies.functional import Functional, Returns
 from skillweave.policies.hierarchy import ActiveGuide, Hierarchy, Interruption
 from skillweave.policies.hierarchy import Skill as Called
-from skillweave.policies.leaves import Ready, Returns
+from skillweave.policies.leaves import Ready
 from skillweave.policies.parts import Corrects, Given, Joined, Reflexes, Remembers
 from skillweave.skills import Reflex, Skill, path_of
 from skillweave.skills.answers import ask
@@ -21,7 +22,7 @@ from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import CallGoals, Goals, goals_of
 from skillweave.skills.outputs import blame
 from skillweave.skills.own_part import ZERO, OwnPart, PartOf, Rest
-from skillweave.types import Array, Memoryless
+from skillweave.types import Memoryless
 
 
 @dataclass(frozen=True)
@@ -69,15 +70,6 @@ class SkillSet:
     def hierarchy(self) -> Hierarchy:
         """The skills in calls, without a selector."""
         return hierarchy_of(self)
-
-    @property
-    def restricts(self) -> bool:
-        """True if some skill, here or in a hierarchy below, may not start everywhere."""
-        return self.hierarchy.restricts
-
-    def startable(self, obs: Array) -> Array:
-        """Choices whose skill may start, (n, choices) bool; perhaps none in some observation."""
-        return self.hierarchy.may_start(obs)
 
     @property
     def action_space(self) -> gym.Space[Any]:
@@ -158,11 +150,11 @@ def hierarchy_of(
     inside = [_skill(skills, i) for i in range(len(skills.skills))]
     with_goals = {i: skill.goals for i, skill in enumerate(inside) if skill.goals is not None}
     return Hierarchy(
-        None if selector is None else _leaf(selector, "the selector's act()"),
+        None if selector is None else _selects(selector, "the selector's act()"),
         inside,
         ask,
         lengths=skills.lengths,
-        guide=guide and replace(guide, selector=_leaf(guide.selector, "the guide")),
+        guide=guide and replace(guide, selector=_selects(guide.selector, "the guide")),
         interruption=skills.interruption,
         call_goals=CallGoals(with_goals) if with_goals and skills.interruption else None,
         fresh_calls=goals is not None,
@@ -179,19 +171,20 @@ def within(policy: Policy) -> Hierarchy:
     return policy
 
 
-def in_place(policy: Any) -> Policy:
-    """Return a policy of any form as one whose memory is changed in place."""
+def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
+    """Return a policy of any form as one whose memory is changed in place; ``who`` for messages."""
     if isinstance(policy, Policy):
         return policy
-    found = getattr(policy, "in_place", None)
-    return found if isinstance(found, Policy) else _leaf(policy, "the policy's act()")
+    if isinstance(policy, Functional) and policy.is_plain:
+        return policy.in_place
+    watches = getattr(type(policy), "observe", None) is not Memoryless.observe
+    return Returns(policy, who, blame, watches=watches)
 
 
 def _skill(skills: SkillSet, i: int) -> Called:
     skill, part = skills.skills[i], skills.part(i)
     path, goals = path_of(skill), goals_of(skill)
     policy = policy_of(skills.policies[i], goals, part, f"skill {path!r}: its policy's act()")
-    _check_memory(policy, skill)
     if part is not None:
         policy = PartOf(part, policy)
     asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
@@ -205,53 +198,52 @@ def _outermost(policy: Policy, skills: SkillSet, remembers: bool) -> Policy:
     return Remembers(policy, Rest(ZERO, skills.action_space).start) if remembers else policy
 
 
-def policy_of(policy: Any, goals: Goals | None, part: OwnPart | None, who: str) -> Policy:
+def policy_of(
+    policy: Any, goals: Goals | None, part: OwnPart | None, who: str, *, outermost: bool = False
+) -> Policy:
     """Return a skill's policy, whose actions are those of its own part.
 
     Args:
         policy: of any form; None: it is not there yet.
         goals, part: of the skill.
         who: for messages.
+        outermost: see ``acting_policy``.
     """
     if policy is None:
         return Policy()
-    if (below := skills_below(policy)) is not None and hasattr(policy, "selector"):
-        return acting_policy(below, policy.selector, policy.guide, goals, outermost=False)
-    own = _leaf(policy, who)
-    own = own if goals is None else Joined(own)
+    known = policy.is_plain if isinstance(policy, Functional) else not hasattr(policy, "act")
+    if known and hasattr(policy, "selector"):
+        how = policy.skills, policy.selector, policy.guide, policy.goals
+        inside, joins = acting_policy(*how, outermost=outermost), policy.goals is None
+    else:
+        inside, joins = in_place(policy, who), True
+        _check_memory(inside, who.removesuffix("'s act()"))
+    inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
-        return own
-    return Corrects(own, base_of(part, goals), part.correction.apply)
+        return inside
+    return Corrects(inside, base_of(part, goals), part.correction.apply)
 
 
 def base_of(part: OwnPart, goals: Goals | None) -> Policy:
     """Return the policy that a skill corrects; a hierarchy remembers its own last actions."""
-    base: Any = part.base
-    if (below := skills_below(base)) is not None:
-        return acting_policy(below, base.selector, base.guide, goals)
-    return policy_of(base, goals, None, f"{part.who}: the act() of the policy that it corrects")
+    who = f"{part.who}: the act() of the policy that it corrects"
+    return policy_of(part.base, goals, None, who, outermost=True)
 
 
 ENDS = ("initiation", "termination", "success")
 """The methods of a skill that are asked while it acts."""
 
 
-def _leaf(policy: Any, who: str) -> Policy:
-    if isinstance(policy, Policy):
-        return policy
-    if hasattr(policy, "watch"):
-        return Ready(policy, partial(blame, who=who))
-    watches = getattr(type(policy), "observe", None) is not Memoryless.observe
-    return Returns(policy, partial(blame, who=who), watches=watches)
+def _selects(selector: Any, who: str) -> Policy:
+    """Return a selector's policy; one that is not trained watches how calls end."""
+    return Ready(selector, who, blame) if hasattr(selector, "watch") else in_place(selector, who)
 
 
-def _check_memory(policy: Policy, skill: Skill) -> None:
+def _check_memory(policy: Policy, who: str) -> None:
     """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
-    if isinstance(policy, Hierarchy | Reflexes):
-        return
-    for name, value in flat(policy.start(1)).items():
+    for name, value in policy.start(1).items() if isinstance(policy, Returns) else ():
         if value.dtype.kind not in "biuf":
             raise PolicyError(
-                f"skill {skill.name!r}: its policy remembers {name!r} as {value.dtype}; a memory "
-                "is an array of numbers whose first axis is the environment"
+                f"{who} remembers {name!r} as {value.dtype}; a memory is an array of numbers whose "
+                "first axis is the environment"
             )

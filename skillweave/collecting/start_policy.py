@@ -125,7 +125,7 @@ class StartPolicy:
         assert self.skills is not None
         if not len(ids):
             return
-        may = self.skills.startable(obs[ids])
+        may = self.skills.hierarchy.may_start(obs[ids])
         if last is not None:
             is_named = np.repeat(self._is_named, may.shape[1] // len(self._is_named))
             restricted = last[ids] & (may & is_named).any(axis=1)

@@ -85,5 +85,7 @@ def learning_set(roles: Roles, level: Level, policies: Mapping[str, Policy]) -> 
     for inner in reversed(inside):
         selector = policies[inner.selector_path] if inner.ready_selector is not None else None
         guide = learning_guide(roles, inner)
-        parts[inner.path] = UntrainedHierarchy(inner.skill_set(parts), selector, guide)
+        parts[inner.path] = UntrainedHierarchy(
+            inner.skill_set(parts), selector, guide, goals_of(inner.as_skill)
+        )
     return level.skill_set(parts)

@@ -16,7 +16,7 @@ from skillweave.envs.infos import allowed_rows
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies.core import RUNNING, Turn, World, restart
-from skillweave.policies.hierarchy import SKILL
+from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
 from skillweave.seeding import Seeds
 from skillweave.skills.goals import as_goals
@@ -172,7 +172,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         mask[terminated] = True
         limited = np.flatnonzero(truncated & ~terminated)
         if len(limited):
-            mask[limited] = self._hierarchy.allowed(self._memory, limited, next_obs[limited])
+            mask[limited] = unless_none(self._hierarchy.may_start(next_obs[limited]))
         return {"action_mask": self._mask, "next_action_mask": mask}
 
     def _final(self, next_obs: Array, ended: Array) -> dict[str, Any]:

@@ -8,72 +8,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
-import numpy as np
-
 from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet, acting_alone, acting_policy
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies.core import Memory as InPlaceMemory
-from skillweave.policies.core import Policy as InPlace
-from skillweave.policies.core import Turn, World, flat, nested
+from skillweave.policies.core import flat, split
+from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide, Interruption
-from skillweave.policies.parts import GOAL, OBSERVATION, OWN_GOAL
+from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.foreign_policy import checksum, source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.types import Array, Memory, Policy, Step
-
-
-class Functional:
-    """A policy as ``skillweave.Policy`` says, over one whose memory is changed in place.
-
-    Args:
-        in_place: the same policy.
-        joins: it observes its goal beside the observation.
-    """
-
-    labels: tuple[str, ...] = ()
-
-    def __init__(self, in_place: InPlace, *, joins: bool = False) -> None:
-        self.in_place, self._joins = in_place, joins
-        self._like = in_place.start(0)
-
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments whose episodes start."""
-        return flat(self.in_place.start(n))
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
-
-        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
-
-        ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
-        selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
-        """
-        memory, goal = {k: v.copy() for k, v in memory.items()}, None
-        if self._joins:
-            obs, goal = obs[OBSERVATION], obs[GOAL]
-        turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
-        return self.in_place.act(nested(self._like, memory), rows, obs, turn), memory
-
-    def observe(self, memory: Memory, step: Step) -> Memory:
-        """Return the ``memory`` after a ``step``; calls that are over end in it."""
-        memory = {k: v.copy() for k, v in memory.items()}
-        self.in_place.observe(nested(self._like, memory), np.arange(len(step.reward)), step)
-        return memory
-
-    def acting(self, memory: Memory) -> Array | None:
-        """Return the running skills in a ``memory``, (n,) int64; None: it has no skills."""
-        return memory["skill"] if self.labels else None
+from skillweave.types import Array, Policy
 
 
 @checked_names
@@ -136,7 +83,7 @@ class HierarchyPolicy(Functional):
         Returns:
             (…) an element of ``goal_space``, or None.
         """
-        memory = self._whole(memory)
+        memory = split(flat(memory))
         i = str(memory["skill"][row])
         policy = self.skills.policies[int(i)]
         if isinstance(policy, HierarchyPolicy):
@@ -146,16 +93,12 @@ class HierarchyPolicy(Functional):
 
     def acts(self, memory: InPlaceMemory, row: int = 0) -> str:
         """Return the path of the skill that acts in environment ``row``: ``inner/skill``."""
-        memory = self._whole(memory)
+        memory = split(flat(memory))
         i = int(memory["skill"][row])
         name, policy = self.labels[i], self.skills.policies[i]
         if not isinstance(policy, HierarchyPolicy):
             return name
         return f"{name}/{policy.acts(memory[str(i)], row)}"
-
-    def _whole(self, memory: InPlaceMemory) -> InPlaceMemory:
-        """Return a memory as that of ``in_place``, which has the memories of parts in it."""
-        return memory if "selector" in memory else nested(self._like, memory)
 
 
 def with_interruption(skills: SkillSet, critic: Any, margin: float) -> SkillSet:

@@ -97,7 +97,7 @@ def forecast(planner: Planner) -> Forecast:
     obs, state, elapsed = first.copy(), machine.start(n), np.zeros(n, np.int64)
     may, running = np.ones((n, log.choices), bool), np.ones(n, bool)
     if graph.skills is not None:
-        may = graph.skills.startable(first)
+        may = graph.skills.hierarchy.may_start(first)
     # Of each call the skill (−1: none), its steps, and how far the nearest logged one was.
     history = np.full((MOST_CALLS, 3, n), -1.0)
     for calls in history:

@@ -197,8 +197,8 @@ class CallGraph:
         own = log.choice[call[self._cut]]
         self.may[self._cut] = own[:, None] == np.arange(log.choices)
         parts = np.flatnonzero(~whole)
-        if len(parts) and skills is not None and skills.restricts:
-            self.may[parts] = skills.startable(self.end[parts])
+        if len(parts) and skills is not None and skills.hierarchy.restricts:
+            self.may[parts] = skills.hierarchy.may_start(self.end[parts])
         self._end_features = [each(self.end) for each in self.maps]
         self._depths = _by_depth(pieces.then)
         self._after: Near | None = None
@@ -419,8 +419,8 @@ class CallGraph:
         features = [each(end) for each in self.maps]
         same = all(np.array_equal(a, b) for a, b in zip(features, self._end_features, strict=True))
         may = self.may
-        if self.skills is not None and self.skills.restricts:
-            may = self.skills.startable(end)
+        if self.skills is not None and self.skills.hierarchy.restricts:
+            may = self.skills.hierarchy.may_start(end)
         return (self.after if same else self.near_features(features)), may
 
 

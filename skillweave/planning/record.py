@@ -181,7 +181,7 @@ class WithDrawnGoals(Around):
     """
 
     def __init__(self, selector: Any, skills: SkillSet, space: gym.Space[Any]) -> None:
-        super().__init__(in_place(selector))
+        super().__init__(in_place(selector, "the selector's act()"))
         self._selector, self._skills, self._space = selector, skills, space
         self._goals = goals_in(skills)
 
@@ -206,16 +206,12 @@ class WithDrawnGoals(Around):
 
 def _selector(choose: Any, skills: SkillSet, engine: Engine) -> Any:
     names, choices = tuple(s.name for s in skills.skills), skills.choice_space
-    chooses: Any = None
     if isinstance(choose, str) and choose == "random":
-        chooses = RandomChoice(skills.choices)
-    elif isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
+        choose = RandomChoice(skills.choices)
+    if isinstance(choose, LearnsFromCalls) and not isinstance(choose, type):
         choose.begin(skills.choices)
-        chooses = choose
-    elif isinstance(choose, RandomChoice):
-        chooses = choose
-    if chooses is not None:
-        return WithDrawnGoals(chooses, skills, choices) if goals_in(skills) else chooses
+    if isinstance(choose, InPlace | LearnsFromCalls) and not isinstance(choose, type):
+        return WithDrawnGoals(choose, skills, choices) if goals_in(skills) else choose
     if isinstance(choose, ReadySelector) or not hasattr(choose, "act"):
         if (ready := ready_selector(choose, names)) is not None:
             return ready.bind(engine.observation_space, choices, "selector")

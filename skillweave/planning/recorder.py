@@ -299,7 +299,7 @@ class Recorder:
             known[over],
             trace["env_terminated"][over],
             trace["env_truncated"][over],
-            self.skills.startable(trace["next_obs"][over]),
+            self.skills.hierarchy.may_start(trace["next_obs"][over]),
         )
 
     def _cut_before(self, goes_on: Array, ids: Array) -> list[tuple[Array, ...]]:
@@ -367,7 +367,16 @@ class Recorder:
                 *(goals.flat(goals.start(0)) for goals in self.goals.values()),
             ),
             steps if first is None else tuple(column[:0] for column in first),
-            [(whole, np.zeros(0, np.int8), truth, truth, truth, self.skills.startable(obs))],
+            [
+                (
+                    whole,
+                    np.zeros(0, np.int8),
+                    truth,
+                    truth,
+                    truth,
+                    self.skills.hierarchy.may_start(obs),
+                )
+            ],
         )
 
 

@@ -264,38 +264,22 @@ class Around(Policy):
         self.restricts = policy.restricts
         self.fresh_calls = policy.fresh_calls
 
-    def start(self, n: int) -> Memory:
-        """As of the policy."""
-        return self.policy.start(n)
 
-    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """As of the policy."""
-        return self.policy.act(memory, rows, obs, turn)
+def _forward(name: str) -> Callable[..., Any]:
+    def call(self: Around, *arguments: Any) -> Any:
+        return getattr(self.policy, name)(*arguments)
 
-    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
-        """As of the policy."""
-        self.policy.observe(memory, rows, step)
+    return call
 
-    def startable(self, obs: Array) -> Array:
-        """As of the policy."""
-        return self.policy.startable(obs)
 
-    def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array | bool:
-        """As of the policy."""
-        return self.policy.stuck(memory, rows, obs)
-
-    def redraws(self, greedy: bool) -> bool:
-        """As of the policy."""
-        return self.policy.redraws(greedy)
-
-    def values(self) -> dict[str, Any]:
-        """As of the policy."""
-        return self.policy.values()
+for _name, _method in vars(Policy).items():  # a combinator can forget none of them
+    if callable(_method):
+        setattr(Around, _name, _forward(_name))
 
 
 Asks: TypeAlias = Callable[[Callable[..., Any], Any, Array, str, str], Array]
-"""How functions of users are asked: of a function, a step or observations, the environments (k,)
-that they are of, the skill's path and its name: what it answers, (k,) bool."""
+"""How functions of users are asked: of a function, a step or observations, the rows (k,) that they
+are of, the skill's path and its name: what it answers, (k,) bool."""
 
 
 def observed(obs: Array) -> str:
@@ -340,3 +324,15 @@ def nested(like: Memory, arrays: Mapping[str, Array], prefix: str = "") -> Memor
         k: nested(v, arrays, f"{prefix}{k}.") if isinstance(v, dict) else arrays[prefix + k]
         for k, v in like.items()
     }
+
+
+def split(arrays: Mapping[str, Array]) -> Memory:
+    """Return arrays by dotted names as a memory; parts that remember nothing are left out."""
+    found: Memory = {}
+    for name, value in arrays.items():
+        *parts, last = name.split(".")
+        inside = found
+        for part in parts:
+            inside = inside.setdefault(part, {})
+        inside[last] = value
+    return found

@@ -270,7 +270,12 @@ class Hierarchy(Policy):
         if choice.dtype.fields is not None:
             goals = {i: choice[GOAL][self.skills[i].name] for i in self.goals}
             choice = choice[SKILL]
-        skill = self.skill_of(choice)
+        skill = self.skill_of(np.asarray(choice).astype(np.int64, copy=False))
+        if not ((skill >= 0) & (skill < len(self.skills))).all():
+            raise SkillError(
+                f"the selector chose {choice.tolist()}, but there are {self.choices} choices, "
+                f"from 0 to {self.choices - 1}"
+            )
         for i in self.goals:
             mine = np.flatnonzero(skill == i)
             if not len(mine):
@@ -282,7 +287,9 @@ class Hierarchy(Policy):
                 )
             memory["goal"][str(i)][rows[mine]] = goals[i][mine]
         if self.lengths:
-            memory["limit"][rows] = np.array(self.lengths)[choice % self._each]
+            memory["limit"][rows] = np.array(self.lengths)[
+                np.asarray(choice, np.int64) % self._each
+            ]
         fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
         memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
         for i, own in enumerate(self.skills):
@@ -372,17 +379,6 @@ class Hierarchy(Policy):
             return may
         left: Array = self.guide.selector.ahead(memory["guide"], rows, may)
         return left
-
-    def allowed(self, memory: Memory, rows: Array, obs: Array) -> Array | None:
-        """Return the choices that may be made next in environments ``rows`` (k,), (k, choices).
-
-        Nothing changes: of a guide, only what is known before it sees ``obs`` (k, …) counts. None:
-        all, always. Where none is left, all are True.
-        """
-        if not self.restricts and self.guide is None:
-            return None
-        may = self.guided(memory, rows, self.may_start(obs))
-        return may | ~may.any(axis=1, keepdims=True)
 
     def stuck(self, memory: Memory, rows: Array, obs: Array) -> Array:
         """(k,) bool, the selector must decide, but no skill may start; its own call ends there."""
@@ -521,3 +517,8 @@ def _by_skill(running: Array) -> Iterator[tuple[int, Array]]:
         return
     for i in present:
         yield i, np.flatnonzero(running == i)
+
+
+def unless_none(may: Array) -> Array:
+    """Return choices that may be made, (k, choices) bool; all where none may."""
+    return may | ~may.any(axis=1, keepdims=True)

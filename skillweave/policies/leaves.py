@@ -1,54 +1,13 @@
-"""Policies that contain no other: those that return their memory, networks, ready selectors."""
+"""Policies that contain no other: ready selectors, and networks that learn."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from .core import Array, LastCall, Memory, Policy, Step, Turn, put
-
-
-class Returns(Policy):
-    """A policy of ``skillweave.Policy``: it is given its own rows, and returns its memory.
-
-    Args:
-        blame: raises an error of the policy's ``act`` with other words.
-        watches: its ``observe`` has something to notice.
-    """
-
-    def __init__(
-        self, policy: Any, blame: Callable[[BaseException], NoReturn], *, watches: bool = False
-    ) -> None:
-        self.policy = policy
-        self._blame = blame
-        self.watches = watches
-        self._names = tuple(policy.start(0))
-
-    def start(self, n: int) -> Memory:
-        """Return the policy's fresh memory."""
-        memory: Memory = self.policy.start(n)
-        return memory
-
-    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
-        """Return the policy's actions."""
-        how: Any = {"deterministic": turn.greedy, "rng": turn.world.rng}
-        try:
-            action, after = self.policy.act(self._of(memory, rows), obs, turn.mask, **how)
-        except (Exception, SystemExit) as error:
-            self._blame(error)
-        put(memory, rows, after)
-        found: Array = action
-        return found
-
-    def observe(self, memory: Memory, rows: Array, step: Step) -> None:
-        """Let the policy notice a step."""
-        put(memory, rows, self.policy.observe(self._of(memory, rows), step))
-
-    def _of(self, memory: Memory, rows: Array) -> Memory:
-        """Return a copy of what the policy remembers in ``rows`` (k,), without what others do."""
-        return {name: memory[name][rows] for name in self._names}
+from .core import Array, LastCall, Memory, Policy, Step, Turn
+from .functional import Returns
 
 
 class Ready(Returns):
@@ -66,7 +25,7 @@ class Ready(Returns):
         own = len(self.policy.skills) * max(1, len(self.policy.lengths))
         lengths = may.shape[1] // own
         chances, after = self.policy.chances(self._of(memory, rows), obs, may[:, ::lengths])
-        put(memory, rows, after)
+        self._keep(memory, rows, after)
         found: Array = chances.repeat(lengths, axis=1) / np.float32(lengths)
         return found
 
@@ -80,7 +39,7 @@ class Ready(Returns):
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Show it a step, and how the last calls ended."""
-        put(memory, rows, self.policy.watch(self._of(memory, rows), step, last))
+        self._keep(memory, rows, self.policy.watch(self._of(memory, rows), step, last))
 
     def redraws(self, greedy: bool) -> bool:
         """Return False: what it chooses follows from what it sees."""

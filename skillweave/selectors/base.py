@@ -64,7 +64,7 @@ class ReadySelector(Foreign):
         return dict(goals.spaces) if isinstance(goals, Dict) else {}
 
     def with_goals(self, skill: Array, goals: Mapping[str, tuple[Array, Any]], obs: Array) -> Array:
-        """Return choices of skills (n,) with their goals, as a ``Player`` takes them.
+        """Return choices of skills (n,) with their goals, as a ``Hierarchy`` takes them.
 
         Args:
             skill: (n,) the chosen skills.

@@ -179,17 +179,6 @@ class Goals:
         flat = [x.reshape(len(goal), math.prod(x.shape[1:])).astype(np.float64) for x in columns]
         return np.concatenate(flat, axis=1)
 
-    def from_flat(self, numbers: Array) -> Array:
-        """Return the goals (n, *goal_shape) of which ``flat`` returned ``numbers`` (n, G)."""
-        goal = np.repeat(self._one[None], len(numbers), axis=0)
-        first = 0
-        for path in leaf_paths(self.space):
-            part = part_at(goal, path)
-            size = math.prod(part.shape[1:])
-            part[...] = numbers[:, first : first + size].reshape(part.shape)
-            first += size
-        return goal
-
     @property
     def _label(self) -> str:
         return f"{self._who}: goals()"

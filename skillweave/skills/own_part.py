@@ -627,16 +627,13 @@ class OwnPart:
             return own.reshape(len(action), *(space.shape or ()))
         return _joined(space, written.paths, action)
 
-    def write(self, own: Array, last: Array | None, base: Array | None = None) -> Array:
+    def write(self, own: Array, last: Array | None) -> Array:
         """Return whole actions (n, …) of its own ones (n, …).
 
         Args:
             last: (n, …), the last actions; needed only where it ``holds``.
-            base: (n, …), the actions that it corrects; None: they are corrected already.
         """
         written = self.written
-        if self.correction is not None and base is not None:
-            own = self.correction.apply(base, own)
         if written is None:
             return own
         if isinstance(self.whole_action_space, Discrete):

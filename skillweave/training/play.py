@@ -12,7 +12,7 @@ from skillweave.collecting.skill_set import in_place
 from skillweave.envs.engine import Engine
 from skillweave.envs.infos import allowed_rows
 from skillweave.policies.core import Memory as InPlaceMemory
-from skillweave.policies.core import Turn, World, restart
+from skillweave.policies.core import Turn, World, flat, put, split, take
 from skillweave.types import Array, Policy, Step
 
 
@@ -85,6 +85,7 @@ def play(
     """
     n, acts, world = episodes.num_envs, in_place(policy), World(rng)
     memory, choose_goals = acts.start(n), getattr(policy, "choose_goals", None)
+    shown = split(flat(memory))  # the same arrays
 
     def begin(rows: Array) -> None:
         """Let a skill that acts alone choose goals where episodes start."""
@@ -103,13 +104,13 @@ def play(
         before = memory["elapsed"][rows] if "elapsed" in memory else np.ones(len(rows))
         played = episodes.step(action)
         acts.observe(memory, rows, played.step)
-        played.memory, played.acting, played.call_start = memory, acting, before == 0
+        played.memory, played.acting, played.call_start = shown, acting, before == 0
         if acting is not None and "end" in memory:
             played.elapsed, played.why = memory["elapsed"][rows], memory["end"][rows]
         yield played
         restarted = episodes.go_on(played)
         if len(restarted):
-            restart(acts, memory, restarted)
+            put(memory, restarted, take(acts.start(n), restarted))
             begin(restarted)
 
 

@@ -21,6 +21,7 @@ from skillweave.collecting.calls import SMOOTHED
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.policies.core import CallEnd
+from skillweave.policies.hierarchy import unless_none
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.types import Array
@@ -249,4 +250,4 @@ def test_where_no_skill_may_start_all_choices_are_open_to_the_value_of_what_foll
     policy = hierarchy_of(SkillSet(skills, (scripted(0), scripted(2)), call_steps=Lengths(1, 2)))
     obs = np.zeros((2, 4), np.float32)
     obs[1, T] = 1
-    assert policy.allowed(policy.start(2), np.arange(2), obs).all()
+    assert unless_none(policy.may_start(obs)).all()

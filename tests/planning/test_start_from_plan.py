@@ -90,7 +90,7 @@ def test_a_selector_starts_as_the_plan(planned: Run) -> None:
     obs = np.float32([[2, 0, 0], [4, 0, 0], [0, 1, 0], [5, 1, 0], [6, 1, 1]])
     state = np.array([[0, 0], [1, 0], [1, 0], [1, 0], [2, 0]])
     seen = view.joined(obs, TASK.observe(state))
-    may = planned.policy.skills.startable(obs)
+    may = planned.policy.skills.hierarchy.may_start(obs)
     chosen, _ = start.policy.act({}, seen, may)
     q = np.where(may, planned.hierarchy.selector.values(obs, state), -np.inf)
     assert (q[np.arange(len(q)), chosen] >= 0.95 * q.max(1)).all()

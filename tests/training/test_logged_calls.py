@@ -87,7 +87,7 @@ def assert_whole(log: CallLog, policy: Any, limits: dict[str, int]) -> None:
         if skill.defines("success"):
             won = np.asarray(skill.success(step))[log.offset[1:] - 1]
         assert (log.succeeded[calls] == won[calls]).all()
-    assert (log.may_follow == skills.startable(log.end)).all()
+    assert (log.may_follow == skills.hierarchy.may_start(log.end)).all()
     following = log.followed_by
     first = np.flatnonzero(following >= 0)
     assert len(first) > len(log) / 3
