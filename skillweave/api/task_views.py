@@ -15,9 +15,10 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.skill_set import SkillSet, policy_of
-from skillweave.hierarchy.policy import Functional, HierarchyPolicy
+from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning.task_env import OwnView
 from skillweave.policies.core import LastCall
+from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.parts import Viewed
 from skillweave.selectors import ReadySelector
