@@ -216,7 +216,8 @@ def policy_of(
         how = policy.skills, policy.selector, policy.guide, policy.goals
         inside, joins = acting_policy(*how, outermost=outermost), policy.goals is None
     else:
-        inside, joins = in_place(policy, who), True
+        inside = in_place(policy, who)
+        joins = not (known and isinstance(policy, Functional) and policy.joins)
         _check_memory(inside, who.removesuffix("'s act()"))
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:

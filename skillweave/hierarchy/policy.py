@@ -78,7 +78,7 @@ class HierarchyPolicy(Functional):
         return {"sha256": checksum(whole.encode())}
 
     def goal_now(self, memory: InPlaceMemory, row: int = 0) -> Array | None:
-        """Return the goal of the skill that acts in environment ``row``; None: it has none.
+        """Return the goal of the skill that acts in ``row`` of a ``memory``; None: it has none.
 
         Returns:
             (…) an element of ``goal_space``, or None.
@@ -92,7 +92,7 @@ class HierarchyPolicy(Functional):
         return None if goals is None else goals[row]
 
     def acts(self, memory: InPlaceMemory, row: int = 0) -> str:
-        """Return the path of the skill that acts in environment ``row``: ``inner/skill``."""
+        """Return the path of the skill that acts in ``row`` of a ``memory``: ``inner/skill``."""
         memory = split(flat(memory))
         i = int(memory["skill"][row])
         name, policy = self.labels[i], self.skills.policies[i]

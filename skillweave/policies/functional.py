@@ -23,22 +23,23 @@ class Functional:
     labels: tuple[str, ...] = ()
 
     def __init__(self, in_place: Policy, *, joins: bool = False) -> None:
-        self.in_place, self._joins = in_place, joins
+        self.in_place = in_place
+        self.joins = joins
         self._like = in_place.start(1)
 
-    def start(self, n: int) -> dict[str, Array]:
+    def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""
         return flat(self.in_place.start(n))
 
     def act(
         self,
-        memory: dict[str, Array],
+        memory: Memory,
         obs: Array,
         mask: Array | None = None,
         *,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
-    ) -> tuple[Array, dict[str, Array]]:
+    ) -> tuple[Array, Memory]:
         """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
 
         ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
@@ -47,18 +48,18 @@ class Functional:
         selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
         """
         memory, goal = {k: v.copy() for k, v in memory.items()}, None
-        if self._joins:
+        if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
         turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
         return self.in_place.act(nested(self._like, memory), rows, obs, turn), memory
 
-    def observe(self, memory: dict[str, Array], step: Step) -> dict[str, Array]:
+    def observe(self, memory: Memory, step: Step) -> Memory:
         """Return the ``memory`` after a ``step``; calls that are over end in it."""
         memory = {k: v.copy() for k, v in memory.items()}
         self.in_place.observe(nested(self._like, memory), np.arange(len(step.reward)), step)
         return memory
 
-    def acting(self, memory: dict[str, Array]) -> Array | None:
+    def acting(self, memory: Memory) -> Array | None:
         """Return the running skills in a ``memory``, (n,) int64; None: it has no skills."""
         inside = getattr(self, "policy", self)  # of a skill that acts alone
         if isinstance(inside, Functional):
