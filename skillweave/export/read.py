@@ -520,7 +520,7 @@ def _method(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _samples(entry: dict[str, Any]) -> bool:
-    """Return whether an entry draws its actions; of a hierarchy, whether its selector does."""
-    if inside := {"Part": "policy", "Hierarchy": "selector"}.get(entry.get("kind", "")):
-        return _samples(entry[inside])
+    """Return whether an entry draws its actions; a hierarchy's selector says that for itself."""
+    if entry.get("kind") == "Part":
+        return _samples(entry["policy"])
     return bool(entry.get("noise")) or entry.get("sampled") is True
