@@ -12,8 +12,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.errors import PolicyError
 from skillweave.policies.core import Around, Policy
 from skillweave.policies.functional import Functional, Returns
-from skillweave.policies.hierarchy import ActiveGuide, Hierarchy, Interruption
-from skillweave.policies.hierarchy import Skill as Called
+from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
 from skillweave.policies.leaves import Ready
 from skillweave.policies.parts import Corrects, Given, Joined, Reflexes, Remembers
 from skillweave.skills import Reflex, Skill, path_of
@@ -181,14 +180,16 @@ def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
     return Returns(policy, who, blame, watches=watches)
 
 
-def _skill(skills: SkillSet, i: int) -> Called:
+def _skill(skills: SkillSet, i: int) -> CalledSkill:
     skill, part = skills.skills[i], skills.part(i)
     path, goals = path_of(skill), goals_of(skill)
     policy = policy_of(skills.policies[i], goals, part, f"skill {path!r}: its policy's act()")
     if part is not None:
         policy = PartOf(part, policy)
     asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
-    return Called(skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks)
+    return CalledSkill(
+        skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks
+    )
 
 
 def _outermost(policy: Policy, skills: SkillSet, remembers: bool) -> Policy:
@@ -218,7 +219,7 @@ def policy_of(
     else:
         inside = in_place(policy, who)
         joins = not (known and isinstance(policy, Functional) and policy.joins)
-        _check_memory(inside, who.removesuffix("'s act()"))
+        _check_memory(inside)
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside
@@ -240,11 +241,13 @@ def _selects(selector: Any, who: str) -> Policy:
     return Ready(selector, who, blame) if hasattr(selector, "watch") else in_place(selector, who)
 
 
-def _check_memory(policy: Policy, who: str) -> None:
+def _check_memory(policy: Policy) -> None:
     """Raise a PolicyError where a checkpoint could not hold what a policy remembers."""
-    for name, value in policy.start(1).items() if isinstance(policy, Returns) else ():
+    if not isinstance(policy, Returns):
+        return
+    for name, value in policy.start(1).items():
         if value.dtype.kind not in "biuf":
             raise PolicyError(
-                f"{who} remembers {name!r} as {value.dtype}; a memory is an array of numbers whose "
-                "first axis is the environment"
+                f"{policy.who} remembers {name!r} as {value.dtype}; a memory is an array of "
+                "numbers whose first axis is the environment"
             )

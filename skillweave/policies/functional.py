@@ -93,7 +93,9 @@ class Returns(Policy):
     ) -> None:
         self.policy = policy
         self.watches = watches
-        self._who = who
+        self.who = who.removesuffix("'s act()")
+        """Whose policy it is, for messages."""
+        self._acting = who
         self._blame = blame
         self._names: frozenset[str] = frozenset()
 
@@ -109,7 +111,7 @@ class Returns(Policy):
         try:
             action, after = self.policy.act(self._of(memory, rows), obs, turn.mask, **how)
         except (Exception, SystemExit) as error:
-            self._blame(error, self._who)
+            self._blame(error, self._acting)
         self._keep(memory, rows, after)
         found: Array = action
         return found
@@ -130,7 +132,7 @@ class Returns(Policy):
         """
         if after.keys() != self._names:
             raise PolicyError(
-                f"{self._who}: the memory has {sorted(after)}, but start() gave "
+                f"{self.who}: the memory has {sorted(after)}, but start() gave "
                 f"{sorted(self._names)}: return arrays of the same names"
             )
         for name, value in after.items():
@@ -138,7 +140,7 @@ class Returns(Policy):
             fits = new.dtype == old.dtype or np.can_cast(new.dtype, old.dtype, "same_kind")
             if new.shape != (len(rows), *old.shape[1:]) or not fits:
                 raise PolicyError(
-                    f"{self._who}: the memory {name!r} is {new.dtype} {new.shape}, but by start() "
+                    f"{self.who}: the memory {name!r} is {new.dtype} {new.shape}, but by start() "
                     f"it would be {old.dtype} {(len(rows), *old.shape[1:])}: let start() return "
                     "arrays of the type and shape that they keep"
                 )

@@ -50,7 +50,7 @@ TRIES = 16
 
 
 @dataclass
-class Skill:
+class CalledSkill:
     """A skill of a hierarchy: its policy, and when calls of it start and end."""
 
     name: str
@@ -123,7 +123,7 @@ class Hierarchy(Policy):
     def __init__(
         self,
         selector: Policy | None,
-        skills: Sequence[Skill],
+        skills: Sequence[CalledSkill],
         ask: Asks,
         *,
         lengths: tuple[int, ...] = (),
@@ -270,7 +270,8 @@ class Hierarchy(Policy):
         if choice.dtype.fields is not None:
             goals = {i: choice[GOAL][self.skills[i].name] for i in self.goals}
             choice = choice[SKILL]
-        skill = self.skill_of(np.asarray(choice).astype(np.int64, copy=False))
+        choice = np.asarray(choice).astype(np.int64, copy=False)
+        skill = self.skill_of(choice)
         if not ((skill >= 0) & (skill < len(self.skills))).all():
             raise SkillError(
                 f"the selector chose {choice.tolist()}, but there are {self.choices} choices, "
@@ -287,9 +288,7 @@ class Hierarchy(Policy):
                 )
             memory["goal"][str(i)][rows[mine]] = goals[i][mine]
         if self.lengths:
-            memory["limit"][rows] = np.array(self.lengths)[
-                np.asarray(choice, np.int64) % self._each
-            ]
+            memory["limit"][rows] = np.array(self.lengths)[choice % self._each]
         fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
         memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
         for i, own in enumerate(self.skills):
