@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from skillweave.policies.errors import DeclarationError as DeclarationError
 from skillweave.policies.errors import PolicyError as PolicyError
+from skillweave.policies.errors import RunError as RunError
 from skillweave.policies.errors import SkillError as SkillError
 from skillweave.policies.errors import SkillweaveError as SkillweaveError
 from skillweave.policies.errors import printable
@@ -16,8 +18,8 @@ from skillweave.tracebacks import ShortTraceback
 SkillweaveError._render_traceback_ = ShortTraceback._render_traceback_  # type: ignore[attr-defined]
 
 
-class DeclarationError(SkillweaveError):
-    """A setting, an argument or a declaration is wrong; raised before anything is trained."""
+for _kind in (SkillweaveError, DeclarationError, PolicyError, RunError, SkillError):
+    _kind.__module__ = __name__  # where users find it
 
 
 class EnvError(SkillweaveError):
@@ -26,10 +28,6 @@ class EnvError(SkillweaveError):
 
 class TrainingError(SkillweaveError):
     """Training cannot continue: a loss is not finite, memory is short, or a process was lost."""
-
-
-class RunError(SkillweaveError):
-    """A run or another file is missing, damaged, in use, of other settings, or not writable."""
 
 
 class MissingExtra(SkillweaveError, ImportError):

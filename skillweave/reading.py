@@ -1,4 +1,4 @@
-"""Reading of files that may be damaged or made by others: plain files, strict JSON, a schema.
+"""Reading of files that may be damaged or made by others: a schema.
 
 A schema is a type: a ``TypedDict`` for JSON that stays a dict, a dataclass for settings. ``fit``
 compares data with it, and every error names the file and the field. ``settings`` has the kinds of
@@ -7,95 +7,23 @@ annotations. This module does not import torch.
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import stat
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from pathlib import Path
 from typing import Any, NotRequired, get_args, get_origin, is_typeddict
 
 import numpy as np
 
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.messages import short
+from skillweave.policies.files import check_file as check_file
+from skillweave.policies.files import load_json as load_json
+from skillweave.policies.files import parse_json as parse_json
+from skillweave.policies.files import read_file as read_file
+from skillweave.policies.files import shown as shown
 from skillweave.settings import Fitting, Unfit, annotations_of
 
-DEEPEST = 100
-"""The deepest nesting of JSON, so that its readers may be recursive."""
-_SHOWN = 60
-
-
-def shown(value: object, most: int = _SHOWN) -> str:
-    """Return a value for a message: its ``repr``, shortened."""
-    try:
-        text = repr(value)
-    except Exception:  # a number of too many digits, or nested too deep
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= most else f"{text[: most - 1]}…"
-
-
-# Files
-
-
-def check_file(path: Path, most: int | None = None) -> None:
-    """Raise a RunError where ``path`` is not a plain file, or has more than ``most`` bytes.
-
-    A pipe would wait forever, and a device may never end.
-    """
-    try:
-        found = os.stat(path)
-    except FileNotFoundError as error:
-        raise RunError(f"{path} does not exist") from error
-    except (OSError, ValueError) as error:
-        raise RunError(f"{path} cannot be read: {error}") from error
-    if not stat.S_ISREG(found.st_mode):
-        kind = "a directory" if stat.S_ISDIR(found.st_mode) else "a pipe or a device"
-        raise RunError(f"{path} is {kind}, not a file")
-    if most is not None and found.st_size > most:
-        raise RunError(
-            f"{path} has {found.st_size:,} bytes, but such a file has at most {most:,}: damaged, "
-            "or another file"
-        )
-
-
-def read_file(path: Path, most: int | None = None) -> bytes:
-    """Return the content of a plain file.
-
-    Raises:
-        RunError: it is missing, no plain file, too large, or cannot be read.
-    """
-    check_file(path, most)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise RunError(f"{path} cannot be read: {error.strerror or error}") from error
-
-
 # JSON
-
-
-def parse_json(text: str | bytes, where: Path | str) -> Any:
-    """Parse a JSON text whose numbers are finite and that is nested at most ``DEEPEST`` deep.
-
-    Raises:
-        RunError: it is damaged; the message begins with ``where``.
-    """
-    try:
-        data = load_json(text, parse_constant=_finite, parse_float=_finite)
-    except RecursionError as error:
-        raise RunError(f"{where} is damaged: it is nested too deep") from error
-    except ValueError as error:
-        raise RunError(f"{where} is damaged: {str(error)[:300]}") from error
-    layer = [data]
-    depth = 0
-    while layer:
-        if depth > DEEPEST:
-            raise RunError(f"{where} is damaged: it is nested too deep")
-        layer = [x for part in layer for x in _inside(part)]
-        depth += 1
-    return data
 
 
 def as_json(value: Any, where: str, advice: str) -> Any:
@@ -123,35 +51,6 @@ def as_json(value: Any, where: str, advice: str) -> Any:
         f"{where} is {short(value)}{keys}, but a run records only finite numbers, texts, and lists "
         f"and dicts of them; {advice}"
     )
-
-
-def load_json(text: str | bytes, **how: Any) -> Any:
-    """Load JSON as ``json.loads`` does, without lone surrogates, which cannot be shown or saved.
-
-    Raises:
-        ValueError: it is not JSON, or holds a lone surrogate.
-    """
-    data = json.loads(text, **how)
-    escape: Any = "\\" if isinstance(text, str) else b"\\"
-    if escape in text or not text.isascii():
-        try:
-            json.dumps(data, ensure_ascii=False).encode()
-        except UnicodeEncodeError as error:
-            raise ValueError("a text in it holds half of a character") from error
-    return data
-
-
-def _inside(data: Any) -> Any:
-    if isinstance(data, dict):
-        return data.values()
-    return data if isinstance(data, list) else ()
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{shown(text)} is no finite number")
-    return value
 
 
 # The schema
@@ -221,7 +120,7 @@ class _FileFitting(Fitting):
             return values
         if unknown := sorted(set(values) - names):
             raise RunError(
-                f"{_at(file, path)} has no field {', '.join(u[:_SHOWN] for u in unknown[:3])}: "
+                f"{_at(file, path)} has no field {', '.join(u[:60] for u in unknown[:3])}: "
                 "made by a newer version?"
             )
         try:

@@ -97,7 +97,7 @@ def test_a_number_far_beyond_what_was_seen_is_named_once(case, who):
     now = np.array([[0, later]], np.float32)
     if who == "plan":
         features = FeatureMap(BOX, None, rows, "skill 'go'")
-        acts = [lambda: features(now, acts=True)] * 2
+        acts = [lambda: features.acting(now)] * 2
     else:
         algorithm, state = learnt("PPO", rows)
         policy = AgentPolicy.from_file(*AgentPolicy.of(algorithm, state).to_file(), "runs/go")

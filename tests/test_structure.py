@@ -57,7 +57,7 @@ ROOMS: dict[str, set[str]] = {
     "arguments": {"errors", "types", "messages"},
     "named": {"errors", "types", "messages"},
     "settings": {"errors", "types", "messages", "arguments"},
-    "reading": {"errors", "types", "messages", "settings"},
+    "reading": {"errors", "types", "messages", "policies", "settings"},
     "experience": {"types", "paths"},
     "ops": BASE,
     "spaces": BASE,
@@ -88,7 +88,7 @@ ROOMS: dict[str, set[str]] = {
 LEAVES: dict[str, set[str]] = {
     "networks.config": {"errors", "types", "messages", "settings", "named"},
     "settings": {"errors", "types", "messages", "arguments"},
-    "reading": {"errors", "types", "messages", "settings"},
+    "reading": {"errors", "types", "messages", "policies.files", "settings"},
     "algorithms.config": {
         "errors",
         "types",

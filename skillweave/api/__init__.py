@@ -670,6 +670,7 @@ class Run:
         goal: Any = None,
         deterministic: bool = True,
         seed: int = 0,
+        nan: Literal["error", "zero"] = "error",
     ) -> Player:
         """Return a player: the policy for one environment, with a memory of its own.
 
@@ -678,12 +679,13 @@ class Run:
             goal: of this skill, where it has goals; None: its ``goals()`` draw one.
             deterministic: act greedily, else sample; as in ``evaluate``.
             seed: of what is sampled.
+            nan: what a NaN in an observation is: an error, or a zero.
 
         Returns:
             The player; call its ``reset`` where an episode begins.
         """
         policy = self._policy(skill)
-        return Player(policy, deterministic=deterministic, seed=seed, goal=goal)
+        return Player(policy, deterministic=deterministic, seed=seed, goal=goal, nan=nan)
 
     @checked_names
     def export(self, path: str | Path) -> Export:

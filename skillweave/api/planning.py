@@ -141,7 +141,7 @@ def start_of(
     if log.goals:
         space = policy.skills.choice_space
         bound = planner.among(log.skills).bind(log.observation_space, space, SELECTOR)
-        with_goals = space, bound.with_goals(chosen, bound.goals_at(chosen, call), obs)
+        with_goals = space, bound.in_place.record(chosen, call, obs)
     selector = imitate(config, seen, may, chances, spec.spaces.observation, seeds, with_goals)
     names = tuple(skill.name for skill in policy.skills.skills)
     sha256 = selector.source()["sha256"]

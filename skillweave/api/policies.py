@@ -10,8 +10,9 @@ from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.export.read import read_policy
-from skillweave.export.write import MANIFEST, Export, write_export
+from skillweave.export.write import Export, write_export
 from skillweave.messages import as_path, short
+from skillweave.policies.codec import MANIFEST
 from skillweave.runs import hub
 from skillweave.skills.foreign_policy import Foreign, fitted
 from skillweave.types import Policy

@@ -58,7 +58,7 @@ class OwnPolicy(Functional):
         def seen(obs: Array) -> Array:
             """Return what the policy sees of observations that hold the task's state."""
             own = view.obs(obs)
-            return own if part is None else part.see(own)
+            return own if part is None else part.part.see(own)
 
         inside = policy_of(policy, goals, part, "the policy's act()")
         super().__init__(Viewed(inside, seen), joins=goals is not None)

@@ -44,7 +44,7 @@ from skillweave.policies.core import (
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Learning
 from skillweave.skills import Skill
-from skillweave.skills.goals import CallGoals, goals_of
+from skillweave.skills.goals import goals_of
 from skillweave.spaces import action_codec
 from skillweave.types import Array, Step, prefixed
 
@@ -346,7 +346,7 @@ class HierarchyCollector(Collector):
             names = ((i, f"{level.path}{level.skills[i].name}/goal") for i in own)
             goals = {i: trace[name] for i, name in names}
             where = np.where(acts, running, -1)
-            seen = {k: CallGoals(own).join(obs, where, goals) for k, obs in seen.items()}
+            seen = {k: level.hierarchy.beside_calls(obs, where, goals) for k, obs in seen.items()}
         return steps.replace(
             **seen,
             action=np.where(acts, running, 0),

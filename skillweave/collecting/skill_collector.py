@@ -34,9 +34,10 @@ from skillweave.policies.core import (
     restart,
 )
 from skillweave.policies.parts import Reflexes
+from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.goals import goals_of
-from skillweave.skills.own_part import ZERO, OwnPart, Rest
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Array, Memory, Step
 
 PATIENCE = 5_000
@@ -117,10 +118,12 @@ class SkillCollector(Collector):
         """Whether calls come first is drawn for each episode."""
         self._searches = self._restricted or self._draws
         self._part = part
-        holds = (part is not None and part.holds) or (starters is not None and starters.holds)
-        self._rest = Rest(ZERO, engine.action_space) if holds else None
-        if self._rest is not None:
-            self.kept["last_action"] = self._rest.start(n)
+        holds = (part is not None and part.part.holds) or (
+            starters is not None and starters.hierarchy.holds
+        )
+        self._last_actions = space_of(engine.action_space) if holds else None
+        if self._last_actions is not None:
+            self.kept["last_action"] = self._last_actions.start(n)
         self._base: Any = None
         if part is not None and part.base is not None:
             self._base = base_of(part, goals_of(skill))
@@ -185,11 +188,11 @@ class SkillCollector(Collector):
             self._draw_calls()
         obs, mask, memory, playing = self.obs, self.engine.mask(), self.memory, self._playing()
         goal, part = None, self._part
-        own = seen = obs if part is None else part.see(obs)
+        own = seen = obs if part is None else part.part.see(obs)
         if self._goals is not None:
             goal = self._choose_goals(playing)
             seen = self._goals.join(own, goal)
-        acted = self.acting.all(seen, mask if part is None else part.mask(mask), memory)
+        acted = self.acting.all(seen, mask if part is None else part.part.mask(mask), memory)
         action, overridden = self._actions(obs, own, goal, acted.action, mask, playing)
         out.write(
             obs=obs,
@@ -202,7 +205,7 @@ class SkillCollector(Collector):
             goal=goal,
         )
         raw = self.engine.step(action)
-        if self._rest is not None:
+        if self._last_actions is not None:
             self.kept["last_action"][:] = action
         self.kept["age"] += 1
         self.kept["elapsed"] += 1 if playing is None else playing
@@ -211,7 +214,7 @@ class SkillCollector(Collector):
             rows = self._all if playing is None else np.flatnonzero(playing)
             aim = None if goal is None else goal[rows]
             seen_step = part_of(step, self.kept["elapsed"][rows], rows, None, aim)
-            self._base.observe(self._base_memory, rows, part.own_step(seen_step))
+            self._base.observe(self._base_memory, rows, part.part.own_step(seen_step))
         end = self._ends(raw, step, playing, goal)
         out.write(
             next_obs=raw.next_obs,
@@ -266,8 +269,9 @@ class SkillCollector(Collector):
         last = self.kept.get("last_action")
         if self._part is not None:
             rows = self._all if playing is None else np.flatnonzero(playing)
-            action = self._part.write(self._corrected(action, own, goal, rows), last)
-            self._part.check_mask(None if mask is None else mask[rows], action[rows])
+            part = self._part.part
+            action = part.write(self._corrected(action, own, goal, rows), last)
+            part.check_mask(None if mask is None else mask[rows], action[rows])
         if self.reflexes:
             action, overridden = self._reflexes.over(obs, action)
         if playing is not None:
@@ -291,7 +295,7 @@ class SkillCollector(Collector):
         if len(rows):
             turn = Turn(World(self._rng), None, None if goal is None else goal[rows])
             base[rows] = self._base.act(self._base_memory, rows, own[rows], turn)
-        return self._part.correction.apply(base, action)
+        return self._part.correction.added.apply(base, action)
 
     def _search(self, step: Step, searching: Array) -> None:
         """Let environments ``searching`` (k,) go on until the skill may start in them."""
@@ -396,7 +400,7 @@ class SkillCollector(Collector):
         made = self.kept["calls_made"]
         ids = limited[made[limited] + 1 < self._episode_calls]
         age, calls = self.kept["age"][ids], made[ids] + 1
-        last = self.kept["last_action"][ids] if self._rest is not None else None
+        last = self.kept["last_action"][ids] if self._last_actions is not None else None
         self._forget(ids)
         if last is not None:  # the episode goes on
             self.kept["last_action"][ids] = last
@@ -419,8 +423,8 @@ class SkillCollector(Collector):
         keys = ("searched", "found", "sought")
         counted = {k: self.kept[k][ids] for k in keys if k in self.kept}
         super()._forget(ids)
-        if self._rest is not None:
-            self.kept["last_action"][ids] = self._rest.start(len(ids))
+        if self._last_actions is not None:
+            self.kept["last_action"][ids] = self._last_actions.start(len(ids))
         if self._base is not None:
             restart(self._base, self._base_memory, ids)
         if self._goals is not None:

@@ -14,13 +14,14 @@ from skillweave.policies.core import Around, Policy
 from skillweave.policies.functional import Functional, Returns
 from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
 from skillweave.policies.leaves import Ready
-from skillweave.policies.parts import Corrects, Given, Joined, Reflexes, Remembers
+from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
+from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, path_of
 from skillweave.skills.answers import ask
 from skillweave.skills.goal_spaces import choice_space
-from skillweave.skills.goals import CallGoals, Goals, goals_of
+from skillweave.skills.goals import Goals, goals_of
 from skillweave.skills.outputs import blame
-from skillweave.skills.own_part import ZERO, OwnPart, PartOf, Rest
+from skillweave.skills.own_part import OwnPart
 from skillweave.types import Memoryless
 
 
@@ -80,16 +81,6 @@ class SkillSet:
         """Return the own part of skill ``i``; None: it has all."""
         return self.parts[i] if self.parts else None
 
-    @property
-    def holds(self) -> bool:
-        """True if the last action counts for some skill, here or in a hierarchy below."""
-        return any(map(self.held, range(len(self.skills))))
-
-    def held(self, i: int) -> bool:
-        """Return whether the last action counts for skill ``i``, or for a skill below it."""
-        part, below = self.part(i), skills_below(self.policies[i])
-        return (part is not None and part.holds) or (below is not None and below.holds)
-
     def limit(self, i: int) -> int | None:
         """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
         skill = self.skills[i]
@@ -120,14 +111,14 @@ def acting_policy(
             it is in the ``World``.
     """
     policy = hierarchy_of(skills, selector, guide, goals)
-    return _outermost(policy, skills, outermost and skills.holds)
+    return _around(policy, skills, remembers=outermost)
 
 
 def acting_alone(skills: SkillSet, i: int) -> Policy:
     """Return the policy of skill ``i`` without a selector, with reflexes."""
     skill = _skill(skills, i)
     policy = skill.policy if skill.goals is None else Given(skill.policy, skill.goals)
-    return _outermost(policy, skills, skills.held(i))
+    return _around(policy, skills, remembers=True)
 
 
 def hierarchy_of(
@@ -146,19 +137,17 @@ def hierarchy_of(
     """
     if guide is not None and guide.decides:
         selector, guide = guide.selector, None
-    inside = [_skill(skills, i) for i in range(len(skills.skills))]
-    with_goals = {i: skill.goals for i, skill in enumerate(inside) if skill.goals is not None}
+    inside = tuple(_skill(skills, i) for i in range(len(skills.skills)))
     return Hierarchy(
         None if selector is None else _selects(selector, "the selector's act()"),
         inside,
-        ask,
         lengths=skills.lengths,
         guide=guide and replace(guide, selector=_selects(guide.selector, "the guide")),
         interruption=skills.interruption,
-        call_goals=CallGoals(with_goals) if with_goals and skills.interruption else None,
         fresh_calls=goals is not None,
         greedy=skills.greedy,
         greedy_selector=skills.greedy_selector,
+        ask=ask,
     )
 
 
@@ -185,18 +174,20 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
     path, goals = path_of(skill), goals_of(skill)
     policy = policy_of(skills.policies[i], goals, part, f"skill {path!r}: its policy's act()")
     if part is not None:
-        policy = PartOf(part, policy)
+        policy = PartOf(policy, part.part)
     asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
     return CalledSkill(
         skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks
     )
 
 
-def _outermost(policy: Policy, skills: SkillSet, remembers: bool) -> Policy:
-    """Return a policy with reflexes, which perhaps remembers the last action."""
+def _around(policy: Policy, skills: SkillSet, *, remembers: bool) -> Policy:
+    """Return a policy with reflexes, which remembers the last action where that counts."""
     if skills.reflexes:
         policy = Reflexes(policy, skills.reflexes, skills.action_space)
-    return Remembers(policy, Rest(ZERO, skills.action_space).start) if remembers else policy
+    if not (remembers and policy.holds):
+        return policy
+    return Remembers(policy, space_of(skills.action_space))
 
 
 def policy_of(
@@ -212,18 +203,19 @@ def policy_of(
     """
     if policy is None:
         return Policy()
-    known = policy.is_plain if isinstance(policy, Functional) else not hasattr(policy, "act")
-    if known and hasattr(policy, "selector"):
+    known = isinstance(policy, Functional) and policy.is_plain
+    if hasattr(policy, "act"):
+        inside, joins = in_place(policy, who), not (known and policy.joins)
+        if isinstance(inside, Remembers) and not outermost:
+            inside = inside.policy
+        _check_memory(inside)
+    else:  # a hierarchy that learns
         how = policy.skills, policy.selector, policy.guide, policy.goals
         inside, joins = acting_policy(*how, outermost=outermost), policy.goals is None
-    else:
-        inside = in_place(policy, who)
-        joins = not (known and isinstance(policy, Functional) and policy.joins)
-        _check_memory(inside)
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside
-    return Corrects(inside, base_of(part, goals), part.correction.apply)
+    return Corrects(inside, base_of(part, goals), part.correction.added)
 
 
 def base_of(part: OwnPart, goals: Goals | None) -> Policy:
@@ -238,7 +230,14 @@ ENDS = ("initiation", "termination", "success")
 
 def _selects(selector: Any, who: str) -> Policy:
     """Return a selector's policy; one that is not trained watches how calls end."""
-    return Ready(selector, who, blame) if hasattr(selector, "watch") else in_place(selector, who)
+    if not hasattr(selector, "watch"):
+        return in_place(selector, who)
+    kind, asked = type(selector), ("start", "act", "chances", "allowed", "watch")
+    methods = (getattr(kind, name, None) for name in asked)
+    # Where the user has another way, it counts.
+    ours = all(getattr(one, "__module__", "").startswith("skillweave.") for one in methods)
+    rule: Policy | None = getattr(selector, "in_place", None) if ours else None
+    return Ready(selector, who, blame) if rule is None else rule
 
 
 def _check_memory(policy: Policy) -> None:
@@ -246,7 +245,7 @@ def _check_memory(policy: Policy) -> None:
     if not isinstance(policy, Returns):
         return
     for name, value in policy.start(1).items():
-        if value.dtype.kind not in "biuf":
+        if value.dtype.names is None and value.dtype.kind not in "biuf":
             raise PolicyError(
                 f"{policy.who} remembers {name!r} as {value.dtype}; a memory is an array of "
                 "numbers whose first axis is the environment"

@@ -183,8 +183,8 @@ def rows_of(
     if "call_elapsed" in record:
         found["call_elapsed"] = elapsed
     if part is not None:
-        found |= {k: part.see(found[k]) for k in ("obs", "next_obs")}
-        found |= {k: part.mask(found[k]) for k in ("mask", "next_mask")}
+        found |= {k: part.part.see(found[k]) for k in ("obs", "next_obs")}
+        found |= {k: part.part.mask(found[k]) for k in ("mask", "next_mask")}
     if goals is not None:
         goal = trace[path + "goal"]
         found |= {k: goals.join(found[k], goal) for k in ("obs", "next_obs")}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +11,9 @@ import numpy as np
 from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.policies.core import OWN_REWARD, SUCCESS
-from skillweave.skills.info_words import NUMBERS, info_keys
+from skillweave.policies.infos import NUMBERS, batched_infos
+from skillweave.policies.spaces import space_of
+from skillweave.skills.info_words import info_keys
 from skillweave.spaces import (
     action_codec,
     allows_each,
@@ -21,92 +22,7 @@ from skillweave.spaces import (
     obs_shape,
     put_observation,
 )
-from skillweave.spaces.packing import parts
 from skillweave.types import Array
-
-
-def batched_infos(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Batch the infos of n environments in the format of Gymnasium's vectors.
-
-    Gymnasium casts the values of all environments to the type of the first, 0.5 to 0 for example.
-    Here an array has a type that represents all of them exactly.
-
-    Returns:
-        By key, an array over the n environments: of numbers; of arrays of one shape; else of
-        objects. Dicts are batched in turn. Where an environment's info lacks the key, the value is
-        0, or None among objects, and the (n,) bool under ``_key`` is False.
-    """
-    if not any(infos):
-        return {}
-    n = len(infos)
-    columns: dict[str, tuple[list[int], list[Any]]] = {}
-    for row, info in enumerate(infos):
-        for key, value in info.items():
-            rows, values = columns.setdefault(key, ([], []))
-            rows.append(row)
-            values.append(value)
-    batch: dict[str, Any] = {}
-    for key, (rows, values) in columns.items():
-        batch[key] = _column(rows, values, n)
-        if (mask := f"_{key}") not in columns:
-            present = np.zeros(n, bool)
-            present[rows] = True
-            batch[mask] = present
-    return batch
-
-
-def _column(rows: list[int], values: list[Any], n: int) -> Any:
-    """Return the values of n environments under one key as a column; ``rows`` have one."""
-    kinds = set(map(type, values))
-    if all(issubclass(kind, dict) for kind in kinds):
-        inner: list[dict[str, Any]] = [{}] * n
-        for row, value in zip(rows, values, strict=True):
-            inner[row] = value
-        return batched_infos(inner)
-    array = None
-    if all(issubclass(kind, NUMBERS) for kind in kinds):
-        array = _numbers(values, mixed=len(kinds) > 1 or int in kinds)
-    elif all(issubclass(kind, np.ndarray) for kind in kinds):
-        array = _stacked(values)
-    if array is not None:
-        if len(rows) == n:
-            return array
-        column = np.zeros((n, *array.shape[1:]), array.dtype)
-        column[rows] = array
-        return column
-    objects = np.full(n, None, object)
-    for row, value in zip(rows, values, strict=True):
-        objects[row] = value
-    return objects
-
-
-def _numbers(values: list[Any], *, mixed: bool) -> Array | None:
-    """Return numbers as an array; None: no type represents all of them exactly."""
-    array = np.array(values)
-    if array.dtype.kind not in "biufc":
-        return None  # whole numbers that are too large
-    if mixed and array.dtype.kind == "f":
-        same = (a == v or v != v for a, v in zip(array.tolist(), values, strict=True))
-        return array if all(same) else None
-    return array
-
-
-def _stacked(values: list[Array]) -> Array | None:
-    """Stack arrays; None: no array represents all of them exactly."""
-    first = values[0]
-    if any(v.shape != first.shape for v in values):
-        return None
-    try:
-        stacked = np.stack(values)
-    except TypeError:  # dates and numbers, for example
-        return None
-    if any(v.dtype != stacked.dtype for v in values):
-        same = all(
-            np.array_equal(a, v, equal_nan=v.dtype.kind == "f")
-            for a, v in zip(stacked, values, strict=True)
-        )
-        return stacked if same else None
-    return stacked
 
 
 def joined_infos(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
@@ -157,65 +73,9 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
 def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
     """Return a mask of an environment or a user for the choices of a space as (A,) bool.
 
-    Several choices may have a list each. The mask of a Dict or Tuple is a dict or tuple of masks,
-    and where a part has none, all is allowed. It may also be one array.
-
-    Raises:
-        ValueError: the value does not have a number for each choice; the message shows it.
+    See ``Space.allowed``.
     """
-    return _checked_mask(value, space, "its action_mask")
-
-
-def _checked_mask(value: Any, space: gym.Space[Any], what: str) -> Array:
-    """Return a mask as (A,) bool; ``what`` begins messages."""
-    named = parts(space)
-    by_place = isinstance(space, gym.spaces.Tuple) and _is_by_place(value)
-    if named is not None and (by_place or isinstance(value, Mapping)):
-        if by_place and len(value) != len(named):
-            raise ValueError(
-                f"{what} has {len(value)} parts, but actions of {short(space)} have {len(named)}"
-            )
-        given = dict(zip(named, value, strict=True)) if by_place else value
-        if not set(given) <= set(named):
-            raise ValueError(
-                f"{what} has the parts {short(list(given))}, but actions of {short(space)} have "
-                f"{', '.join(map(repr, named))}"
-            )
-        masks = [
-            _checked_mask(given[name], part, f"{what}[{name!r}]")
-            if given.get(name) is not None and choice_counts(part)
-            else np.ones(sum(choice_counts(part)), bool)
-            for name, part in named.items()
-        ]
-        return np.concatenate(masks)
-    size = sum(choice_counts(space))
-    mask = _flat(value)
-    if mask.size != size or mask.dtype.kind not in "iubf":
-        raise ValueError(
-            f"{what} is {short(value)}; it must be a number for each choice of {space}, "
-            f"{size} in all, 0 where it is forbidden"
-        )
-    allowed: Array = mask.reshape(-1) != 0
-    return allowed
-
-
-def _is_by_place(value: Any) -> bool:
-    """Return whether the mask of a Tuple is a list of masks, and not one of numbers."""
-    if not isinstance(value, tuple | list):
-        return False
-    return not all(isinstance(each, int | float | np.number | np.bool_) for each in value)
-
-
-def _flat(value: Any) -> Array:
-    """Return a mask as an array; of lists of unequal lengths their numbers, one after another."""
-    try:
-        mask = np.asarray(value)
-    except ValueError:
-        mask = np.array(None)
-    if mask.dtype == object:
-        with suppress(TypeError, ValueError):
-            mask = np.concatenate([np.ravel(part) for part in value])
-    return mask
+    return space_of(space).allowed(value)
 
 
 class ActionMasks:

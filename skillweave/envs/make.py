@@ -18,11 +18,12 @@ from skillweave.arguments import checked_names
 from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
-from skillweave.envs.infos import ActionMasks, batched_infos, random_actions
+from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, error_text, short, shortened
+from skillweave.policies.infos import batched_infos
 from skillweave.reading import as_json
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Check, check_fields

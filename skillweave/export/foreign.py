@@ -1,12 +1,12 @@
-"""Models from elsewhere as ONNX files, beside the mapping that the runner applies around them.
+"""Models from elsewhere as ONNX files, behind the mapping that is around them.
 
 Stands alone because each kind of model is converted in its own way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,11 +15,18 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 
 from skillweave.errors import PolicyError
-from skillweave.export.graphs import leaves_of, traced
+from skillweave.export.graphs import examples, traced
 from skillweave.ops.device import FLOAT
-from skillweave.skills.mapped import MappedPolicy, invoke, parted
-from skillweave.skills.onnx_file import OnnxPolicy
-from skillweave.skills.plan import Plan
+from skillweave.policies.mapped import (
+    Function,
+    Input,
+    Mapped,
+    OnnxFile,
+    Take,
+    invoke,
+    parted,
+)
+from skillweave.policies.spaces import space_of
 from skillweave.skills.sb3 import SB3Policy
 from skillweave.skills.torch_module import TorchPolicy
 from skillweave.spaces.packing import parts
@@ -28,60 +35,42 @@ OBS = "obs"
 """The name of a file's only input, where the model has none."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """An ONNX file's content, and the names in it."""
+def as_file(policy: Mapped, where: str, *, sampled: bool) -> Mapped:
+    """Return a policy whose model is an ONNX file, or a function.
 
-    content: bytes
-    only: str
-    """The name of the input that a mapping calls ""."""
-    output: str
-    state: tuple[tuple[str, str, tuple[int, ...]], ...] = ()
-    """Inputs, outputs and shapes of the recurrent state of one environment."""
-
-
-def model_of(policy: MappedPolicy, where: str) -> Model:
-    """Return a policy's model as an ONNX file that acts in one environment.
+    Args:
+        sampled: it samples; else it is greedy.
 
     Raises:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
-    match policy:
-        case OnnxPolicy():
-            return Model(policy.data, policy.free[0], policy.output, policy.single_states())
-        case TorchPolicy():
-            return _module_model(policy, where)
+    match policy.model:
+        case OnnxFile() | Function():
+            return policy
+        case TorchPolicy() as own:
+            return _module_model(policy, own, where)
+        case SB3Policy() as own if not sampled:
+            return _sb3_model(policy, own, where)
         case SB3Policy():
-            return _sb3_model(policy, where)
-    raise PolicyError(f"{where} is a {type(policy).__name__}, which cannot be written as ONNX")
+            raise PolicyError(
+                f"{where} samples by Stable-Baselines3's own code, which the runner does not have: "
+                "train with selection=Selection(greedy_skills=True)"
+            )
+    kind = type(policy.model).__name__
+    raise PolicyError(f"{where} is a {kind}, which cannot be written as ONNX")
 
 
-def mapping_entry(
-    plan: Plan, only: str, name_of: Callable[[Callable[..., Any], str], str]
-) -> dict[str, Any]:
-    """Return a mapping as JSON for the runner: each part of an input names one leaf.
-
-    Args:
-        only: the name of the input that the mapping calls "".
-        name_of: returns the runner's name of a user's function; its second argument describes it.
-    """
-    mapping = plan.mapping
-    acts = plan.mapping.acts
-    entry = {"goal": None, "acts": None, "scaling": {}, "chunk": None} | mapping.to_json()
-    entry |= {"every": mapping.every, "outputs": plan.outputs.count, "sees": None, "shapes": {}}
-    what = "observations (1, ...) to numbers (1, ...)"
-    names = {id(function): name_of(function, what) for function in mapping.functions().values()}
-    if callable(mapping.goal):
-        entry["goal"] = {"function": names[id(mapping.goal)]}
-    if acts is not None and plan.outputs.to is not None:
-        entry["acts"]["to"] = plan.outputs.to.tolist()
-    if plan.inputs is not None:
-        entry["sees"] = {}
-        for name, given in plan.inputs.items():
-            entry["sees"][name or only] = given.to_json(names)
-            entry["shapes"][name or only] = list(given.shape)
-        entry["scaling"] = {name or only: v for name, v in entry["scaling"].items()}
-    return entry
+def _with_file(
+    policy: Mapped, space: gym.Space[Any], content: bytes, state: tuple[tuple[str, str], ...] = ()
+) -> Mapped:
+    """Return a policy whose model is a file that was traced on ``_examples``."""
+    inputs, leaves = policy.inputs, space_of(space).leaves
+    if inputs is None and () not in leaves:
+        whole = {path: Take("observation", leaf.shape, path, whole=True)
+                 for path, leaf in leaves.items()}  # fmt: skip
+        inputs = {".".join((OBS, *k)): Input((take,), take.shape) for k, take in whole.items()}
+    names = tuple(name or OBS for name in inputs or ("",))
+    return replace(policy, model=OnnxFile(content, "output", names, state), inputs=inputs)
 
 
 class _Called(nn.Module):
@@ -120,24 +109,24 @@ def _nested(space: gym.Space[Any], leaves: Iterator[Tensor], dtype: torch.dtype)
     return tuple(values.values()) if isinstance(space, gym.spaces.Tuple) else values
 
 
-def _examples(policy: MappedPolicy, inputs: Any) -> dict[str, Tensor]:
+def _examples(policy: Mapped, space: gym.Space[Any]) -> dict[str, Tensor]:
     """Return one example of each input of a model, by the name in the file."""
-    if inputs is None:
-        leaves = leaves_of(policy.observation_space)
-        return {leaf.name: leaf.example() for leaf in leaves}
-    return {name or OBS: torch.zeros(1, *given.shape, **FLOAT) for name, given in inputs.items()}
+    if policy.inputs is None:
+        return examples(space)
+    shapes = {name or OBS: given.shape for name, given in policy.inputs.items()}
+    return {name: torch.zeros(1, *shape, **FLOAT) for name, shape in shapes.items()}
 
 
-def _module_model(policy: TorchPolicy, where: str) -> Model:
-    inputs = policy.plan.inputs
-    given = _examples(policy, inputs)
-    shapes = [tuple(1 if n is None else n for n in shape) for shape in policy.mapping.state]
-    states = [(f"state.{i}", f"state.{i}.after", shape) for i, shape in enumerate(shapes)]
-    given |= {name: torch.zeros(shape, **FLOAT) for name, _, shape in states}
-    outputs = ["output", *(after for _, after, _ in states)]
-    module = _Called(policy, list(inputs or ()))
+def _module_model(policy: Mapped, own: TorchPolicy, where: str) -> Mapped:
+    space = own.observation_space
+    given = _examples(policy, space)
+    shapes = [tuple(1 if n is None else n for n in shape) for shape in own.mapping.state]
+    state = tuple((f"state.{i}", f"state.{i}.after") for i in range(len(shapes)))
+    given |= {k: torch.zeros(shape, **FLOAT) for (k, _), shape in zip(state, shapes, strict=True)}
+    outputs = ["output", *(after for _, after in state)]
+    module = _Called(own, list(policy.inputs or ()))
     module.training = False  # the policy's module is in evaluation mode already
-    return Model(traced(module, given, outputs, where), OBS, "output", tuple(states))
+    return _with_file(policy, space, traced(module, given, outputs, where), state)
 
 
 class _Predicting(nn.Module):
@@ -174,15 +163,15 @@ def _channels_first(x: Tensor, space: gym.Space[Any]) -> Tensor:
     return x.permute(0, 3, 1, 2) if turned and tuple(x.shape[1:]) != shape else x
 
 
-def _sb3_model(policy: SB3Policy, where: str) -> Model:
-    inputs = policy.plan.inputs
-    given = _examples(policy, inputs)
-    names = list(inputs or ()) or [name.removeprefix(f"{OBS}.") for name in given]
-    module = _Predicting(policy, names).eval()
+def _sb3_model(policy: Mapped, own: SB3Policy, where: str) -> Mapped:
+    space = own.observation_space
+    given = _examples(policy, space)
+    names = list(policy.inputs or ()) or [name.removeprefix(f"{OBS}.") for name in given]
+    module = _Predicting(own, names).eval()
     # Checks of a distribution's arguments depend on their values, which a graph cannot have.
     checks = Distribution._validate_args
     Distribution.set_default_validate_args(False)
     try:
-        return Model(traced(module, given, ["output"], where), OBS, "output")
+        return _with_file(policy, space, traced(module, given, ["output"], where))
     finally:
         Distribution.set_default_validate_args(checks)

@@ -22,29 +22,14 @@ from torch import Tensor, nn
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import MissingExtra, PolicyError
-from skillweave.networks.heads import ActionHead, ChoiceHead, JointHead
+from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
-from skillweave.spaces import ActionCodec, ChoiceCodec, ChoiceSpace, obs_dtype, obs_shape
-from skillweave.spaces.action_codec import action_codec
+from skillweave.policies.spaces import space_of
+from skillweave.spaces import ActionCodec, ChoiceSpace, JointCodec
 from skillweave.spaces.choices import NumberedChoiceCodec
-from skillweave.spaces.packing import parts
 
 OPSET = 18
 """Version of ONNX's operators."""
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """A part of an observation that has no parts itself: an input of the graph."""
-
-    name: str
-    """``obs``, or of a Dict or Tuple ``obs.camera``."""
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-    def example(self) -> Tensor:
-        """Return one observation of zeros."""
-        return torch.from_numpy(np.zeros((1, *self.shape), self.dtype))
 
 
 @dataclass(frozen=True)
@@ -56,60 +41,21 @@ class Graph:
     """Width of the input ``mask``; 0: no mask."""
     memory: int = 0
     """Width of the input ``memory`` and of the output of the same name; 0: no memory."""
-    noise: tuple[tuple[str, int], ...] = ()
+    noise: tuple[Any, ...] = ()
     """Inputs ``noise.0``, …: a distribution by NumPy's name, and the count of its numbers."""
 
 
-def leaves_of(space: gym.Space[Any], name: str = "obs") -> list[Leaf]:
-    """Return the inputs that observations of a space are, in the order of ``ObsCodec.leaves``."""
-    inner = parts(space)
-    if inner is None:
-        return [Leaf(name, obs_shape(space), obs_dtype(space))]
-    return [leaf for k, part in inner.items() for leaf in leaves_of(part, f"{name}.{k}")]
-
-
-def inputs_of(space: gym.Space[Any]) -> list[list[Any]]:
-    """Return for each leaf its name, its fields in the packed array, and its keys."""
-
-    def within(space: gym.Space[Any], fields: list[str], keys: list[Any]) -> list[list[Any]]:
-        inner = parts(space)
-        if inner is None:
-            return [[".".join(["obs", *fields]), fields, keys]]
-        places = range(len(inner)) if isinstance(space, gym.spaces.Tuple) else inner
-        return [
-            leaf
-            for (name, part), key in zip(inner.items(), places, strict=True)
-            for leaf in within(part, [*fields, name], [*keys, key])
-        ]
-
-    leaves = within(space, [], [])
-    assert [name for name, _, _ in leaves] == [leaf.name for leaf in leaves_of(space)]
-    return leaves
-
-
-def dtype_to_json(dtype: np.dtype[Any]) -> Any:
-    """Return a dtype as JSON that ``numpy.dtype`` reads."""
-    if dtype.subdtype is not None:
-        base, shape = dtype.subdtype
-        return f"({','.join(map(str, shape))},){base.str}"
-    if dtype.names is None:
-        return dtype.str
-    assert dtype.fields is not None
-    fields = [dtype.fields[name][:2] for name in dtype.names]
+def examples(space: gym.Space[Any]) -> dict[str, Tensor]:
+    """Return one observation of zeros, by the names of the inputs that its leaves are."""
     return {
-        "names": list(dtype.names),
-        "formats": [dtype_to_json(d) for d, _ in fields],
-        "offsets": [at for _, at in fields],
-        "itemsize": dtype.itemsize,
+        ".".join(("obs", *path)): torch.from_numpy(np.zeros((1, *leaf.shape), leaf.record))
+        for path, leaf in space_of(space).leaves.items()
     }
 
 
 def mask_width(space: gym.Space[Any]) -> int:
     """Return the number of choices in a mask of actions, 0 where actions have no mask."""
-    if isinstance(space, ChoiceSpace):
-        return space.choices
-    codec = action_codec(space)
-    return codec.size if codec.discrete else 0
+    return space.choices if isinstance(space, ChoiceSpace) else sum(space_of(space).counts)
 
 
 class _Acting(nn.Module):
@@ -167,11 +113,11 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
         PolicyError: it cannot be written as ONNX; the message begins with ``where``.
     """
     algorithm = policy.algorithm
-    leaves = leaves_of(policy.observation_space)
+    given = examples(policy.observation_space)
+    leaves = len(given)
     choices = mask_width(policy.action_space)
     noise = _noise_of(algorithm) if sampled else ()
     graph = Graph(b"", choices, algorithm.memory_size, noise)
-    given = {leaf.name: leaf.example() for leaf in leaves}
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
     outputs = ["action"]
@@ -179,7 +125,7 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
         given["memory"] = torch.zeros(1, graph.memory, **FLOAT)
         outputs.append("memory.after")
     given |= {f"noise.{i}": torch.full((1, n), 0.5, **FLOAT) for i, (_, n) in enumerate(noise)}
-    module = _Acting(policy, len(leaves), graph)
+    module = _Acting(policy, leaves, graph)
     return replace(graph, content=traced(module, given, outputs, where))
 
 
@@ -188,22 +134,22 @@ def worth_graph(critic: AgentPolicy, where: str) -> Graph:
 
     ``worth`` is (1, S), or (1, S + 1) where the critic also has the value of a new decision.
     """
-    given = {leaf.name: leaf.example() for leaf in leaves_of(critic.observation_space)}
+    given = examples(critic.observation_space)
     return Graph(traced(_Worth(critic), given, ["worth"], where))
 
 
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
     """Convert an action (1, …) from policy units to the environment's, as ``Algorithm.to_env``.
 
-    A choice of a skill with its goal becomes a row of numbers, ``ChoiceSpace.rows``.
+    One with parts, or a choice of a skill with its goal, becomes a row of numbers (see
+    ``Space.flat``).
     """
     codec, head = algorithm.codec, getattr(algorithm, "head", None)
     if isinstance(codec, NumberedChoiceCodec):
         space: Any = codec.space
         return torch.from_numpy(space.rows(codec.table))[action]
-    if not isinstance(codec, ChoiceCodec):
+    if not isinstance(head, JointHead):
         return _in_env_units(codec, action, getattr(head, "squash", False))
-    assert isinstance(head, ChoiceHead)
     return _row(head, action)
 
 
@@ -242,7 +188,7 @@ def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
     """Return the noise that an algorithm's ``act`` takes, for one observation."""
     noise = algorithm.noise([torch.Generator()], 1, 1)[0]
     if isinstance(noise, Tensor):
-        if isinstance(algorithm.codec, ChoiceCodec):
+        if isinstance(algorithm.codec, JointCodec):
             return algorithm.head.noises
         kind = "gumbel" if algorithm.codec.discrete else "standard_normal"
         return ((kind, noise.numel()),)

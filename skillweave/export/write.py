@@ -1,30 +1,23 @@
-"""The folder of an export: ONNX files, ``policy.json``, and the runner."""
+"""The folder of an export: ONNX files, ``policy.json``, the runner, and what acts in it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from skillweave.envs.infos import observes_mask
-from skillweave.errors import PolicyError
-from skillweave.export.graphs import dtype_to_json, inputs_of
-from skillweave.export.states import States
-from skillweave.messages import short
+from skillweave import policies
+from skillweave.export.compile import deployed
+from skillweave.policies.codec import FORMAT, MANIFEST, Written, checksum
 from skillweave.runs.files import write_bytes
-from skillweave.skills.foreign_policy import checksum
-from skillweave.spaces import obs_dtype, obs_shape, space_to_json
 from skillweave.terminal import printable
 from skillweave.types import Policy
 
-FORMAT = 2
-"""Version of ``policy.json``."""
-MANIFEST = "policy.json"
-"""The name of the file that describes a policy."""
+PACKAGE = "skillweave_policies"
+"""The name of ``skillweave.policies`` in an export, whose modules import one another by place."""
 
 
 @dataclass(frozen=True)
@@ -62,33 +55,31 @@ def write_export(
         PolicyError: a part of it cannot be exported; the message names it, and what to do.
         MissingExtra: the packages that write ONNX are not installed.
     """
-    if isinstance(policy.action_space, gym.spaces.Dict | gym.spaces.Tuple):
-        raise PolicyError(
-            f"actions of {short(policy.action_space, 200)} cannot be exported, as the runner "
-            "returns one array: let a wrapper (gymnasium.wrappers.TransformAction) make a Box or a "
-            "MultiDiscrete of them and train with it, or act by run.player() where this library is"
-        )
-    states = States(policy.action_space)
-    entry = states.policy(policy)
-    space = policy.observation_space
+    written = Written()
+    tree = written.tree(deployed(policy))
+    files = written.content()
     content = {
         "format": FORMAT,
         "env": env,
         "licence": licence,
         "origin": origin,
-        "files": {name: checksum(data) for name, data in states.files.items()},
-        "code": states.code,
-        "dtype": dtype_to_json(obs_dtype(space)),
-        "shape": list(obs_shape(space)),
-        "inputs": inputs_of(space),
-        "observation_space": space_to_json(space),
-        "action_space": space_to_json(policy.action_space),
-        "observed_mask": observes_mask(space, policy.action_space),
-        "policy": entry,
+        "files": {name: checksum(data) for name, data in files.items()},
+        "code": written.code,
+        "policy": tree,
     }
-    text = json.dumps(content, indent=1, allow_nan=False)
-    runner = Path(__file__).with_name("runner.py").read_bytes()
-    files = states.files | {MANIFEST: text.encode(), "runner.py": runner}
+    files |= {MANIFEST: json.dumps(content, indent=1, allow_nan=False).encode()}
     for name, data in files.items():
         write_bytes(path / name, data)
-    return Export(path, tuple(files), states.code, states.functions)
+    for name, data in _programs().items():
+        write_bytes(path / name, data, durable=False)
+    return Export(path, (*files, *_programs()), written.code, written.functions)
+
+
+@cache
+def _programs() -> dict[str, bytes]:
+    """Return the runner, and the package by which it acts."""
+    runner = Path(__file__).with_name("runner.py").read_bytes()
+    modules = sorted(Path(policies.__path__[0]).glob("*.py"))
+    return {"runner.py": runner} | {
+        f"{PACKAGE}/{module.name}": module.read_bytes() for module in modules
+    }

@@ -18,8 +18,8 @@ from skillweave.messages import short
 from skillweave.policies.core import RUNNING, Turn, World, restart
 from skillweave.policies.hierarchy import SKILL, unless_none
 from skillweave.policies.parts import GOAL
+from skillweave.policies.spaces import space_of
 from skillweave.seeding import Seeds
-from skillweave.skills.goals import as_goals
 from skillweave.spaces import obs_dtype, unpack
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.types import Array
@@ -206,7 +206,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         choice[SKILL] = self._checked(actions[SKILL])
         for name, part in space.goal_spaces.items():
             whose = f"skill {name!r}"
-            goals = as_goals(goals_of[name], self.num_envs, part, "OptionsEnv.step", whose)
+            goals = space_of(part).goals(goals_of[name], self.num_envs, "OptionsEnv.step", whose)
             choice[GOAL][name] = goals
         return choice
 

@@ -309,7 +309,7 @@ def rehearsed_obs(
     if not steps.any():
         return None
     obs: Array = log.before[steps]
-    obs = obs if part is None else part.see(obs)
+    obs = obs if part is None else part.part.see(obs)
     goals = goals_of(skill)
     if goals is None:
         return obs

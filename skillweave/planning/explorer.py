@@ -13,7 +13,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
-from skillweave.planning.states import PlanningStates
+from skillweave.planning.states import planning_states
 from skillweave.policies.core import Memory, Policy, Turn
 from skillweave.types import Array
 
@@ -80,9 +80,9 @@ class Explorer(Policy):
             return
         graph = CallGraph(log, self._features, self._neighbours)
         nothing = RewardMachine({})
-        readings = nothing.read(graph.log.as_steps())
+        readings = nothing.acts.read(graph.log.as_steps())
         judged = graph.judge(
-            nothing, PlanningStates(nothing), readings, self._gamma, graph.terminated
+            nothing, planning_states(nothing), readings, self._gamma, graph.terminated
         )
         self._far = self._radius_of(graph)
         worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._far)
@@ -90,7 +90,7 @@ class Explorer(Policy):
 
     def _radius_of(self, graph: CallGraph) -> Array:
         """Return the distance from which on each option is new, (O,) float32."""
-        sizes = np.array([each.size for each in graph.maps])[graph.skill_of[graph.choice_of]]
+        sizes = np.array([each.size for each in graph.maps])[graph.options.skills]
         own = PER_FEATURE * np.sqrt(sizes) if self._radius is None else self._radius
         return np.broadcast_to(np.float32(own), sizes.shape)
 
@@ -132,6 +132,6 @@ class Explorer(Policy):
         again = (call >= 0) & ~is_new[rows, option]
         goals = {}
         for name, numbers in graph.log.goals.items():
-            mine = np.flatnonzero(again & (graph.skill_of[choice] == graph.log.number(name)))
+            mine = np.flatnonzero(again & (graph.options.skills[option] == graph.log.number(name)))
             goals[name] = mine, numbers[call[mine]]
         return choice, goals

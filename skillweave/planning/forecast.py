@@ -16,9 +16,10 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.hand_over import wilson
 from skillweave.planning.lacking import names_of, read_log
-from skillweave.planning.machine import Readings, RewardMachine, predicate_of
+from skillweave.planning.machine import RewardMachine, predicate_of
 from skillweave.planning.planner import Planner
-from skillweave.planning.tried import SLACK
+from skillweave.policies.plan import Readings
+from skillweave.policies.planned import SLACK
 from skillweave.types import Array
 
 EPISODES = 200
@@ -111,7 +112,7 @@ def forecast(planner: Planner) -> Forecast:
         weights = weights * (weights >= 0.999 * weights[:, graph.neighbours - 1, None])
         drawn = weights.cumsum(1) < rng.random((len(here), 1)) * weights.sum(1, keepdims=True)
         piece = wide.pieces[at, option, np.minimum(drawn.sum(1), weights.shape[1] - 1)]
-        far = near.distance[at, option] / graph.units[option]
+        far = near.distance[at, option] / graph.options.units[option]
         step, end = graph.pieces.first[piece], graph.end_of[piece]
         goes_on = np.isfinite(far)
         while goes_on.any():
@@ -120,13 +121,14 @@ def forecast(planner: Planner) -> Forecast:
                 readings = known.take(steps)
             elif isinstance(task, GoalTask):
                 there = task.holds(log.next_obs[steps], task.of(first[some]))
-                readings = Readings(there[:, None], np.zeros((len(some), 0)))
-            state[some] = machine.advance(state[some], readings)[0]
+                events = np.stack([there, np.zeros_like(there), np.ones_like(there)], 1)
+                readings = Readings(events, np.zeros((len(some), 1)))
+            state[some] = machine.acts.advance(state[some], readings)[0]
             elapsed[some] += 1
             step += goes_on
             goes_on &= (step <= graph.end_step[end]) & (elapsed[here] < limit)
             goes_on &= ~machine.is_over(state[here])
-        calls[:, here] = graph.skill_of[graph.choice_of[option]], (elapsed - until)[here], far
+        calls[:, here] = graph.options.skills[option], (elapsed - until)[here], far
         over = machine.is_over(state[here]) | (elapsed[here] >= limit) | ~np.isfinite(far)
         running[here[over | planner.over[end]]] = False
         if not running.any():
@@ -166,7 +168,7 @@ def forecast(planner: Planner) -> Forecast:
 
 def _shift(graph: CallGraph, option: Array, one: Array, other: Array) -> Array:
     """Return the distances (n,) between observations, as the skills of options see them."""
-    shift, skill = np.zeros(len(option)), graph.skill_of[graph.choice_of[option]]
+    shift, skill = np.zeros(len(option)), graph.options.skills[option]
     for i in np.unique(skill):
         mine, features = skill == i, graph.maps[i]
         shift[mine] = np.linalg.norm(features(one[mine]) - features(other[mine]), axis=1)
@@ -188,7 +190,7 @@ def _usual_calls(history: Array, skills: tuple[str, ...]) -> tuple[tuple[str, fl
 def _reason(machine: RewardMachine, state: Array, log: CallLog, known: Readings | None) -> str:
     """Return where most episodes end that fail, in these states (n,)."""
     begins = log.offset[:-1][log.order == 0]
-    for arrow in machine.arrows_from(machine.plan.start):
+    for arrow in machine.arrows[machine.plan.start]:
         if known is not None and machine.failing[arrow.target]:
             numbers = [machine.number(predicate_of(atom)) for atom in arrow.atoms]
             holds = known.events[begins][:, numbers].all(1).mean()

@@ -97,14 +97,11 @@ class GoalTask:
         value = called(self.reached, read_only(obs), f"{who}: {name}()", more=(goal,))
         return checked(value, len(obs), bool, who, name)
 
-    def at(self, goal: Array) -> RewardMachine:
-        """Return the task of one goal (G,) as a reward machine."""
-        there = Predicate(lambda obs: self.holds(obs, goal), "the goal", "obs")
-        return RewardMachine({("on the way", "there"): (there, 1.0)}, accepting={"there"})
-
-    def own(self) -> RewardMachine:
-        """Return the task whose goal is the one that each observation holds."""
-        there = Predicate(lambda step: self.arrives(step), "the goal", "step")
+    def at(self, goal: Array | None) -> RewardMachine:
+        """Return the task of one goal (G,), or None: of that which each observation holds."""
+        there = Predicate(self.arrives, "the goal", "step")
+        if goal is not None:
+            there = Predicate(lambda obs: self.holds(obs, goal), "the goal", "obs")
         return RewardMachine({("on the way", "there"): (there, 1.0)}, accepting={"there"})
 
     def arrives(self, step: Step) -> Array:
@@ -132,10 +129,10 @@ def reached(function: Callable[[Array, Array], Any], goal: Any) -> Predicate:
 def _goal(value: Any) -> Array:
     try:
         goal = np.atleast_1d(np.asarray(value))
+        if goal.dtype.kind not in "iuf":
+            raise TypeError
     except (TypeError, ValueError) as error:
         raise DeclarationError(f"a goal is {short(value)}; give numbers: [3.0, -1.0]") from error
-    if goal.dtype.kind not in "iuf":
-        raise DeclarationError(f"a goal is {short(value)}; give numbers: [3.0, -1.0]")
     goal = goal.astype(np.float64)
     if goal.ndim != 1 or not len(goal) or not np.isfinite(goal).all():
         raise DeclarationError(f"a goal is {short(value)}; give one row of finite numbers")

@@ -16,9 +16,10 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import compared_places
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import feature_maps, nearest, weights_of
+from skillweave.planning.neighbours import feature_maps, nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
+from skillweave.policies.plan import weights_of
 from skillweave.types import Array
 
 START = "start"
@@ -354,7 +355,7 @@ def happened(log: CallColumns, event: Any) -> Array:
         rows = np.flatnonzero((tau > k) & ~over)
         if not len(rows):
             break
-        state[rows], _ = task.advance(state[rows], readings.take(log.offset[rows] + k))
+        state[rows], _ = task.acts.advance(state[rows], readings.take(log.offset[rows] + k))
         over[rows] = task.is_over(state[rows])
     return over
 

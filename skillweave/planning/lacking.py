@@ -8,10 +8,11 @@ import numpy as np
 
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.machine import Arrow, Readings, RewardMachine, predicate_of
+from skillweave.planning.machine import Arrow, RewardMachine, predicate_of
 from skillweave.planning.neighbours import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.policies.core import observed
+from skillweave.policies.plan import Readings
 from skillweave.types import Array
 
 TRIES = 20_000
@@ -28,7 +29,7 @@ def read_log(task: RewardMachine, log: CallColumns) -> Readings:
         SkillError: an event or a reward failed, or returned another shape or type.
     """
     try:
-        return task.read(log.as_steps())
+        return task.acts.read(log.as_steps())
     except SkillError as error:
         cause = error.__cause__
         key = cause.args[0] if isinstance(cause, KeyError) and cause.args else None
@@ -51,7 +52,7 @@ def check_possible(task: RewardMachine, readings: Readings, log: CallColumns) ->
     pays = any(task.plan.each_step.values())
     while queue:
         state = queue.pop()
-        for arrow in task.arrows_from(state):
+        for arrow in task.arrows[state]:
             atoms = [predicate_of(atom) for atom in arrow.atoms]
             absent = [a for a in atoms if not happens[task.number(a)]]
             if absent and not task.failing[arrow.target]:
@@ -94,7 +95,7 @@ def obstacle(task: RewardMachine, log: CallColumns) -> str:
         rows, to = np.nonzero(follows[at])
         state = np.column_stack([place, task.counter_steps[place] - 1])[rows]
         new = np.zeros_like(reached)
-        new[task.advance(state, events.take(first[to]))[0][:, 0], to] = True
+        new[task.acts.advance(state, events.take(first[to]))[0][:, 0], to] = True
         new &= ~reached
     states: Array = np.asarray(reached.any(1))
     if (states & task.accepting).any():

@@ -17,9 +17,9 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, short
 from skillweave.planning.predicates import Event, Held, Predicate, as_event
-from skillweave.selectors import Automaton
-from skillweave.selectors.base import function_name, listed
-from skillweave.skills.answers import answer
+from skillweave.policies.plan import Machine
+from skillweave.selectors.automaton import Automaton, check_name, check_transitions
+from skillweave.selectors.base import Wrapped, checked_function, function_name, listed
 from skillweave.types import LARGEST_REWARD, Array, Step
 
 MOST_STATES = 10_000
@@ -71,26 +71,11 @@ class Plan:
     each_step: dict[int, Reward] = field(default_factory=dict)
     """The reward of every step in a state."""
 
-
-class Readings:
-    """Truths and rewards that a machine reads from n steps, whatever its states.
-
-    Args:
-        events: (n, E) bool.
-        values: (n, F) float64, rewards that are functions of a step.
-    """
-
-    def __init__(self, events: Array, values: Array) -> None:
-        n = len(events)
-        # Two columns that pad lists of atoms: one is never true, the other always.
-        self.events = np.concatenate([events, np.zeros((n, 1), bool), np.ones((n, 1), bool)], 1)
-        self.values = np.concatenate([np.zeros((n, 1)), values], 1)
-
-    def take(self, rows: Any) -> Readings:
-        """Return the readings of some steps."""
-        some = object.__new__(Readings)
-        some.events, some.values = self.events[rows], self.values[rows]
-        return some
+    @property
+    def pays(self) -> bool:
+        """True if a transition or a step of it has a reward."""
+        rewards = [*self.each_step.values(), *(arrow.reward for arrow in self.arrows)]
+        return any(callable(reward) or reward != 0.0 for reward in rewards)
 
 
 @checked_names
@@ -148,7 +133,7 @@ class RewardMachine:
         each_step: Any = 0.0,
     ) -> None:
         plan = _declared(transitions, start, accepting, failing, each_step)
-        if not _pays(plan):
+        if not plan.pays:
             plan.arrows = [
                 replace(arrow, reward=float(arrow.target in plan.accepting))
                 for arrow in plan.arrows
@@ -163,16 +148,16 @@ class RewardMachine:
                 "repeat it less often, or combine fewer sequences by 'and' or 'or'"
             )
         self.plan, self.state_names = plan, plan.names
-        by_state: list[list[Arrow]] = [[] for _ in plan.names]
+        self.arrows: list[list[Arrow]] = [[] for _ in plan.names]
+        """The transitions from each state, in the order in which they are checked."""
         for arrow in plan.arrows:
-            by_state[arrow.origin].append(arrow)
-        counters = [_counters(arrows) for arrows in by_state]
+            self.arrows[arrow.origin].append(arrow)
+        counters = [_counters(arrows) for arrows in self.arrows]
         self.slots = max((slot + 1 for some in counters for slot in some), default=0)
         """Counters side by side."""
         self.events: list[Predicate] = []
         self.rewards: list[Callable[[Step], Any]] = []
-        self._by_state = by_state
-        count, most = len(plan.names), max(1, *(len(a) for a in by_state))
+        count, most = len(plan.names), max(1, *(len(a) for a in self.arrows))
         atoms = max([1, *(len(a.atoms) for a in plan.arrows)])
         if count * most * atoms > MOST_CELLS:
             raise DeclarationError(
@@ -184,53 +169,47 @@ class RewardMachine:
                 self.number(predicate_of(atom))
         # Two columns behind those of the events: one is never true, the other always.
         never, always = len(self.events), len(self.events) + 1
-        self._counted = np.full((count, self.slots), never)
+        counted = np.full((count, self.slots), never)
         self.counter_steps = np.full((count, self.slots), _NEVER)
         """Steps for which each counter must count, (Q, H); the largest number: it is not used."""
         for q, some in enumerate(counters):
             for slot, counter in some.items():
-                self._counted[q, slot] = self.number(counter.predicate)
+                counted[q, slot] = self.number(counter.predicate)
                 self.counter_steps[q, slot] = counter.steps
-        self._atoms = np.full((count, most, atoms), always)
-        self._atoms[:, :, 0] = never
-        self._target = np.arange(count)[:, None].repeat(most, 1)
-        self._paid, self._paid_by = np.zeros((count, most)), np.zeros((count, most), np.int64)
-        self._keeps = np.zeros((count, most, self.slots), bool)
-        for q, arrows in enumerate(by_state):
+        each_atom = np.full((count, most, atoms), always)
+        each_atom[:, :, 0] = never
+        target = np.arange(count)[:, None].repeat(most, 1)
+        paid, paid_by = np.zeros((count, most)), np.zeros((count, most), np.int64)
+        keeps = np.zeros((count, most, self.slots), bool)
+        for q, arrows in enumerate(self.arrows):
             for t, arrow in enumerate(arrows):
-                self._atoms[q, t, : len(arrow.atoms)] = [
+                each_atom[q, t, : len(arrow.atoms)] = [
                     always + 1 + atom.slot if isinstance(atom, Counter) else self.number(atom)
                     for atom in arrow.atoms
                 ]
-                self._target[q, t] = arrow.target
-                self._paid[q, t], self._paid_by[q, t] = self._reward(arrow.reward)
-                self._keeps[q, t, list(arrow.keeps)] = True
-        self._each, self._each_by = np.zeros(count), np.zeros(count, np.int64)
+                target[q, t] = arrow.target
+                paid[q, t], paid_by[q, t] = self._reward(arrow.reward)
+                keeps[q, t, list(arrow.keeps)] = True
+        each, each_by = np.zeros(count), np.zeros(count, np.int64)
         for q, reward in plan.each_step.items():
-            self._each[q], self._each_by[q] = self._reward(reward)
+            each[q], each_by[q] = self._reward(reward)
+        events = [
+            (Wrapped(e.function, e.at if e.reads == "obs" else e.holds), e.reads)
+            for e in self.events
+        ]
+        rewards = [
+            checked_function(reward, "task", function_name(reward), np.float64)
+            for reward in self.rewards
+        ]
+        self.acts = Machine(
+            plan.start, counted, self.counter_steps, each_atom, target, paid, paid_by, keeps, each,
+            each_by, tuple(events), tuple(rewards),
+        )  # fmt: skip
+        """The task as data, by which a plan follows it."""
         self.accepting = np.isin(np.arange(count), list(plan.accepting))
         """The states in which the task has succeeded, (Q,) bool."""
         self.failing = np.isin(np.arange(count), list(plan.failing))
         """The states in which it has failed, (Q,) bool."""
-
-    @property
-    def arrays(self) -> dict[str, Array]:
-        """The machine as arrays, one row for each state, by which a runner follows it."""
-        return {
-            "counted": self._counted,
-            "counter_steps": self.counter_steps,
-            "atoms": self._atoms,
-            "target": self._target,
-            "paid": self._paid,
-            "paid_by": self._paid_by,
-            "keeps": self._keeps,
-            "each": self._each,
-            "each_by": self._each_by,
-        }
-
-    def arrows_from(self, state: int) -> list[Arrow]:
-        """Return the transitions from a state, in the order in which they are checked."""
-        return self._by_state[state]
 
     def number(self, predicate: Predicate) -> int:
         """Return the number of a predicate among the events; the same function has one number."""
@@ -256,9 +235,7 @@ class RewardMachine:
 
         Column 0 is the number of the machine's state, the others are its counters.
         """
-        state = np.zeros((n, 1 + self.slots), np.int64)
-        state[:, 0] = self.plan.start
-        return state
+        return self.acts.start(n)
 
     def step(self, state: Array, step: Step) -> tuple[Array, Array, Array]:
         """Return the state after a ``step``, the reward, and where the task is over.
@@ -273,75 +250,8 @@ class RewardMachine:
         Raises:
             SkillError: a predicate or a reward failed, or returned another shape or type.
         """
-        after, reward = self.advance(state, self.read(step))
+        after, reward = self.acts.advance(state, self.acts.read(step))
         return after, reward, self.is_over(after)
-
-    def read(self, step: Step) -> Readings:
-        """Evaluate all events and rewards on n steps."""
-        n = len(step.reward)
-        events = [event.holds(step) for event in self.events]
-        values = [
-            answer(reward, step, n, np.float64, "task", function_name(reward), step.elapsed)
-            for reward in self.rewards
-        ]
-        return Readings(
-            np.stack(events, 1) if events else np.zeros((n, 0), bool),
-            np.stack(values, 1) if values else np.zeros((n, 0)),
-        )
-
-    def advance(self, state: Array, readings: Readings) -> tuple[Array, Array]:
-        """Return the next states and rewards, from several states at once if wanted.
-
-        Args:
-            state: (n, …, 1 + H).
-            readings: of n steps.
-
-        Returns:
-            (n, …, 1 + H), and (n, …).
-        """
-        q = state[..., 0]
-        rows = np.arange(len(q)).reshape(-1, *(1,) * (q.ndim - 1))
-        after = np.empty_like(state)
-        full = np.zeros((*q.shape, self.slots), bool)
-        for slot in range(self.slots):
-            goes_on = readings.events[rows, self._counted[q, slot]]
-            count = np.where(goes_on, state[..., 1 + slot] + 1, 0)
-            full[..., slot] = count >= self.counter_steps[q, slot]
-            after[..., 1 + slot] = count
-        taken = np.full(q.shape, -1)
-        for t in reversed(range(self._atoms.shape[1])):
-            holds = self._holds(self._atoms[q, t], readings.events, rows, full)
-            taken = np.where(holds, t, taken)
-        arrow = np.maximum(taken, 0)
-        moves = taken >= 0
-        after[..., 0] = np.where(moves, self._target[q, arrow], q)
-        if self.slots:
-            after[..., 1:][moves[..., None] & ~self._keeps[q, arrow]] = 0
-        paid, each = np.where(moves, self._paid[q, arrow], 0.0), self._each[q]
-        reward: Array = paid + each
-        if self.rewards:
-            reward += np.where(moves, readings.values[rows, self._paid_by[q, arrow]], 0.0)
-            reward += readings.values[rows, self._each_by[q]]
-        return after, reward
-
-    def _holds(self, atoms: Array, events: Array, rows: Array, full: Array) -> Array:
-        """Return where all atoms (n, …, A) of an arrow hold, (n, …) bool."""
-        plain = events.shape[1]
-        holds: Array = np.ones(atoms.shape[:-1], bool)
-        for a in range(atoms.shape[-1]):
-            atom = atoms[..., a]
-            true = events[rows, np.minimum(atom, plain - 1)]
-            if self.slots:
-                slot = np.clip(atom - plain, 0, self.slots - 1)
-                counted = np.take_along_axis(full, slot[..., None], -1)[..., 0]
-                true = np.where(atom >= plain, counted, true)
-            holds &= true
-        return holds
-
-    @property
-    def pays(self) -> bool:
-        """True if a transition or a step of it has a reward."""
-        return _pays(self.plan)
 
     def is_over(self, state: Array) -> Array:
         """Return where the task is over, (n, …) bool."""
@@ -387,7 +297,7 @@ class RewardMachine:
         states: dict[str, Any] = {}
         transitions: dict[tuple[str, str], Any] = {}
         for q, name in enumerate(self.state_names):
-            arrows = self._by_state[q]
+            arrows = self.arrows[q]
             calls = [_skills_of(a, skills) for a in arrows if not self.failing[a.target]]
             chosen = list(dict.fromkeys(skill for some in calls for skill in some))
             counters = list(_counters(arrows).values())
@@ -410,6 +320,9 @@ class RewardMachine:
         return Automaton(states, transitions, self.state_names[self.plan.start])
 
 
+_Way = tuple[Sequence[Predicate], bool]
+
+
 def _counted_name(name: str, count: int) -> str:
     return name if count == 0 else f"{name} ({count} steps held)"
 
@@ -418,16 +331,10 @@ def _automaton_arrows(
     task: RewardMachine, arrows: Sequence[Arrow], name: str, counters: Sequence[Counter], count: int
 ) -> dict[tuple[str, str], Callable[[Step], Any]]:
     """Return an automaton's transitions from one state, whose counter stands at ``count``."""
-    events: dict[tuple[str, str], list[Callable[[Step], Any]]] = {}
-    here = _counted_name(name, count)
+    ways: dict[tuple[str, str], list[_Way]] = {}
 
     def add(target: str, atoms: Sequence[Predicate], wanted: bool = True) -> None:
-        def event(step: Step) -> Array:
-            holds: Array = np.logical_and.reduce([p.holds(step) for p in atoms])
-            return holds if wanted else ~holds
-
-        event.__name__ = ("" if wanted else "not ") + " and ".join(p.name for p in atoms)
-        events.setdefault((here, target), []).append(event)
+        ways.setdefault((_counted_name(name, count), target), []).append((atoms, wanted))
 
     for arrow in arrows:
         full = all(count + 1 >= a.steps for a in arrow.atoms if isinstance(a, Counter))
@@ -435,7 +342,7 @@ def _automaton_arrows(
             continue
         target, atoms = task.state_names[arrow.target], [predicate_of(a) for a in arrow.atoms]
         for counter in counters:
-            goes_on = counter.slot in _counters(task.arrows_from(arrow.target))
+            goes_on = counter.slot in _counters(task.arrows[arrow.target])
             if counter.slot in arrow.keeps and goes_on and count + 1 < counter.steps:
                 add(_counted_name(target, count + 1), [*atoms, counter.predicate])
         add(target, atoms)
@@ -444,18 +351,21 @@ def _automaton_arrows(
             add(_counted_name(name, count + 1), [counter.predicate])
         if count:
             add(name, [counter.predicate], wanted=False)
-    return {pair: _any_of(some) for pair, some in events.items()}
+    return {pair: _any_of(some) for pair, some in ways.items()}
 
 
-def _any_of(events: Sequence[Callable[[Step], Any]]) -> Callable[[Step], Any]:
-    if len(events) == 1:
-        return events[0]
+def _any_of(ways: Sequence[_Way]) -> Callable[[Step], Any]:
+    """Return the event that all predicates of one of the ways hold; or, if not wanted, do not."""
 
     def event(step: Step) -> Array:
-        holds: Array = np.logical_or.reduce([e(step) for e in events])
-        return holds
+        holds = [
+            np.logical_and.reduce([p.holds(step) for p in some]) == wanted for some, wanted in ways
+        ]
+        found: Array = np.logical_or.reduce(holds)
+        return found
 
-    event.__name__ = " or ".join(e.__name__ for e in events)
+    names = ("not " * (not wanted) + " and ".join(p.name for p in some) for some, wanted in ways)
+    event.__name__ = " or ".join(names)
     return event
 
 
@@ -489,23 +399,11 @@ def _counters(arrows: Sequence[Arrow]) -> dict[int, Counter]:
 
 def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_step: Any) -> Plan:
     """Check the arguments of a machine, and return its parts."""
-    if not isinstance(transitions, Mapping):
-        raise DeclarationError(
-            f"a RewardMachine's transitions are {short(transitions)}; write "
-            "{('from', 'to'): event}"
-        )
+    check_transitions(transitions, "a RewardMachine's")
     named: dict[str, int] = {}
     for pair in transitions:
-        if not isinstance(pair, tuple) or len(pair) != 2:
-            raise DeclarationError(
-                f"a RewardMachine's transition is from {short(pair)}; write ('from', 'to'): event"
-            )
         for state in pair:
-            if not isinstance(state, str) or not state:
-                raise DeclarationError(
-                    f"a RewardMachine's state is named {short(state)}; it must be text"
-                )
-            named.setdefault(state, len(named))
+            named.setdefault(check_name(state, "a RewardMachine's"), len(named))
     if not named:
         named[start if isinstance(start, str) and start else "always"] = 0
     ends = [
@@ -538,11 +436,6 @@ def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_s
         if state not in over:
             plan.each_step[state] = reward
     return plan
-
-
-def _pays(plan: Plan) -> bool:
-    rewards = [*plan.each_step.values(), *(arrow.reward for arrow in plan.arrows)]
-    return any(callable(reward) or reward != 0.0 for reward in rewards)
 
 
 def atom_of(event: Event, slot: int) -> Atom:

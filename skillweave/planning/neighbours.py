@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,23 +15,15 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import close_matches, error_text, short
 from skillweave.ops.moments import is_constant, scale_of
 from skillweave.ops.seen import Seen
+from skillweave.policies import plan
+from skillweave.selectors.base import Wrapped
 from skillweave.spaces import obs_codec, to_tensor
 from skillweave.types import Array
 
-BLOCK = 4_000_000
-"""Distances that are computed at once."""
-SOFT = 0.01
-"""Distance that is added before weights are inverse distances: two equal calls count equally."""
-AHEAD = 8
-"""Points that are looked at for each one that is wanted: several may be of one group, or equally
-near."""
 MOST_DISTINCT = 0.9
 """The share of a number's distinct values that are looked for in the shortest interval."""
 OUTSIDE = 3.0
 """Lengths of that interval, beside it, beyond which values do not count to the deviation."""
-FAR = 100.0
-"""Deviations beyond which all values are equally far."""
-
 Features = Callable[[Array], Any] | Sequence[int]
 """Features of observations: a function (n, *obs_shape) to (n, F), or places in the flat vector."""
 
@@ -88,10 +81,10 @@ class Standard:
     def __call__(self, values: Array) -> Array:
         """Return standardised values (..., F), float64."""
         standard: Array = (values - self.mean) * self.scale
-        return standard.clip(-FAR, FAR)
+        return standard.clip(-plan.FAR, plan.FAR)
 
 
-class FeatureMap(Standard):
+class FeatureMap:
     """Standardised features of observations for one skill.
 
     Args:
@@ -107,58 +100,68 @@ class FeatureMap(Standard):
     def __init__(self, space: gym.Space[Any], features: Any, known: Array, who: str) -> None:
         self._space, self._features, self._who = space, features, who
         self._codec = None if callable(features) else obs_codec(space)
+        self.places: list[int] | None = None
+        """The places in the flat observation; None: the features are a function."""
         if self._codec is not None:
             if self._codec.images and features is None:
                 raise DeclarationError(
                     f"{who} sees images, and images have no distance that means something; "
                     + FEATURES
                 )
-            self._places = self._checked_places(features, self._codec.size)
+            self.places = self._checked_places(features, self._codec.size)
         raw = self.raw(known)
         if wrong := np.flatnonzero(~np.isfinite(raw).all(0)).tolist():
             raise DeclarationError(
                 f"feature {wrong[0]} of {who} is not finite in the log; leave it out, or clip it"
             )
-        super().__init__(raw)
-        if not self.varies.any():
+        standard = Standard(raw)
+        at = np.flatnonzero(standard.varies)
+        self._standard = plan.Features(
+            at, standard.mean[at], standard.scale[at], self.raw, self._check
+        )
+        self.size = len(at)
+        """F, the number of features."""
+        if not self.size:
             raise DeclarationError(
                 f"all features of {who} are constant in the log, so no call is nearer than "
                 "another; give features= that change, or record calls from other states"
             )
         low, high = torch.from_numpy(raw.min(0)), torch.from_numpy(raw.max(0))
-        self._seen = Seen(f"the plan with {who}: feature", *self.moments, low, high, len(raw))
-        self.size = int(self.varies.sum())
-        """F, the number of features."""
+        self._seen = Seen(f"the plan with {who}: feature", *standard.moments, low, high, len(raw))
 
-    def __call__(self, obs: Array, *, acts: bool = False) -> Array:
-        """Return standardised features, (n, F) float32; constant ones are left out.
+    def __call__(self, obs: Array) -> Array:
+        """Return standardised features, (n, F) float32; constant ones are left out."""
+        return self._standard(obs)
 
-        If the plan ``acts`` by them, a feature far beyond the log is named once.
-        """
-        raw = self.raw(obs)
+    @property
+    def acting(self) -> plan.Features:
+        """The same for a plan that acts: a feature far beyond the log is named once."""
+        function: Callable[..., Any] = self.raw
+        if self._codec is None:
+            function = Wrapped(self._features, self.raw)
+        elif isinstance(self._space, gym.spaces.Box) and not self._codec.images:
+            places = np.array(self.places)[self._standard.places]
+            return replace(self._standard, places=places, function=None, look=self._notice_places)
+        return replace(self._standard, function=function, look=self._notice)
+
+    def _notice_places(self, numbers: Array) -> None:
+        self._notice(numbers[:, self.places].astype(np.float64))
+
+    def _notice(self, raw: Array) -> None:
+        self._check(raw)
+        self._seen.look(torch.from_numpy(raw))
+
+    def _check(self, raw: Array) -> None:
         if not np.isfinite(raw).all():
             raise DeclarationError(
                 f"a feature of {self._who} is not finite in an observation; clip it"
             )
-        if acts:
-            self._seen.look(torch.from_numpy(raw))
-        return np.asarray(super().__call__(raw)[:, self.varies], np.float32)
-
-    @property
-    def places(self) -> list[int] | None:
-        """The places in the flat observation; None: the features are a function."""
-        return None if self._codec is None else self._places
-
-    @property
-    def arrays(self) -> dict[str, Array]:
-        """The numbers by which raw features are standardised, and those that are left out."""
-        return {"mean": self.mean, "scale": self.scale, "varies": self.varies}
 
     def raw(self, obs: Array) -> Array:
         """Return the features of observations (n, …) as they are, (n, F) float64."""
         if self._codec is not None:
             vector = self._codec.split(to_tensor(obs))[0].numpy().reshape(len(obs), -1)
-            features: Array = vector[:, self._places].astype(np.float64)
+            features: Array = vector[:, self.places].astype(np.float64)
             return features
         try:
             value = np.asarray(self._features(obs), np.float64)
@@ -210,28 +213,24 @@ def feature_maps(
                 f"features= names {short(name)}, which is no skill of the log; its skills are: "
                 f"{', '.join(skills)}.{close_matches(str(name), skills)}"
             )
-    maps: list[FeatureMap] = []
-    for name, places in zip(skills, sees, strict=True):
-        given = by_skill.get(name)
-        maps.append(FeatureMap(space, places if given is None else given, known, f"skill {name!r}"))
-    return maps
+    return [
+        FeatureMap(
+            space,
+            places if by_skill.get(name) is None else by_skill[name],
+            known,
+            f"skill {name!r}",
+        )
+        for name, places in zip(skills, sees, strict=True)
+    ]
 
 
+@lru_cache(64)
 def tie_order(count: int) -> Array:
     """Return the order in which equally near points count, (count,) int64.
 
     It is by chance, but always the same: those of one part of a log would resemble one another.
     """
-    order: Array = _tie_ranks(count).argsort()
-    return order
-
-
-@lru_cache(64)
-def _tie_ranks(count: int) -> Array:
-    """Return the place of each point in ``tie_order``."""
-    ranks = np.random.default_rng(0).permutation(count)
-    ranks.setflags(write=False)
-    return ranks
+    return np.random.default_rng(0).permutation(count).argsort()
 
 
 def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, Array]:
@@ -248,30 +247,6 @@ def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, 
         ``tie_order``; and distances (n, count) float32. Where there are fewer groups, the distance
         is infinite.
     """
-    tries = min(len(points), count * AHEAD)
-    y, x = torch.from_numpy(points), torch.from_numpy(np.ascontiguousarray(to))
-    squares = (y * y).sum(1)[None]
-    rows = []
-    step = max(1, BLOCK // len(points))
-    for first in range(0, len(to), step):
-        far = torch.addmm(squares, x[first : first + step], y.T, alpha=-2.0)
-        rows.append(far.topk(tries, 1, largest=False).indices)
-    near = torch.cat(rows).numpy() if rows else np.zeros((0, tries), np.int64)
-    near = np.take_along_axis(near, _tie_ranks(len(points))[near].argsort(1), 1)
-    # Differences again: those of squares are wrong by rounding where points are near.
-    distance = np.sqrt(((points[near] - to[:, None]) ** 2).sum(2))
-    groups, each = group[near], np.arange(len(to))
-    chosen = np.zeros((len(to), count), np.int64)
-    far_away = np.full((len(to), count), np.inf, np.float32)
-    for k in range(min(count, tries)):
-        at = distance.argmin(1)
-        chosen[:, k], far_away[:, k] = near[each, at], distance[each, at]
-        distance[groups == groups[each, at][:, None]] = np.inf
-    return chosen, far_away
-
-
-def weights_of(distance: Array) -> Array:
-    """Return weights (…, K) of neighbours at these distances; they add up to 1."""
-    weights = 1.0 / (distance + SOFT)
-    normalised: Array = weights / weights.sum(-1, keepdims=True)
-    return normalised
+    order = tie_order(len(points))
+    near, far = plan.nearest(points[order], to, count, group[order])
+    return order[near], far

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import gymnasium as gym
@@ -18,18 +19,18 @@ from skillweave.messages import short, whole_number
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog, columns_of
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.graph import CallGraph, Near
+from skillweave.planning.graph import CallGraph
 from skillweave.planning.lacking import check_possible, obstacle, read_log
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
-from skillweave.planning.states import PlanningStates
+from skillweave.planning.states import planning_states
 from skillweave.planning.task import Task, as_task
-from skillweave.planning.tried import Tried
-from skillweave.policies.core import LastCall, own_step
+from skillweave.policies.plan import Near
+from skillweave.policies.planned import Planned
 from skillweave.selectors.base import ReadySelector
 from skillweave.skills.foreign_policy import checksum
-from skillweave.skills.goal_spaces import from_numbers, numbers_in
-from skillweave.types import Array, Memory, Step
+from skillweave.skills.goal_spaces import numbers_in
+from skillweave.types import Array
 
 MOST_GOALS = 256
 """Goals whose plans are kept."""
@@ -124,8 +125,8 @@ class Planner(ReadySelector):
         if not isinstance(log, CallLog):
             raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
         self.log, self.task = log, as_task(task, predicates)
-        self.lengths = log.lengths
-        if isinstance(self.task, RewardMachine) and not self.task.pays:
+        self.skills, self.lengths = log.skills, log.lengths
+        if isinstance(self.task, RewardMachine) and not self.task.plan.pays:
             raise DeclarationError(
                 "the RewardMachine pays nothing, so there is nothing to plan: give a transition a "
                 "reward, {('from', 'to'): (event, 1.0)}, or name accepting states, which then pay 1"
@@ -138,14 +139,13 @@ class Planner(ReadySelector):
             self.task if isinstance(self.task, RewardMachine) else None,
         )
         self.gamma, self.caution, self.temperature = gamma, caution, temperature
-        self._tried = Tried(self.graph)
         self._plans: OrderedDict[bytes, Plan] = OrderedDict()
         self.over = _over(self.task, self.graph)
         """(E,) bool, the ends of calls after which nothing follows."""
-        self.machine = self.task.own() if isinstance(self.task, GoalTask) else self.task
-        self.states = PlanningStates(self.machine)
-        for name, known in zip(log.skills, _known_skills(self.graph), strict=True):
-            if not known:
+        self.machine = self.task.at(None) if isinstance(self.task, GoalTask) else self.task
+        self.states = planning_states(self.machine)
+        for i, name in enumerate(log.skills):
+            if not (self.graph.log.skill == i).any():
                 notice(f"the log has no call of {name!r}, so the planner never calls it")
         if any(log.recurrent):
             names = ", ".join(n for n, r in zip(log.skills, log.recurrent, strict=True) if r)
@@ -163,19 +163,41 @@ class Planner(ReadySelector):
         elif self.task.goal is not None:
             self.plan = self._plan_of(self.task.goal)
 
+    @cached_property
+    def in_place(self) -> Planned:
+        """The plan as data, which acts in many environments at once."""
+        graph, states, worth = self.graph, self.states, self.plan.worth
+        kind: type[Planned] = Planned
+        if isinstance(self.task, GoalTask) and self.task.columns is not None:
+            kind, worth = _OfObserved, np.zeros((len(graph.pieces.call), states.count), np.float32)
+        acts = kind(
+            *self._rule_of,
+            tuple(each.acting for each in graph.maps),
+            graph.options,
+            self.machine.acts,
+            states,
+            worth,
+            self.gamma,
+            self.caution,
+            self.temperature,
+            {name: graph.log.goals[name] for name in self.goal_spaces},
+        )
+        if isinstance(acts, _OfObserved):
+            acts.planner = self
+        return acts
+
     # Planning
 
     def _solve(self, task: RewardMachine, place: Array | None = None) -> Plan:
         """Plan a task; ``place`` is its goal, if it is one."""
         graph = self.graph
-        readings = read_log(task, self.graph.log)
-        check_possible(task, readings, self.graph.log)
+        readings = read_log(task, graph.log)
+        check_possible(task, readings, graph.log)
         near, may = graph.after, graph.may
         if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
         judged = graph.judge(task, self.states, readings, self.gamma, self.over)
-        worth, sweeps = graph.solve(judged, near, may, caution=self.caution)
-        return Plan(worth, sweeps)
+        return Plan(*graph.solve(judged, near, may, caution=self.caution))
 
     def _plan_of(self, goal: Array) -> Plan:
         """Return the plan of a goal (G,), solved when it is first needed."""
@@ -201,7 +223,7 @@ class Planner(ReadySelector):
             log has no call.
         """
         state = self.machine.start(len(obs)) if state is None else state
-        values = self._values(self.graph.near(obs), obs, state)
+        values = self.in_place.valued(self.graph.near(obs), obs, self.states.corners(state))
         first = np.searchsorted(self.graph.choice_of, np.arange(self.log.choices))
         best: Array = np.maximum.reduceat(values, first, axis=1)
         return best
@@ -225,43 +247,14 @@ class Planner(ReadySelector):
     ) -> tuple[Array, Near]:
         """Return the best options of the graph, (n,), and the nearest calls; see ``choices``."""
         near = self.graph.near(obs)
-        return self._choose(self._values(near, obs, state), may, rng), near
-
-    def goals_at(self, choice: Array, call: Array) -> dict[str, tuple[Array, Array]]:
-        """Return goals of choices (n,) from calls (n,) in the graph, as of ``with_goals``."""
-        found, skill = {}, self.graph.skill_of[choice]
-        for name, space in self.goal_spaces.items():
-            rows = np.flatnonzero((skill == self.log.number(name)) & (call >= 0))
-            found[name] = rows, from_numbers(space, self.graph.log.goals[name][call[rows]])
-        return found
+        q = self.in_place.valued(near, obs, self.states.corners(state))
+        return self.in_place.choose(q, may, rng), near
 
     @property
     def compared(self) -> dict[str, list[int] | None]:
         """The places in the flat observation that count, by skill; None: a function does."""
         places = (each.places for each in self.graph.maps)
         return dict(zip(self.log.skills, places, strict=True))
-
-    def _goal_advice(self, name: str) -> str:
-        return f"the log has no call of {name!r}, so record some"
-
-    def _values(self, near: Near, obs: Array, state: Array) -> Array:
-        if not isinstance(self.task, GoalTask):
-            return self._values_in(self.plan, near, state)
-        goals = self.task.of(obs)
-        values = np.empty(near.distance.shape, np.float32)
-        unique, which = np.unique(goals, axis=0, return_inverse=True)
-        for i, goal in enumerate(unique):
-            rows = np.flatnonzero(which.reshape(-1) == i)
-            values[rows] = self._values_in(self._plan_of(goal), near.take(rows), state[rows])
-        return values
-
-    def _values_in(self, plan: Plan, near: Near, state: Array) -> Array:
-        place, share = self.states.corners(state)
-        # (n, O, K, J): the worth of each neighbour at each corner.
-        worth = plan.worth[near.pieces[..., None], place[:, None, None, :]]
-        q = ((worth * share[:, None, None, :]).sum(3) * near.weights).sum(2)
-        q = np.where(q > 0, q * self.graph.trust(near.distance, self.caution), q)
-        return np.where(np.isfinite(near.distance), q, -np.inf).astype(np.float32)
 
     def situations(self, count: int, goals: int, rng: np.random.Generator) -> tuple[Array, Array]:
         """Draw logged observations, and states of the task that is not over in them.
@@ -336,62 +329,6 @@ class Planner(ReadySelector):
             )
         return bound
 
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments: the task's state, and no call so far."""
-        state = self.machine.start(n)
-        return {"state": state[:, 0], "counters": state[:, 1:], **self._tried.start(n)}
-
-    @property
-    def ranges(self) -> dict[str, range]:
-        """Return the range of the task's states."""
-        return {"state": range(len(self.machine.state_names))}
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` (n, choices) allows.
-
-        Where it was bound to choices with goals, they have goals.
-        """
-        may = np.ones((len(obs), self.log.choices), bool) if mask is None else mask
-        features = [each(obs, acts=True) for each in self.graph.maps]
-        near, state = self.graph.near_features(features), _state(memory)
-        logged, place = self._values(near, obs, state), self.states.place(state)
-        seen, goals = self._tried.padded(features), self._tried.goals_of(near)
-        memory = memory | self._tried.end(memory, seen, goals, logged, near, place, may)
-        q = self._tried.corrected(memory, seen, goals, logged, near, place)
-        option, rows = self._choose(q, may, rng), np.arange(len(obs))
-        choice, call = self.graph.choice_of[option], near.goal[rows, option]
-        # A guide does not say which goal: that of the call is unknown.
-        goal = goals[rows, option] if self.goal_spaces else np.where(call < 0, 0.0, np.nan)[:, None]
-        memory = memory | self._tried.begin(memory, seen, goal, choice, place)
-        if not self.goal_spaces:
-            return choice, memory
-        return self.with_goals(choice, self.goals_at(choice, call), obs), memory
-
-    def _choose(self, q: Array, may: Array, rng: np.random.Generator | None) -> Array:
-        """Return the best options of values (n, O), or samples; ``may``: (n, choices) bool."""
-        may = may[:, self.graph.choice_of]
-        score = np.where(may, np.maximum(q, -1e30), -np.inf)  # one without a call comes last
-        if self.temperature:
-            largest = np.abs(np.where(may & np.isfinite(q), q, 0.0)).max(1, keepdims=True)
-            score = score / (self.temperature * np.maximum(largest, 1e-12))
-            score = score + (rng or np.random.default_rng()).gumbel(size=q.shape)
-        option: Array = score.argmax(1)
-        return option
-
-    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Return the memory after a ``step``: the task's state goes on."""
-        after, reward, _ = self.machine.step(_state(memory), own_step(step))
-        changed = {"state": after[:, 0], "counters": after[:, 1:]}
-        return memory | changed | self._tried.pay(memory, reward, self.gamma, last)
-
     def source(self) -> dict[str, Any]:
         """Return the checksum of its log, with the names of its task's states."""
         digest = [
@@ -402,15 +339,24 @@ class Planner(ReadySelector):
         return {"kind": self.kind, "name": self.name, "sha256": checksum(whole.encode())}
 
 
+class _OfObserved(Planned):
+    """A plan for the goals that observations hold, each solved when it is first observed."""
+
+    planner: Planner
+
+    def worths(self, obs: Array) -> Iterator[tuple[Any, Array]]:
+        """Yield rows of observations with one goal, and the worth of pieces for it."""
+        task = self.planner.task
+        assert isinstance(task, GoalTask)
+        unique, which = np.unique(task.of(obs), axis=0, return_inverse=True)
+        for i, goal in enumerate(unique):
+            yield np.flatnonzero(which.reshape(-1) == i), self.planner._plan_of(goal).worth
+
+
 def _shown_sizes(sizes: Mapping[str, int]) -> str:
     """Return the numbers of goals by skill for messages."""
     each = [f"{name} ({size} number{'s' * (size != 1)})" for name, size in sizes.items()]
     return ", ".join(each) or "no skill"
-
-
-def _state(memory: Memory) -> Array:
-    """Return the task's state in a memory, (n, 1 + H)."""
-    return np.concatenate([memory["state"][:, None], memory["counters"]], 1)
 
 
 def _skill_set(log: CallLog, skills: Any) -> SkillSet | None:
@@ -438,9 +384,3 @@ def _over(task: Task, graph: CallGraph) -> Array:
     own = task.of(graph.log.start[graph.end_call[rows]])
     over[rows] = ~task.holds(graph.end[rows], own)
     return over
-
-
-def _known_skills(graph: CallGraph) -> list[bool]:
-    """Return whether the log has a call of each skill."""
-    skill = graph.skill_of[graph.choice_of]
-    return [bool(graph.known[skill == i].any()) for i in range(len(graph.log.skills))]

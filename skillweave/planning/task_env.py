@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.checks import last_observation
-from skillweave.envs.infos import batched_infos
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.task import Task
 from skillweave.policies.core import OWN_REWARD, OWN_SUCCESS, SUCCESS
+from skillweave.policies.infos import batched_infos
 from skillweave.spaces import obs_dtype, obs_shape
 from skillweave.spaces.packing import parts, put_observation
 from skillweave.types import Array, Step
@@ -93,7 +93,7 @@ class TaskEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], task: Task, *, observe: bool = False) -> None:
         super().__init__(env)
-        self.machine = task.own() if isinstance(task, GoalTask) else task
+        self.machine = task.at(None) if isinstance(task, GoalTask) else task
         self._own, self._observes = env.observation_space, observe
         if observe:
             self.observation_space = _with_task(self._own, self.machine.observation_space)

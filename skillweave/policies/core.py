@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .errors import SkillError
 
 Array: TypeAlias = NDArray[Any]
 Memory: TypeAlias = dict[str, Any]
@@ -219,6 +221,8 @@ class Policy:
     """It may not start everywhere."""
     fresh_calls = False
     """Each call with a goal begins with a fresh memory."""
+    holds = False
+    """The last action of the environment counts."""
 
     def start(self, n: int) -> Memory:
         """Return the memory of n environments in which it has not acted yet."""
@@ -247,6 +251,15 @@ class Policy:
         """Return whether it may choose otherwise where it is asked the same again."""
         return not greedy
 
+    def check(self, sees: Any, acts: Any, goal: Any, where: str) -> None:
+        """Raise a PolicyError where it does not fit these spaces: it may be from a file.
+
+        Args:
+            sees, acts: ``Space`` of its observations and actions.
+            goal: of the calls that it acts in; None: they have none.
+            where: begins the message.
+        """
+
     def values(self) -> dict[str, Any]:
         """Return what numbers in its memory may be, by dotted name: a range, or has ``contains``.
 
@@ -255,14 +268,18 @@ class Policy:
         return {}
 
 
+@dataclass(eq=False)
 class Around(Policy):
     """A policy that changes what another one sees or does; the base of combinators."""
 
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
+    policy: Policy
+
+    def __post_init__(self) -> None:
+        policy = self.policy
         self.watches = policy.watches
         self.restricts = policy.restricts
         self.fresh_calls = policy.fresh_calls
+        self.holds = policy.holds
 
 
 def _forward(name: str) -> Callable[..., Any]:
@@ -277,9 +294,36 @@ for _name, _method in vars(Policy).items():  # a combinator can forget none of t
         setattr(Around, _name, _forward(_name))
 
 
+def code(what: str, label: str = "", *, needed: bool = True) -> Any:
+    """Return a field that holds a function of the user, which exports name and do not write.
+
+    Args:
+        what: what it takes and returns, for the list of functions that an export needs.
+        label: its name there, after that of the skill; "": the function's own.
+        needed: else it may be None.
+    """
+    metadata = {"what": what, "label": label}
+    return field(metadata=metadata) if needed else field(default=None, metadata=metadata)
+
+
 Asks: TypeAlias = Callable[[Callable[..., Any], Any, Array, str, str], Array]
 """How functions of users are asked: of a function, a step or observations, the rows (k,) that they
 are of, the skill's path and its name: what it answers, (k,) bool."""
+
+
+def asked(function: Callable[..., Any], about: Any, rows: Array, path: str, name: str) -> Array:
+    """Ask a function of a user, as ``Asks`` says, without further words.
+
+    Raises:
+        SkillError: it did not return (k,) bool.
+    """
+    found = np.asarray(function(about))
+    if found.shape != (len(rows),) or found.dtype.kind not in "biuf":
+        raise SkillError(
+            f"{path!r}: {name}() returned {found.dtype} of shape {found.shape}, but ({len(rows)},) "
+            "bool was expected: one yes or no for each environment"
+        )
+    return found.astype(bool, copy=False)
 
 
 def observed(obs: Array) -> str:

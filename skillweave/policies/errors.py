@@ -30,6 +30,14 @@ class SkillweaveError(Exception):
         super().__init__(printable(message))
 
 
+class DeclarationError(SkillweaveError):
+    """A setting, an argument or a declaration is wrong; raised before anything is trained."""
+
+
+class RunError(SkillweaveError):
+    """A run or another file is missing, damaged, in use, of other settings, or not writable."""
+
+
 class SkillError(SkillweaveError):
     """Code of a skill, a selector or a reflex failed, or returned an unusable value."""
 

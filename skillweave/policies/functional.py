@@ -39,15 +39,17 @@ class Functional:
         *,
         deterministic: bool = True,
         rng: np.random.Generator | None = None,
+        goal: Array | None = None,
     ) -> tuple[Array, Memory]:
         """Return actions (n, ...) for ``obs`` (n, ...), among those that ``mask`` (n, A) allows.
 
-        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling.
+        ``memory`` is of n environments; ``rng`` is the source of random numbers for sampling;
+        ``goal`` (n, G) replaces a goal of the policy's own.
 
         ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
         selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
         """
-        memory, goal = {k: v.copy() for k, v in memory.items()}, None
+        memory = {k: v.copy() for k, v in memory.items()}
         if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
         turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
@@ -71,7 +73,8 @@ class Functional:
     def is_plain(self) -> bool:
         """It acts as ``in_place`` does: no subclass has another way."""
         kind = type(self)
-        return kind.act is Functional.act and kind.observe is Functional.observe
+        own = (kind.start, kind.act, kind.observe)
+        return own == (Functional.start, Functional.act, Functional.observe)
 
 
 class Returns(Policy):

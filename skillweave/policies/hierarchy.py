@@ -12,8 +12,10 @@ A ``Hierarchy`` remembers, for each environment:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,9 @@ from .core import (
     Policy,
     Step,
     Turn,
+    World,
+    asked,
+    code,
     end_with_episode,
     observed,
     own_step,
@@ -39,9 +44,10 @@ from .core import (
     put,
     take,
 )
-from .errors import SkillError
-from .leaves import Ready
-from .parts import GOAL, joined
+from .errors import PolicyError, SkillError
+from .leaves import Selector
+from .parts import GOAL, OBSERVATION, joined, joint_dtype, with_goal
+from .spaces import Space
 
 SKILL = "skill"
 """The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
@@ -49,7 +55,49 @@ TRIES = 16
 """The most goals that are chosen for a call, where those before hold already."""
 
 
-@dataclass
+@dataclass(eq=False)
+class CallGoals:
+    """The goals of a skill's calls."""
+
+    name: str
+    """Of the skill, for messages."""
+    space: Space
+    clip: Callable[..., Any] | None = code(
+        "observations and goals (n, ...) to goals (n, ...)", "clip_goal", needed=False
+    )
+    termination: Callable[..., Any] | None = code(
+        "a Step to (n,) bool", "termination", needed=False
+    )
+
+    def start(self, n: int) -> Array:
+        """Return goals of n environments without a call, (n, *goal_shape)."""
+        return self.space.start(n)
+
+    def fitted(self, obs: Array, goal: Any, who: str) -> Array:
+        """Return goals (n, …) for calls that start in ``obs`` (n, …), clipped and checked.
+
+        Raises:
+            SkillError: one is out of the space; ``who`` gave it.
+        """
+        n, skill = len(obs), f"skill {self.name!r}"
+        goals = self.space.goals(goal, n, who, skill)
+        if self.clip is not None:
+            who = f"{skill}: clip_goal()"
+            goals = self.space.goals(self.clip(obs, goals), n, who, skill)
+        if not (inside := self.space.holds(goals)).all():
+            raise SkillError(self.space.is_out(goals[~inside][0], who, skill))
+        return goals
+
+    def hold(self, obs: Array, goal: Array) -> Array:
+        """Return the goals (n, …) that hold in ``obs`` (n, …) already, (n,) bool."""
+        return goals_hold(self.termination, obs, goal)
+
+    def contains(self, goal: Array) -> bool:
+        """Return whether all goals (n, *goal_shape) are in the space."""
+        return bool(self.space.holds(goal).all())
+
+
+@dataclass(eq=False)
 class CalledSkill:
     """A skill of a hierarchy: its policy, and when calls of it start and end."""
 
@@ -61,31 +109,61 @@ class CalledSkill:
     """Steps after which a call is cut; None: never."""
     max_steps: int | None = None
     """Of these the skill's own: its functions see that it is ``timed_out``."""
-    initiation: Callable[..., Any] | None = None
-    termination: Callable[..., Any] | None = None
-    success: Callable[..., Any] | None = None
-    goals: Any = None
-    """``start``, ``fitted`` and ``hold`` goals (see ``Goals``); None: it has none."""
+    initiation: Callable[..., Any] | None = code(
+        "observations (n, ...) to (n,) bool", "initiation", needed=False
+    )
+    termination: Callable[..., Any] | None = code(
+        "a Step to (n,) bool", "termination", needed=False
+    )
+    success: Callable[..., Any] | None = code("a Step to (n,) bool", "success", needed=False)
+    goals: Any = field(default=None, metadata={"kind": CallGoals | None})
+    """``CallGoals``, or what else has their methods; None: it has none."""
 
 
-@dataclass(frozen=True)
+def goals_hold(termination: Any, obs: Array, goal: Array) -> Array:
+    """Return the goals (n, …) for which a call would end at once, (n,) bool.
+
+    For them ``termination`` is true for a step that stands still in ``obs`` (n, …). Where it
+    fails for such a step, as it reads ``info`` for example, no goal holds.
+    """
+    zeros, ones = np.zeros(len(obs), np.float32), np.ones(len(obs), np.int64)
+    no = zeros > 0
+    still = Step(obs, zeros, obs, zeros, no, no, no, ones, {}, goal)
+    with suppress(Exception), np.errstate(all="ignore"):
+        return np.array(termination(still), bool).reshape(len(obs))
+    return no
+
+
+@dataclass(eq=False)
+class Critic:
+    """A policy whose actions are the values of skills."""
+
+    policy: Policy
+
+    def __call__(self, obs: Array) -> Array:
+        """Return the values (n, S + 1) of observations (n, …)."""
+        n = len(obs)
+        return self.policy.act(self.policy.start(n), np.arange(n), obs, Turn(World()))
+
+
+@dataclass(eq=False)
 class Interruption:
     """When the selector ends a call (Sutton, Precup & Singh 1999, sec. 4)."""
 
-    worth: Callable[[Array], Array]
+    worth: Critic | Callable[[Array], Array]
     """From observations (n, …), the value of each skill and last of a new decision, (n, S + 1), in
     deviations of the return."""
     margin: float
     """How much more a new decision must be worth, in the same unit."""
-    critic: Any = None
+    critic: Any = field(default=None, metadata={"written": False})
     """The trained critic, if there is one."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class ActiveGuide:
     """A ready selector that is asked wherever a selector decides."""
 
-    selector: Any
+    selector: Any = field(metadata={"kind": Selector})
     restricts: bool = True
     """Only what it may choose is allowed."""
     tells: bool = False
@@ -97,6 +175,7 @@ class ActiveGuide:
 NEVER = np.iinfo(np.int64).max
 
 
+@dataclass(eq=False)
 class Hierarchy(Policy):
     """Skills in calls, and the selector that starts them where a call has ended.
 
@@ -106,48 +185,39 @@ class Hierarchy(Policy):
     Args:
         selector: chooses; None: the caller does, by ``begin``.
         skills: in order.
-        ask: how functions of users are asked.
         lengths: that are chosen from together with skills; (): none is chosen.
-        guide: with a ``Ready``: restricts the choices, or only tells what it would choose.
+        guide: with a ``Selector``: restricts the choices, or only tells what it would choose.
         interruption: when the selector cuts a call; None: never.
-        call_goals: ``join`` makes of observations, running skills and their goals what the critic
-            sees; None: no skill has goals.
         fresh_calls: it is a skill that has goals: selector and guide see them beside observations,
             the skills do not, and each of its calls begins with a fresh memory.
         greedy: its skills are; else they sample.
         greedy_selector: its selector is, where its caller acts greedily; else it samples.
+        ask: how functions of users are asked.
+
+    Raises:
+        PolicyError: lengths do not rise.
     """
 
     watches = True
 
-    def __init__(
-        self,
-        selector: Policy | None,
-        skills: Sequence[CalledSkill],
-        ask: Asks,
-        *,
-        lengths: tuple[int, ...] = (),
-        guide: ActiveGuide | None = None,
-        interruption: Interruption | None = None,
-        call_goals: Any = None,
-        fresh_calls: bool = False,
-        greedy: bool = True,
-        greedy_selector: bool = True,
-    ) -> None:
-        self.selector = selector
-        self.skills = tuple(skills)
-        self.lengths = lengths
-        self.guide = guide
-        self.fresh_calls = fresh_calls
-        self._ask = ask
-        self._interruption = interruption
-        self._call_goals = call_goals
-        self._greedy = greedy
-        self._greedy_selector = greedy_selector
-        self._each = max(1, len(lengths))
+    selector: Policy | None
+    skills: tuple[CalledSkill, ...]
+    lengths: tuple[int, ...] = ()
+    guide: ActiveGuide | None = None
+    interruption: Interruption | None = None
+    fresh_calls: bool = False
+    greedy: bool = True
+    greedy_selector: bool = True
+    ask: Asks = field(default=asked, metadata={"written": False})
+
+    def __post_init__(self) -> None:
+        if any(a >= b for a, b in pairwise((0, *self.lengths))):
+            raise PolicyError(f"a hierarchy has the lengths {self.lengths[:5]}, which must rise")
+        self._each = max(1, len(self.lengths))
         self.choices = len(self.skills) * self._each
         """The number of choices: the first skill with each length, then the next skill."""
         self.restricts = any(s.initiation or s.policy.restricts for s in self.skills)
+        self.holds = any(skill.policy.holds for skill in self.skills)
         self._limits = np.array([NEVER if s.limit is None else s.limit for s in self.skills])
         self._asked = {
             i for i, s in enumerate(self.skills) if s.policy.watches or s.termination is not None
@@ -157,8 +227,9 @@ class Hierarchy(Policy):
         self._fresh = np.array(
             [s.goals is not None and s.policy.fresh_calls for s in self.skills], bool
         )
-        ready = {"selector": selector, "guide": None if guide is None else guide.selector}
-        self._ready = {name: who for name, who in ready.items() if isinstance(who, Ready)}
+        guide = None if self.guide is None else self.guide.selector
+        ready = {"selector": self.selector, "guide": guide}
+        self._ready = {name: who for name, who in ready.items() if isinstance(who, Selector)}
 
     def start(self, n: int) -> Memory:
         """Return the memory of n environments whose episodes start: no call has started."""
@@ -197,7 +268,7 @@ class Hierarchy(Policy):
             at, part = rows[ended], turn.some(ended)
             self.begin(memory, at, self._choice(memory, at, obs[ended], part))
         running, actions = memory["skill"][rows], None
-        own = Turn(turn.world, turn.mask, None, self._greedy)
+        own = Turn(turn.world, turn.mask, None, self.greedy)
         for i, mine in _by_skill(running):
             every = len(mine) == len(rows)
             part, at = own if every else own.some(mine), rows if every else rows[mine]
@@ -232,7 +303,7 @@ class Hierarchy(Policy):
             chances = self.guide.selector.chances(memory["guide"], rows, seen, may)
             memory["chances"][rows] = chances
             may = chances > 0.0 if self.guide.restricts else may
-        how = Turn(world, may, None, turn.greedy and self._greedy_selector)
+        how = Turn(world, may, None, turn.greedy and self.greedy_selector)
         before = take(memory["selector"], rows) if self.goals else {}
         choice = np.asarray(selector.act(memory["selector"], rows, seen, how))
         if choice.dtype.fields is None:
@@ -334,6 +405,32 @@ class Hierarchy(Policy):
         """Return the goals of skill ``i`` in ``rows`` (k,); None: it has none."""
         return memory["goal"][str(i)][rows] if i in self.goals else None
 
+    def beside_calls(self, obs: Array, running: Array, goals: Mapping[int, Array]) -> Array:
+        """Return observations with the goals of calls, as a critic of skills sees them.
+
+        Only the goal of the running skill counts; the others are as where an episode starts.
+
+        Args:
+            obs: (…, *obs_shape).
+            running: (…) int64, the running skills.
+            goals: by place, (…, *goal_shape) of the latest calls; one that is missing has no call.
+
+        Returns:
+            One array (…) of observations and goals by the names of skills.
+        """
+        lead = running.shape
+        blank = {self.skills[i].name: own.start(1)[0] for i, own in self.goals.items()}
+        kinds = [(name, one.dtype, one.shape) for name, one in blank.items()]
+        goal = np.dtype(kinds, align=True)
+        joint = np.zeros(lead, joint_dtype(obs.dtype, obs.shape[len(lead) :], goal, ()))
+        joint[OBSERVATION] = obs
+        for name, one in blank.items():
+            joint[GOAL][name] = one
+        for i, values in goals.items():
+            runs = running == i
+            joint[GOAL][self.skills[i].name][runs] = values[runs]
+        return joint
+
     # Where skills may start ---------------------------------------------------------------------
 
     def mask(self, obs: Array, age: Array | None = None) -> Array | None:
@@ -365,7 +462,7 @@ class Hierarchy(Policy):
         for i, skill in enumerate(self.skills):
             may[:, i] = skill.policy.startable(obs) if skill.policy.restricts else True
             if skill.initiation is not None:
-                may[:, i] &= self._ask(skill.initiation, obs, rows, skill.path, "initiation")
+                may[:, i] &= self.ask(skill.initiation, obs, rows, skill.path, "initiation")
         return may.repeat(self._each, axis=1)
 
     def startable(self, obs: Array) -> Array:
@@ -417,11 +514,11 @@ class Hierarchy(Policy):
         for i, mine in _by_skill(running):
             if i in self._asked:
                 self._observe_skill(memory, i, rows, mine, elapsed, own, end)
-        if self._interruption is not None:
-            self._interrupt(self._interruption, memory, rows, step, end)
+        if self.interruption is not None:
+            self._interrupt(self.interruption, memory, rows, step, end)
         end_with_episode(end, step.terminated | step.truncated)
         memory["end"][rows] = end
-        if self._ready:
+        if any(who.ends_matter for who in self._ready.values()):
             succeeded = self._succeeded(memory, rows, own, running, elapsed, end)
             for name, who in self._ready.items():
                 who.watch(memory[name], rows, step, LastCall(running, end, succeeded))
@@ -444,7 +541,7 @@ class Hierarchy(Policy):
             if skill.policy.restricts:
                 end[mine[skill.policy.stuck(memory[str(i)], at, part.next_obs)]] = LIMIT
         if skill.termination is not None:
-            end[mine[self._ask(skill.termination, part, at, skill.path, "termination")]] = OWN
+            end[mine[self.ask(skill.termination, part, at, skill.path, "termination")]] = OWN
 
     def _seen_by(
         self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step
@@ -467,9 +564,9 @@ class Hierarchy(Policy):
         running, seen = memory["skill"][rows], obs
         if self.fresh_calls:
             seen = joined(obs, step.goal[mine])
-        if self._call_goals is not None:
+        if self.goals:
             goals = {i: memory["goal"][str(i)][rows] for i in self.goals}
-            seen = self._call_goals.join(seen, running, goals)
+            seen = self.beside_calls(seen, running, goals)
         worth = how.worth(seen)
         # Where no skill could be called, a new decision is worth nothing.
         again = np.where(self.startable(obs), worth[:, n], -np.inf)
@@ -483,14 +580,42 @@ class Hierarchy(Policy):
         By the skill's ``success``; of a skill without one, if its own termination ended the call.
         """
         found: Array = np.array(end == OWN)
-        for i, skill in enumerate(self.skills):
-            if skill.success is None:
-                continue
-            over = np.flatnonzero((running == i) & (end != RUNNING))
-            if len(over):
+        ended = np.flatnonzero(end != RUNNING)
+        for i, mine in _by_skill(running[ended]):
+            skill, over = self.skills[i], ended[mine]
+            if skill.success is not None:
                 part = self._seen_by(memory, i, rows, over, elapsed, step)
-                found[over] = self._ask(skill.success, part, rows[over], skill.path, "success")
+                found[over] = self.ask(skill.success, part, rows[over], skill.path, "success")
         return found
+
+    def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
+        """Check that the selector, the guide, the critic and all skills fit."""
+        names = [skill.name for skill in self.skills]
+        if not names or len(set(names)) < len(names):
+            raise PolicyError(f"{where}.skills are {names}; they must have names of their own")
+        seen = sees if goal is None or not self.fresh_calls else with_goal(sees, goal)
+        first, last = np.asarray(0), np.asarray(self.choices - 1)
+        choice = plain = Space("Discrete", "int64", (), first, last)
+        spaces = {self.skills[i].name: own.space for i, own in self.goals.items()}
+        if spaces:
+            of = Space("Dict", parts=spaces)
+            choice = Space("Dict", parts={SKILL: plain, GOAL: of})
+        if self.selector is None:
+            raise PolicyError(f"{where} has no selector")
+        self.selector.check(seen, choice, None, f"{where}.selector")
+        if self.guide is not None:
+            if not isinstance(self.guide.selector, Selector):
+                kind = type(self.guide.selector).__name__
+                raise PolicyError(f"{where}.guide is a {kind}; it must be a ready selector")
+            self.guide.selector.check(seen, plain, None, f"{where}.guide")
+        if self.interruption is not None and isinstance(self.interruption.worth, Critic):
+            least, most = np.asarray(-np.inf), np.asarray(np.inf)
+            worth = Space("Box", "float32", (len(self.skills) + 1,), least, most)
+            seen = with_goal(seen, of) if spaces else seen
+            self.interruption.worth.policy.check(seen, worth, None, f"{where}.critic")
+        for i, skill in enumerate(self.skills):
+            own = None if skill.goals is None else skill.goals.space
+            skill.policy.check(sees, acts, own, f"{where}.skills[{i}].policy")
 
     def values(self) -> dict[str, Any]:
         """Return what numbers in its memory may be, by dotted name."""

@@ -1,27 +1,55 @@
-"""Policies that contain no other: ready selectors, and networks that learn."""
+"""Policies that contain no other: ready selectors, networks that learn, and those of exports."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from .core import Array, LastCall, Memory, Policy, Step, Turn
+from .core import Array, LastCall, Memory, Policy, Step, Turn, World
+from .errors import PolicyError
 from .functional import Returns
+from .mapped import NUMBERS, open_session
+from .spaces import Space, at
 
 
-class Ready(Returns):
-    """A selector that is not trained: it also watches how calls end.
+class Selector(Policy):
+    """A selector that is not trained: it also watches how calls end."""
 
-    Its policy has ``chances``, ``allowed``, ``watch``, ``ranges``, ``skills`` and ``lengths``, as
-    ``ReadySelector`` has them.
-    """
+    watches = True
+    ends_matter = True
+    """``watch`` has something to notice."""
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
         """Return how likely each of the choices that ``may`` be made is, (k, choices) float32.
 
         Where it chooses no lengths, all lengths of a skill are equally likely.
         """
+        raise NotImplementedError
+
+    def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
+        """Return which choices (k, choices) it leaves, as far as is known before it sees more."""
+        return may
+
+    def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
+        """Notice a step of environments ``rows`` (k,), and how the last calls ended."""
+
+    def redraws(self, greedy: bool) -> bool:
+        """Return False: what it chooses follows from what it sees."""
+        return False
+
+
+class Ready(Returns, Selector):
+    """A selector of the form of ``ReadySelector``.
+
+    Its policy has ``chances``, ``allowed``, ``watch``, ``ranges``, ``skills`` and ``lengths``, as
+    ``ReadySelector`` has them.
+    """
+
+    def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
+        """Return how likely its choices are, see ``Selector``."""
         own = len(self.policy.skills) * max(1, len(self.policy.lengths))
         lengths = may.shape[1] // own
         chances, after = self.policy.chances(self._of(memory, rows), obs, may[:, ::lengths])
@@ -30,7 +58,7 @@ class Ready(Returns):
         return found
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return which choices (k, choices) it leaves, as far as is known before it sees more."""
+        """Return which choices it leaves, see ``Selector``."""
         allowed = self.policy.allowed(self._of(memory, rows))
         if allowed is None:
             return may
@@ -40,10 +68,6 @@ class Ready(Returns):
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Show it a step, and how the last calls ended."""
         self._keep(memory, rows, self.policy.watch(self._of(memory, rows), step, last))
-
-    def redraws(self, greedy: bool) -> bool:
-        """Return False: what it chooses follows from what it sees."""
-        return False
 
     def values(self) -> dict[str, Any]:
         """Return the ranges of indices in its memory."""
@@ -90,3 +114,115 @@ class Learning(Policy):
     def redraws(self, greedy: bool) -> bool:
         """Return True: it explores, whatever the turn says."""
         return True
+
+
+def _words(given: tuple[Any, tuple[Any, ...]] | None) -> str:
+    return "nothing" if given is None else f"{given[0]} {given[1]}"
+
+
+Noise: TypeAlias = tuple[Literal["gumbel", "standard_normal", "random", "logistic"], int]
+"""A distribution by NumPy's name, and how many numbers of it."""
+
+
+@dataclass(eq=False)
+class Network(Policy):
+    """A network that Skillweave trained, as an ONNX file of one observation.
+
+    Its inputs are the leaves of the observation, ``obs`` or ``obs.camera``, and ``mask``,
+    ``memory``, ``noise.0``, …; its outputs the action, in the environment's units, and
+    ``memory.after``.
+    """
+
+    file: bytes
+    sees: Space
+    acts: Space
+    """Of its actions; where it has parts, the file gives them as rows, ``Space.flat``."""
+    choices: int = 0
+    """The width of its mask; 0: it takes none."""
+    memory: int = 0
+    """The width of its recurrent state; 0: it has none."""
+    noise: tuple[Noise, ...] = ()
+
+    @cached_property
+    def session(self) -> Any:
+        """The file, opened."""
+        return open_session(self.file, "a network")
+
+    @cached_property
+    def _inputs(self) -> dict[str, tuple[str, ...]]:
+        return {".".join(("obs", *path)): path for path in self.sees.leaves}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in vars(self).items() if k != "session"}
+
+    def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
+        """Check that its file takes what it sees, and gives actions."""
+        for mine, theirs, what in ((self.sees, sees, "sees"), (self.acts, acts, "acts")):
+            if not mine.is_like(theirs):
+                raise PolicyError(f"{where}.{what} is {mine}, but it is used for {theirs}")
+        # Of a choice with goals the mask is for the skills alone.
+        masked = (self.acts.parts or {}).get("skill", self.acts)
+        if self.choices not in (width := sum(self.acts.counts), sum(masked.counts)):
+            raise PolicyError(f"{where}.choices is {self.choices}; for {acts} it must be {width}")
+        single = np.dtype("float32")
+        leaves = zip(self._inputs, self.sees.leaves.values(), strict=True)
+        given = {name: (leaf.record, leaf.shape) for name, leaf in leaves}
+        given |= {"mask": (np.dtype(bool), (self.choices,))} if self.choices else {}
+        given |= {"memory": (single, (self.memory,))} if self.memory else {}
+        given |= {f"noise.{i}": (single, (n,)) for i, (_, n) in enumerate(self.noise)}
+        try:
+            taken = {
+                x.name: (np.dtype(NUMBERS.get(x.type, bool)), tuple(x.shape[1:]))
+                for x in self.session.get_inputs()
+            }
+            for name in given | taken:
+                if given.get(name) != taken.get(name):
+                    raise PolicyError(
+                        f"its file takes {_words(taken.get(name))} as {name!r}, but is given "
+                        f"{_words(given.get(name))}"
+                    )
+            rows, turn = np.zeros(1, np.int64), Turn(World(np.random.default_rng(0)))
+            action, size = self._run(self.start(1), rows, self.sees.start(1), turn), self._size
+            if action.shape != (1, *size):
+                raise PolicyError(f"its file gives shape {action.shape}, not {(1, *size)}")
+        except PolicyError as error:
+            raise PolicyError(f"{where}: {error}") from error
+
+    @property
+    def _size(self) -> tuple[int, ...]:
+        if self.acts.parts is None:
+            return self.acts.shape
+        return (sum(int(np.prod(leaf.shape)) for leaf in self.acts.leaves.values()),)
+
+    def start(self, n: int) -> Memory:
+        """Return zeros (n, M), where the network is recurrent."""
+        return {"rnn": np.zeros((n, self.memory), np.float32)} if self.memory else {}
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return actions (k, …), or choices with goals."""
+        action = self._run(memory, rows, obs, turn)
+        return action if self.acts.parts is None else self.acts.of_numbers(action)
+
+    def redraws(self, greedy: bool) -> bool:
+        """Return whether it samples."""
+        return bool(self.noise)
+
+    def _run(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        n = len(rows)
+        feeds = {name: at(obs, path) for name, path in self._inputs.items()}
+        if self.choices:
+            feeds["mask"] = np.ones((n, self.choices), bool) if turn.mask is None else turn.mask
+        if self.memory:
+            feeds["memory"] = memory["rnn"][rows]
+        rng = turn.world.rng or np.random.default_rng() if self.noise else None
+        for i, (kind, width) in enumerate(self.noise):
+            feeds[f"noise.{i}"] = getattr(rng, kind)(size=(n, width)).astype(np.float32)
+        each = [{k: np.ascontiguousarray(v[i : i + 1]) for k, v in feeds.items()} for i in range(n)]
+        try:
+            found = [self.session.run(None, one) for one in each]
+        except Exception as error:  # onnxruntime's own errors have no common class
+            raise PolicyError(f"a network fails: {str(error)[:200]}") from error
+        if self.memory:
+            memory["rnn"][rows] = np.concatenate([after for _, after, *_ in found])
+        action: Array = found[0][0] if n == 1 else np.concatenate([one[0] for one in found])
+        return action

@@ -28,8 +28,14 @@ LARGEST_JSON = 16 * 2**20
 """The most bytes of a JSON file."""
 
 
-def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> None:
+def write_bytes(
+    path: Path, data: bytes, *, make_directories: bool = True, durable: bool = True
+) -> None:
     """Replace ``path`` by ``data``, or leave it unchanged.
+
+    Args:
+        make_directories: make those above it, where they are missing.
+        durable: wait until it is on the disk.
 
     Raises:
         RunError: the disk is full or cannot be written; the old file is intact.
@@ -43,10 +49,12 @@ def write_bytes(path: Path, data: bytes, *, make_directories: bool = True) -> No
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
-        _sync(path.parent)
+        if durable:
+            _sync(path.parent)
     except BaseException as error:
         if temporary:
             with suppress(OSError):

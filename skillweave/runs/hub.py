@@ -27,7 +27,7 @@ MADE_BY_THE_HUB = ".gitattributes"
 LINES = ("run.json", "evaluation.json", "metrics.jsonl", "lineage.jsonl")
 WANTED = (*LINES, CALLS, "policies/*.safetensors")
 """The downloaded files, from which a run is read."""
-OF_A_POLICY = ("policy.json", "*.onnx")
+OF_A_POLICY = ("policy.json", "*.onnx", "arrays.npz")
 """The downloaded files, from which a policy is read."""
 FILMS = (".gif", ".mp4")
 FIGURES = "figures"

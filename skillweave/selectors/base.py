@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Dict
 
-from skillweave.errors import DeclarationError, SkillError, SkillweaveError
-from skillweave.messages import short, shortened
-from skillweave.policies.core import LastCall, observed
+from skillweave.errors import DeclarationError
+from skillweave.messages import shortened
+from skillweave.policies.core import LastCall, Turn, World, take
 from skillweave.policies.parts import GOAL
+from skillweave.policies.selectors import Rule
+from skillweave.policies.selectors import function_name as function_name
+from skillweave.policies.spaces import space_of
+from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goal_spaces import blank_choices, number_of, repeated
-from skillweave.skills.goals import as_goals
+from skillweave.skills.goal_spaces import repeated
 from skillweave.skills.outputs import called
 from skillweave.terminal import one_line
-from skillweave.types import Array, Memory, Step, read_only
+from skillweave.types import Array, Memory, Step
 
 
 class ReadySelector(Foreign):
@@ -31,30 +36,45 @@ class ReadySelector(Foreign):
 
     lengths: tuple[int, ...] = ()
     """The lengths of calls that it chooses with skills; empty: it chooses skills alone."""
+    in_place: Any
+    """The ``Rule`` that acts, whose functions are asked with this library's messages.
+
+    It is made when it is first needed, so that the skills and their goals are known; it raises a
+    SkillError where a fixed goal does not fit its skill."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.skills: tuple[str, ...] = ()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what copies have: each makes its own rule."""
+        return {name: value for name, value in vars(self).items() if name != "in_place"}
+
     @property
     def ranges(self) -> dict[str, range]:
         """Return the valid range of each index in its memory, by name."""
-        return {}
+        return dict(self.in_place.values())
+
+    def named(self) -> Iterable[tuple[str, str, Any]]:
+        """Return the skills that its declaration names: where, their names and goals or None."""
+        return ()
 
     def among(self, skills: tuple[str, ...]) -> Self:
-        """Return a copy that chooses among the skills of these names, in the hierarchy's order.
+        """Return a copy that chooses among the ``skills`` of these names, in the hierarchy's order.
 
         Raises:
             DeclarationError: it names another skill.
         """
-        selector = copy.copy(self)
+        selector, rule = copy.copy(self), Rule(self.kind, skills, {})
         selector.skills = skills
+        for where, name, _ in self.named():
+            rule.number(name, f": {where}", DeclarationError)
         return selector
 
     @property
     def gives_goals(self) -> bool:
         """Return whether it is declared with goals for skills."""
-        return False
+        return any(goal is not None for *_, goal in self.named())
 
     @property
     def goal_spaces(self) -> dict[str, Space[Any]]:
@@ -63,62 +83,49 @@ class ReadySelector(Foreign):
         goals = space[GOAL] if isinstance(space, Dict) else None
         return dict(goals.spaces) if isinstance(goals, Dict) else {}
 
-    def with_goals(self, skill: Array, goals: Mapping[str, tuple[Array, Any]], obs: Array) -> Array:
-        """Return choices of skills (n,) with their goals, as a ``Hierarchy`` takes them.
+    @property
+    def _rule_of(self) -> tuple[str, tuple[str, ...], dict[str, Any]]:
+        """Return what every ``Rule`` is made of: who, skills and goals."""
+        goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
+        return self._who, self.skills, goals
+
+    def start(self, n: int) -> Memory:
+        """Return the memory of ``n`` environments in which it has not chosen yet."""
+        memory: Memory = self.in_place.start(n)
+        return memory
+
+    def act(
+        self,
+        memory: Memory,
+        obs: Array,
+        mask: Array | None = None,
+        *,
+        deterministic: bool = True,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Array, Memory]:
+        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` allows, and the memory.
+
+        They are skills; where skills have goals, skills and goals. ``deterministic`` and ``rng``
+        are as of any policy.
+        """
+        rows, turn = np.arange(len(obs)), Turn(World(rng), mask, None, deterministic)
+        memory = take(memory, rows)
+        return self.in_place.act(memory, rows, obs, turn), memory
+
+    def chances(self, memory: Memory, obs: Array, mask: Array) -> tuple[Array, Memory]:
+        """Return the probability of each choice where a call is over, (n, choices) float32.
 
         Args:
-            skill: (n,) the chosen skills.
-            goals: by skill, rows (k,) and their goals (k, *goal_shape).
-            obs: (n, …), for messages.
-
-        Raises:
-            SkillError: a skill with goals was chosen without one, or one without goals with one.
-        """
-        spaces = self.goal_spaces
-        lacks = np.ones(len(skill), bool)
-        choices = blank_choices(self.action_space, skill) if spaces else skill
-        for name, (rows, values) in goals.items():
-            if name not in spaces:
-                number = self._number(name, self._who, SkillError)
-                raise SkillError(
-                    f"{self._who} gave a goal for skill {self.skills[number]!r}, which has no "
-                    "goals: set its goal_space, or leave out the goal"
-                )
-            whose = f"skill {name!r}"
-            choices[GOAL][name][rows] = as_goals(values, len(rows), spaces[name], self._who, whose)
-            lacks[rows] = False
-        for name in spaces:
-            wrong = np.flatnonzero(lacks & (skill == self.skills.index(name)))
-            if len(wrong):
-                raise SkillError(
-                    f"{self._who} chose skill {name!r} without a goal in observation "
-                    f"{observed(obs[wrong[0]])}, but it has goals of {short(spaces[name])}: "
-                    f"{self._goal_advice(name)}"
-                )
-        return choices
-
-    def _joined_goals(self, name: str, parts: Sequence[tuple[Array, Any]]) -> tuple[Array, Any]:
-        """Return the goals of several rows of skill ``name`` as one array with its rows."""
-        space = self.goal_spaces.get(name)
-        if space is None or len(parts) == 1:
-            return parts[0]
-        whose = f"skill {name!r}"
-        arrays = [as_goals(goals, len(rows), space, self._who, whose) for rows, goals in parts]
-        return np.concatenate([rows for rows, _ in parts]), np.concatenate(arrays)
-
-    def _goal_advice(self, name: str) -> str:
-        """Return how a goal is given to skill ``name``, for messages."""
-        return f"write ({name!r}, goal) in place of {name!r}"
-
-    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """Return the probability of each choice where a call is over, (n, choices) float32.
+            memory: of n environments.
+            obs: (n, …).
+            mask: (n, choices) bool, what may be chosen.
 
         Returns:
             The probabilities, and the memory after the choice.
         """
-        choice, after = self.act(memory, obs, mask)
-        choices = len(self.skills) * max(1, len(self.lengths))
-        return np.eye(choices, dtype=np.float32)[number_of(choice)], after
+        rows = np.arange(len(obs))
+        memory = take(memory, rows)
+        return self.in_place.chances(memory, rows, obs, mask), memory
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
@@ -128,45 +135,52 @@ class ReadySelector(Foreign):
         """Return the memory after a step of n environments; called after every step.
 
         Args:
+            memory: of these environments.
             step: the environments' transition; ``elapsed`` counts as for any policy.
             last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
         """
+        rows = np.arange(len(last.why))
+        memory = take(memory, rows)
+        self.in_place.watch(memory, rows, step, last)
         return memory
 
-    def _number(
-        self, skill: Any, where: str, kind: type[SkillweaveError] = DeclarationError
-    ) -> int:
-        """Return the place of a skill in the hierarchy's list.
-
-        Raises:
-            DeclarationError: no skill has this name; the message begins with ``where``. ``kind`` is
-                the type of the error.
-        """
-        if not isinstance(skill, str) or skill not in self.skills:
-            raise kind(
-                f"{where} names {short(skill)}, which is no skill of the hierarchy; its skills "
-                f"are: {listed(self.skills)}"
-            )
-        return self.skills.index(skill)
+    def _goal(self, name: str, goal: Any, where: str) -> Any:
+        """Return a goal of ``(name, goal)`` for a rule; ``where`` it is declared, for messages."""
+        if callable(goal):
+            return Wrapped(goal, partial(called, goal, who=f"{where}: the goal of {name!r}"))
+        if (space := self.goal_spaces.get(name)) is None:
+            return goal
+        data = space_of(space)
+        goals = data.goals(repeated(space, goal, 1), 1, self._who, f"skill {name!r}")
+        return goals.reshape(data.shape)
 
 
-def skill_and_goal(value: Any) -> tuple[Any, Any]:
-    """Return the name and the goal of ``(name, goal)``; of anything else itself, and None."""
-    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], str):
-        name, goal = value
-        if goal is not None and not isinstance(goal, str):
-            return name, goal
-    return value, None
+@dataclass(frozen=True)
+class Wrapped:
+    """A function of the user, ``bare``, that is asked with this library's messages.
 
-
-def goals_at(goal: Any, space: Space[Any] | None, obs: Array, who: str) -> Any:
-    """Return the goals of ``(name, goal)`` in observations (k, …): fixed, or by a function.
-
-    ``space`` is that of the skill's goals; None: it has none, which is said later.
+    Exports name it.
     """
-    if callable(goal):
-        return called(goal, read_only(obs), who)
-    return goal if space is None else repeated(space, goal, len(obs))
+
+    bare: Callable[..., Any]
+    ask: Callable[..., Any]
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the answer of the function."""
+        return self.ask(*arguments)
+
+
+def checked_function(
+    function: Callable[[Any], Any], who: str, name: str, dtype: type = bool
+) -> Wrapped:
+    """Return a function of observations or of steps to (n,), whose answers are checked."""
+    return Wrapped(function, partial(_checked, function, who, name, dtype))
+
+
+def _checked(function: Callable[[Any], Any], who: str, name: str, dtype: type, about: Any) -> Array:
+    step = isinstance(about, Step)
+    n, elapsed = (len(about.reward), about.elapsed) if step else (len(about), None)
+    return answer(function, about, n, dtype, who, name, elapsed)
 
 
 def goal_as_json(goal: Any) -> Any:
@@ -179,8 +193,3 @@ def goal_as_json(goal: Any) -> Any:
 def listed(names: tuple[str, ...]) -> str:
     """Join names to a part of a sentence."""
     return shortened(one_line(", ".join(names)), 300)
-
-
-def function_name(function: Any) -> str:
-    """Return a user function's name for messages and checksums."""
-    return str(getattr(function, "__name__", type(function).__name__))

@@ -29,22 +29,14 @@ root. Terms as in Colledanchise & Ögren 2018, "Behavior Trees in Robotics and A
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum
-from typing import Any, ClassVar
+from typing import Any
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.selectors.base import function_name, skill_and_goal
+from skillweave.policies.selectors import Status as Status
+from skillweave.policies.selectors import function_name, skill_and_goal
 from skillweave.types import Array
-
-
-class Status(IntEnum):
-    """The status of a node of a tree."""
-
-    RUNNING = 0
-    SUCCESS = 1
-    FAILURE = 2
 
 
 @checked_names
@@ -82,9 +74,6 @@ class Composite:
         DeclarationError: it has no children, or a child of a wrong type.
     """
 
-    goes_on_after: ClassVar[Status]
-    """The status of a child after which the next child is evaluated."""
-
     def __init__(
         self,
         *children: str | tuple[str, Any] | Callable[[Array], Any] | Condition | Composite,
@@ -110,8 +99,6 @@ class Sequence(Composite):
             or a fallback.
     """
 
-    goes_on_after = Status.SUCCESS
-
 
 class Fallback(Composite):
     """A node that runs its children one after another until one succeeds; also called a selector.
@@ -123,8 +110,6 @@ class Fallback(Composite):
         DeclarationError: it has no children, or a child that is not a name, a condition, a sequence
             or a fallback.
     """
-
-    goes_on_after = Status.FAILURE
 
 
 Node = str | tuple[str, Any] | Condition | Composite

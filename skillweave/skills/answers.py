@@ -9,7 +9,8 @@ import numpy as np
 
 from skillweave.errors import SkillError
 from skillweave.messages import short
-from skillweave.skills.info_words import NUMBERS, odd_key
+from skillweave.policies.infos import NUMBERS
+from skillweave.skills.info_words import odd_key
 from skillweave.skills.outputs import as_array, at_step, called
 from skillweave.skills.probing import probe
 from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward

@@ -18,11 +18,13 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
+from skillweave.policies.spaces import Space as Data
+from skillweave.policies.spaces import space_of
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.answers import answer
 from skillweave.skills.goal_spaces import draw_from, repeated
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.outputs import as_array, called, checked_actions
+from skillweave.skills.outputs import as_array, called
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
 from skillweave.skills.residual import Residual
@@ -234,12 +236,7 @@ class Skill:
             declared_sees(self.sees, where)
         if self.acts is not None:
             declared_acts(self.acts, where)
-        known = [
-            *Skill.__annotations__.keys() - {"methods", "of_goals", "_path"},
-            *self.methods,
-            *self.of_goals,
-        ]
-        for name, meant in misspelt(self, Skill, known):
+        for name, meant in misspelt(self, Skill, (*FIELDS, *self.methods, *self.of_goals)):
             code = getattr(getattr(self, name), "__code__", None)
             line = code and f" ({Path(code.co_filename).name}, line {code.co_firstlineno})"
             warnings.warn(
@@ -287,6 +284,10 @@ class Skill:
             )
 
 
+FIELDS = tuple(x for x in Skill.__annotations__ if x not in ("methods", "of_goals", "_path"))
+"""The names of a skill's settings."""
+
+
 def _is_color(value: object) -> bool:
     """Return whether a value is red, green and blue, each from 0 to 255."""
     if isinstance(value, np.ndarray):
@@ -309,11 +310,8 @@ def own_methods(skill: Skill) -> list[str]:
 
 def _own_fields(skill: Skill) -> Iterator[tuple[str, Any]]:
     """Yield the settings of a skill that differ from the defaults, except its name."""
-    for field in Skill.__annotations__:
-        value = getattr(skill, field)
-        if field not in ("name", "methods", "of_goals", "_path") and value is not getattr(
-            Skill, field
-        ):
+    for field in FIELDS:
+        if field != "name" and (value := getattr(skill, field)) is not getattr(Skill, field):
             yield field, value
 
 
@@ -356,6 +354,7 @@ class Reflex:
             raise DeclarationError(f"a Reflex's name is {short(name)}; it must be text")
         self.condition, self.action = condition, action
         self.name = name or getattr(condition, "__name__", "reflex")
+        self._known: tuple[Any, Any] = (None, None)
 
     def check(self, space: Space[Any]) -> None:
         """Raise a DeclarationError where a fixed action is not in ``space``."""
@@ -389,16 +388,23 @@ class Reflex:
         label, shape = f"{self._label}: action", space.shape or ()
         if isinstance(space, Dict | Tuple):
             batch = repeated(space, self.action, 1)
-            return cast(Array, checked_actions(batch, 1, space, label, DeclarationError)[0])
+            return cast(Array, self._data(space).actions(batch, 1, label, DeclarationError)[0])
         value = as_array(self.action, label, DeclarationError)
         # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
         row = np.full(shape, value) if value.shape == () else value
-        action: Array = checked_actions(row[None], 1, space, label, DeclarationError)[0]
+        action: Array = self._data(space).actions(row[None], 1, label, DeclarationError)[0]
         return action
 
     @property
     def _label(self) -> str:
         return f"reflex {self.name!r}"
+
+    def _data(self, space: Space[Any]) -> Data:
+        """Return a space as data, which is made once."""
+        if self._known[0] is not space:
+            self._known = space, space_of(space)
+        data: Data = self._known[1]
+        return data
 
     def _actions(self, obs: Array, space: Space[Any]) -> Array:
         """Return its actions for observations (n, ...)."""
@@ -406,7 +412,7 @@ class Reflex:
         if not callable(self.action):
             return np.repeat(self.fixed(space)[None], n, axis=0)
         result = called(self.action, obs, label)
-        actions = checked_actions(result, n, space, label, SkillError)
+        actions = self._data(space).actions(result, n, label, SkillError)
         probe(self.action, obs, n, label, space)
         return actions
 

@@ -10,12 +10,12 @@ from typing import Any, NotRequired, Self, TypedDict
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box, Dict, Tuple
-from gymnasium.vector.utils import batch_space
 
 from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
+from skillweave.policies.spaces import at, space_of
+from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import untouched, watch
 from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Memory, Memoryless, Policy
@@ -36,8 +36,6 @@ class Foreign(Memoryless):
     """The name of its kind in ``run.json``."""
     suffix: str = ""
     """The suffix of the file of its ``content``."""
-    maps = False
-    """Other observations and actions can be mapped, by ``sees`` and ``acts``."""
 
     def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
         self.name = self._who = name
@@ -69,11 +67,6 @@ class Foreign(Memoryless):
         """Return actions for a batch of observations."""
         raise NotImplementedError
 
-    def must_be_bound(self) -> None:
-        """Raise a PolicyError if it has no spaces yet."""
-        if self.action_space is None:
-            raise PolicyError(f"{self._who} has no spaces yet: bind() it to an environment's")
-
     def source(self) -> dict[str, Any]:
         """Return its source as JSON for ``run.json``: at least its kind."""
         content = self.content()
@@ -87,14 +80,6 @@ class Foreign(Memoryless):
     def restored(self, content: bytes) -> Self:
         """Return this policy with the ``content`` from a run."""
         raise NotImplementedError
-
-    def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
-        """Return this policy with the recorded mapping ``data``.
-
-        Raises:
-            RunError: it has none; the message begins with ``where``.
-        """
-        raise RunError(f"{where} had a policy with a mapping, but now it has none")
 
     def try_out(self) -> None:
         """Act once on two example observations, to find errors before training.
@@ -163,10 +148,9 @@ def check_spaces(
         ("action_space", policy.action_space, action_space, ACTS),
     ):
         if not same_space(mine, theirs):
-            maps = isinstance(policy, Foreign) and policy.maps
             raise PolicyError(
                 f"{whose} has {kind} {mine}, but the environment {env} has {theirs}"
-                + (f": {advice}" if maps else "")
+                + f": {advice}" * hasattr(policy, "mapping")
             )
     if other_bounds(policy.action_space, action_space):
         notice(
@@ -224,13 +208,12 @@ def as_recorded(
             f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
         )
     if recorded.get("mapping") != now.get("mapping"):
-        if not isinstance(policy, Foreign):
+        if not hasattr(policy, "remapped"):
             raise RunError(f"{where} had a policy with a mapping, but now it has none")
         policy = policy.remapped(recorded.get("mapping"), where)
     if recorded.get("sha256") in (None, now.get("sha256")):
         return policy
-    content = read() if isinstance(policy, Foreign) else None
-    if content is None or not isinstance(policy, Foreign):
+    if not isinstance(policy, Foreign) or (content := read()) is None:
         raise RunError(
             f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
             "another checksum. Restore the policy that it was trained with, or train again"
@@ -258,20 +241,10 @@ def _described(source: dict[str, Any]) -> str:
 
 
 def made_up(space: Space[Any], n: int) -> Array:
-    """Draw n elements of a space as one batch."""
-    from skillweave.spaces import pack
-
-    batch = batch_space(space, n)
-    batch.seed(0)
-    return pack(space, _tamed(batch, batch.sample()))
-
-
-def _tamed(space: Space[Any], sample: Any) -> Any:
-    """Clip huge numbers: a space's bounds may be the largest floats."""
-    if isinstance(space, Dict):
-        return {name: _tamed(part, sample[name]) for name, part in space.spaces.items()}
-    if isinstance(space, Tuple):
-        return tuple(_tamed(p, s) for p, s in zip(space.spaces, sample, strict=True))
-    if isinstance(space, Box) and np.issubdtype(space.dtype, np.floating):
-        return sample.clip(-10, 10).clip(space.low, space.high).astype(space.dtype)
-    return sample
+    """Draw n elements of a space as one batch; none are huge, as a space's bounds may be."""
+    drawn = draw_from(space, n, np.random.default_rng(0))
+    for path, leaf in space_of(space).leaves.items():
+        part = at(drawn, path)
+        if part.dtype.kind == "f":
+            part[...] = part.clip(-10, 10).clip(*leaf.bounds)
+    return drawn

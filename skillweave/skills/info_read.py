@@ -5,7 +5,7 @@ Stands alone because a skill is declared without it; only what records steps nee
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,38 +25,22 @@ class _Recording(dict[Any, Any]):
         self.whole = False
         """True if something went over all keys."""
 
-    def __getitem__(self, key: Any) -> Any:
-        self.read[key] = None
-        return super().__getitem__(key)
 
-    def __contains__(self, key: object) -> bool:
-        self.read[key] = None
-        return super().__contains__(key)
+def _noting(name: str, whole: bool) -> Callable[..., Any]:
+    method = getattr(dict, name)
 
-    def get(self, key: Any, default: Any = None) -> Any:
-        self.read[key] = None
-        return super().get(key, default)
+    def noting(self: _Recording, *arguments: Any) -> Any:
+        self.whole |= whole
+        self.read.update(dict.fromkeys(arguments[:1]))
+        return method(self, *arguments)
 
-    def __iter__(self) -> Iterator[Any]:
-        self.whole = True
-        return super().__iter__()
+    return noting
 
-    def keys(self) -> Any:
-        self.whole = True
-        return super().keys()
 
-    def values(self) -> Any:
-        self.whole = True
-        return super().values()
-
-    def items(self) -> Any:
-        self.whole = True
-        return super().items()
-
-    def copy(self) -> Any:
-        self.whole = True
-        return super().copy()
-
+for _name in ("__iter__", "keys", "values", "items", "copy"):
+    setattr(_Recording, _name, _noting(_name, True))
+for _name in ("__getitem__", "__contains__", "get"):
+    setattr(_Recording, _name, _noting(_name, False))
 
 JUDGING = ("reward", "termination", "success")
 """Methods that receive a step."""

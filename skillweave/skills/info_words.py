@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from skillweave.messages import short
+from skillweave.policies.infos import NUMBERS
 from skillweave.types import Array
-
-NUMBERS = bool | int | float | np.number | np.bool_
 
 
 def info_keys(info: Mapping[str, Any]) -> tuple[str, ...]:

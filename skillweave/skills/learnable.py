@@ -219,10 +219,9 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     flat = [m for module in modules for m in _unpacked(module)]
     names = [type(m).__name__ for m in flat]
     wrong = next((n for n in names if n != "Linear" and n not in ACTIVATIONS), None)
-    wrong = wrong or next((repr(m) for m in flat if not _is_plain(m)), None)
-    expected = ["Linear" if i % 2 == 0 else "" for i in range(len(names))]
-    alternates = [n if n == "Linear" else "" for n in names] == expected and len(names) % 2 == 1
-    kinds = sorted(set(names) - {"Linear"})
+    wrong = wrong or next((repr(m) for m in flat if _has_settings(m)), None)
+    kinds = set(names[1::2])
+    alternates = set(names[::2]) == {"Linear"} and "Linear" not in kinds and len(names) % 2 == 1
     if wrong or not alternates or len(kinds) > 1:
         found = f"it has a layer {wrong}" if wrong else f"its layers are {', '.join(names)}"
         raise PolicyError(
@@ -235,13 +234,12 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     biases = tuple(np.zeros(m.out_features) if m.bias is None else array_of(m.bias) for m in linear)
     if not all(np.isfinite(x).all() for x in (*weights, *biases)):
         raise PolicyError(f"{who} cannot learn on: its weights hold NaN or infinity")
-    return Layers(weights, biases, ACTIVATIONS[kinds[0]] if kinds else "tanh")
+    return Layers(weights, biases, ACTIVATIONS[kinds.pop()] if kinds else "tanh")
 
 
-def _is_plain(module: Any) -> bool:
-    """Return whether a nonlinearity has the settings that it has in networks here."""
-    alpha, approximate = getattr(module, "alpha", 1.0), getattr(module, "approximate", "none")
-    return bool(alpha == 1.0 and approximate == "none")
+def _has_settings(module: Any) -> bool:
+    """Return whether a nonlinearity has other settings than in networks here."""
+    return getattr(module, "alpha", 1.0) != 1.0 or getattr(module, "approximate", "none") != "none"
 
 
 def _unpacked(module: nn.Module) -> list[nn.Module]:

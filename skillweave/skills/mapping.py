@@ -7,15 +7,16 @@ applies it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names, meant
+from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
-from skillweave.messages import short, shortened
+from skillweave.messages import short
 from skillweave.named import named
+from skillweave.policies.mapped import LONGEST
 
 # Parts of an input
 
@@ -32,9 +33,8 @@ class Scaling:
     """The lowest and the highest number, after scaling."""
 
     def __post_init__(self) -> None:
-        _set(self, "scale", _numbers(self, "scale"))
-        _set(self, "offset", _numbers(self, "offset"))
-        _set(self, "clip", _range(self, "clip"))
+        _check(self, _numbers, "scale", "offset")
+        _check(self, _range, "clip")
 
 
 @checked_names
@@ -69,7 +69,7 @@ class Part(Scaling):
             raise DeclarationError(
                 f"Part.key is {short(self.key)}; it must be the name of a part of the observation"
             )
-        _set(self, "places", _places(self, "places"))
+        _check(self, _places, "places")
         if not isinstance(self.one_hot, bool):
             raise DeclarationError(
                 f"Part.one_hot is {short(self.one_hot)}; it must be True or False"
@@ -94,14 +94,8 @@ class Goal(Scaling):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("low", "high"):
-            if getattr(self, name) is not None:
-                _set(self, name, _numbers(self, name))
-        if (
-            self.low is not None
-            and self.high is not None
-            and np.any(np.array(self.low) > self.high)
-        ):
+        _check(self, _numbers, "low", "high")
+        if None not in (self.low, self.high) and np.any(np.array(self.low) > self.high):
             raise DeclarationError(f"Goal.low is {short(self.low)}, which is more than Goal.high")
 
 
@@ -169,12 +163,9 @@ class Acts:
     """The other numbers of the action, where ``to`` is a part of it: a number, or one for each."""
 
     def __post_init__(self) -> None:
-        _set(self, "to", _places(self, "to"))
-        _set(self, "scale", _numbers(self, "scale"))
-        _set(self, "offset", _numbers(self, "offset"))
-        _set(self, "clip", _range(self, "clip"))
-        if self.rest is not None:
-            _set(self, "rest", _numbers(self, "rest"))
+        _check(self, _places, "to")
+        _check(self, _numbers, "scale", "offset", "rest")
+        _check(self, _range, "clip")
         if isinstance(self.to, tuple) and len(set(self.to)) != len(self.to):
             raise DeclarationError(
                 f"Acts.to is {short(self.to)}; each place of an action can be written once"
@@ -191,7 +182,11 @@ class Acts:
 
 @dataclass(frozen=True)
 class PolicyMapping:
-    """The whole mapping of a policy."""
+    """The whole mapping of a policy.
+
+    Raises:
+        DeclarationError: the goal has no place or is out of its range, or a count is wrong.
+    """
 
     sees: dict[str, tuple[Source, ...]] | None = None
     """The parts of each input, by its name; "": the only one. None: the whole observation."""
@@ -211,39 +206,24 @@ class PolicyMapping:
     scaling: dict[str, Scaling] = field(default_factory=dict)
     """A last scaling of whole inputs: the statistics of ``VecNormalize``."""
 
-    @property
-    def is_identity(self) -> bool:
-        """Return whether nothing is mapped: observations go in, actions come out."""
-        return self == PolicyMapping()
-
-    @property
-    def period(self) -> int:
-        """Return the number of steps from one inference to the next."""
-        return self.every * (self.chunk or 1)
-
-    @property
-    def remembers_output(self) -> bool:
-        """Return whether the last output is an input."""
-        return any(isinstance(s, LastAction) for s in self.sources())
-
     def sources(self) -> list[Source]:
         """Return the parts of all inputs."""
         return [source for parts in (self.sees or {}).values() for source in parts]
 
     @property
-    def takes_goal(self) -> bool:
-        """Return whether the goal is among the inputs."""
-        return any(isinstance(source, Goal) for source in self.sources())
+    def goal_places(self) -> list[Goal]:
+        """Return the places of the goal among the inputs."""
+        return [source for source in self.sources() if isinstance(source, Goal)]
 
-    def check_goal(self) -> None:
-        """Raise a DeclarationError where the goal has no place, or is out of its range."""
-        places = [s for s in self.sources() if isinstance(s, Goal)]
-        if self.goal is not None and not places:
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "goal", checked_goal(self.goal))
+        _check(self, _count, "every", "chunk")
+        if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"
             )
         if isinstance(self.goal, tuple):
-            _check_in_range(self.goal, places)
+            check_in_range(self.goal, self.goal_places)
 
     def functions(self) -> dict[str, Callable[[Any], Any]]:
         """Return the user's functions in it, by the names under which ``to_json`` has them."""
@@ -263,25 +243,7 @@ class PolicyMapping:
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON; settings that have their defaults are left out."""
         names = {id(function): name for name, function in self.functions().items()}
-        content: dict[str, Any] = {}
-        if self.sees is not None:
-            content["sees"] = {
-                name: [source_to_json(part, names) for part in parts]
-                for name, parts in self.sees.items()
-            }
-        if callable(self.goal):
-            content["goal"] = {"function": names[id(self.goal)]}
-        elif self.goal is not None:
-            content["goal"] = list(self.goal)
-        if self.acts is not None:
-            content["acts"] = _to_json(self.acts)
-        content |= {"every": self.every} if self.every != 1 else {}
-        content |= {"chunk": self.chunk} if self.chunk is not None else {}
-        if self.state:
-            content["state"] = [list(entry) for entry in self.state]
-            content |= {"single_state": True} if self.single_state else {}
-        if self.scaling:
-            content["scaling"] = {k: _to_json(v) for k, v in self.scaling.items()}
+        content: dict[str, Any] = _to_json(self, names)
         return content
 
     @classmethod
@@ -291,47 +253,36 @@ class PolicyMapping:
         """Return the mapping that ``to_json`` wrote.
 
         Args:
-            data: its JSON; further fields are ignored, unless one is like a field's name.
+            data: its JSON; further fields are ignored.
             code: the user's functions, by name.
 
         Raises:
             DeclarationError: a field has a wrong value; the message names it.
         """
-        if not isinstance(data, Mapping):
-            raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
-        _check_names(cls, data, "")
-        code = code or {}
-        sees = data.get("sees")
-        goal = data.get("goal")
+        code, given = code or {}, _given(cls, data, "the mapping")
         for name in ("sees", "scaling"):
-            if not isinstance(value := data.get(name), Mapping | None):
+            if not isinstance(value := given.get(name, {}), Mapping):
                 raise DeclarationError(f"{name} is {short(value)}; it must be an object of inputs")
-        if isinstance(goal, Mapping):
-            goal = _function(goal.get("function"), code, "goal")
-        acts = data.get("acts")
-        scaling = data.get("scaling") or {}
-        mapping = cls(
-            sees=None
-            if sees is None
-            else {
+        if "sees" in given:
+            given["sees"] = {
                 name: tuple(
-                    _source_from_json(p, code, f"sees[{name!r}][{i}]")
-                    for i, p in enumerate(_list(parts, f"sees[{name!r}]"))
+                    _source_from_json(part, code, f"sees[{name!r}][{i}]")
+                    for i, part in enumerate(_list(parts, f"sees[{name!r}]"))
                 )
-                for name, parts in sees.items()
-            },
-            goal=checked_goal(goal),
-            acts=None if acts is None else _from_json(Acts, acts, "acts"),
-            every=checked_count(data.get("every", 1), "every"),
-            chunk=None if data.get("chunk") is None else checked_count(data["chunk"], "chunk"),
-            state=tuple(
-                tuple(_list(entry, "state")) for entry in _list(data.get("state", []), "state")
-            ),
-            single_state=data.get("single_state") is True,
-            scaling={k: _from_json(Scaling, v, f"scaling[{k!r}]") for k, v in scaling.items()},
-        )
-        mapping.check_goal()
-        return mapping
+                for name, parts in given["sees"].items()
+            }
+        goal = given.get("goal")
+        if isinstance(goal, Mapping):
+            given["goal"] = _function(goal.get("function"), code, "goal")
+        if "acts" in given:
+            given["acts"] = _from_json(Acts, given["acts"], "acts")
+        entries = _list(given.get("state", []), "state")
+        given["state"] = tuple(tuple(_list(entry, "state")) for entry in entries)
+        given["scaling"] = {
+            k: _from_json(Scaling, v, f"scaling[{k!r}]")
+            for k, v in given.get("scaling", {}).items()
+        }
+        return cls(**given)
 
 
 def mapping_of(
@@ -355,20 +306,11 @@ def mapping_of(
     """
     try:
         states, single = _checked_state(state)
-        mapping = PolicyMapping(
-            sees=None if sees is None else checked_sees(sees),
-            goal=checked_goal(goal),
-            acts=_checked_acts(acts),
-            every=checked_count(every, "every"),
-            chunk=None if chunk is None else checked_count(chunk, "chunk"),
-            state=states,
-            single_state=single,
-            scaling=dict(scaling or {}),
-        )
-        mapping.check_goal()
+        parts, meaning = None if sees is None else checked_sees(sees), _checked_acts(acts)
+        scalings = dict(scaling or {})
+        return PolicyMapping(parts, goal, meaning, every, chunk, states, single, scalings)
     except DeclarationError as error:
         raise DeclarationError(f"{who}: {error}") from None
-    return mapping
 
 
 def function_name(function: Any) -> str:
@@ -393,7 +335,7 @@ def as_source(value: Any, where: str, of_skill: bool = False) -> Source:
     kind = value if isinstance(value, type) else type(value)
     if of_skill and (why := _NOT_OF_SKILLS.get(kind)):
         raise DeclarationError(f"{where} has {kind.__name__}(), {why}: leave it out")
-    if isinstance(value, Part | Goal | LastAction | Computed):
+    if isinstance(value, Source):
         return value
     if isinstance(value, type) and value in (Goal, LastAction, Part):
         raise DeclarationError(f"{where} is the class {value.__name__}; write {value.__name__}()")
@@ -426,16 +368,6 @@ def is_places(value: Any) -> bool:
     )
 
 
-def checked_count(value: Any, name: str) -> int:
-    """Return a whole number of at least 1; a DeclarationError names it where it is none."""
-    whole = isinstance(value, int | np.integer) and value is not True
-    if not whole or not 1 <= value <= 10**5:  # all actions of a chunk are stored
-        raise DeclarationError(
-            f"{name} is {short(value)}; it must be a whole number, at least 1 and at most 100,000"
-        )
-    return int(value)
-
-
 def checked_goal(goal: Any) -> Any:
     """Return a goal as a function or a tuple of numbers; None: there is none.
 
@@ -444,7 +376,7 @@ def checked_goal(goal: Any) -> Any:
     """
     if goal is None or callable(goal):
         return goal
-    values = _floats(goal)
+    values = floats(goal)
     if values is None:
         raise DeclarationError(
             f"goal is {short(goal)}; it must be finite numbers, or a function of observations that "
@@ -453,7 +385,8 @@ def checked_goal(goal: Any) -> Any:
     return values if isinstance(values, tuple) else (values,)
 
 
-def _check_in_range(goal: tuple[float, ...], places: Sequence[Goal]) -> None:
+def check_in_range(goal: tuple[float, ...], places: Sequence[Any]) -> None:
+    """Raise a DeclarationError where a goal is out of the range of its places, ``Goal``."""
     for place in places:
         for name, wrong in (("low", np.less), ("high", np.greater)):
             bound = getattr(place, name)
@@ -531,11 +464,18 @@ def _is_shape(shape: tuple[Any, ...]) -> bool:
 # Values of fields
 
 
-def _set(settings: Any, name: str, value: Any) -> None:
-    object.__setattr__(settings, name, value)
+def _check(settings: Any, convert: Callable[[Any, str], Any], *names: str) -> None:
+    """Convert fields; one that is None by default may be None."""
+    kind = type(settings)
+    for name in names:
+        value = getattr(settings, name)
+        if value is not None or getattr(kind, name) is not None:
+            prefix = "" if kind is PolicyMapping else f"{kind.__name__}."
+            where = f"{prefix}{name} is {short(value)}; it must be"
+            object.__setattr__(settings, name, convert(value, where))
 
 
-def _floats(value: Any) -> float | tuple[float, ...] | None:
+def floats(value: Any) -> float | tuple[float, ...] | None:
     """Return finite numbers as a float, or a tuple of such; None: they are none."""
     try:
         array = np.asarray(value, np.float64)
@@ -548,55 +488,43 @@ def _floats(value: Any) -> float | tuple[float, ...] | None:
     return tuple(array.tolist()) if array.ndim else float(array)
 
 
-def _numbers(settings: Any, name: str) -> float | tuple[float, ...]:
-    value = _floats(getattr(settings, name))
-    if value is None:
-        raise DeclarationError(
-            f"{type(settings).__name__}.{name} is {short(getattr(settings, name))}; it must be a "
-            "finite number, or a list of such"
-        )
-    return value
+def _numbers(value: Any, where: str) -> float | tuple[float, ...]:
+    numbers = floats(value)
+    if numbers is None:
+        raise DeclarationError(f"{where} a finite number, or a list of such")
+    return numbers
 
 
-def _range(settings: Any, name: str) -> tuple[float, float] | None:
-    value = getattr(settings, name)
-    if value is None:
-        return None
-    found = _floats(value)
-    if not isinstance(found, tuple) or len(found) != 2 or found[0] > found[1]:
-        raise DeclarationError(
-            f"{type(settings).__name__}.{name} is {short(value)}; it must be the lowest and the "
-            "highest number: (-1.0, 1.0)"
-        )
-    return found[0], found[1]
+def _range(value: Any, where: str) -> tuple[float, ...]:
+    ends = floats(value)
+    if not isinstance(ends, tuple) or len(ends) != 2 or ends[0] > ends[1]:
+        raise DeclarationError(f"{where} the lowest and the highest number: (-1.0, 1.0)")
+    return ends
 
 
-def _places(settings: Any, name: str) -> slice | tuple[int, ...] | None:
-    value = getattr(settings, name)
-    if value is None:
-        return None
-    where = f"{type(settings).__name__}.{name} is {short(value)}"
+def _count(value: Any, where: str) -> int:
+    if not _is_whole(value) or not 1 <= value <= LONGEST:
+        raise DeclarationError(f"{where} a whole number, at least 1 and at most {LONGEST:,}")
+    return int(value)
+
+
+def _places(value: Any, where: str) -> slice | tuple[int, ...]:
     if isinstance(value, str):  # as files have slices
         value = _slice_of(value)
     if isinstance(value, slice):
         bounds = (value.start, value.stop, value.step)
         if all(x is None or isinstance(x, int | np.integer) for x in bounds) and value.step != 0:
             return value
-    elif _is_place(value):
-        return (int(value),)
-    elif isinstance(value, range | list | tuple | np.ndarray):
-        places = list(np.atleast_1d(value)) if isinstance(value, np.ndarray) else list(value)
-        if places and all(_is_place(x) for x in places):
+    elif _is_whole(value) or isinstance(value, range | list | tuple | np.ndarray):
+        places = np.atleast_1d(value) if isinstance(value, np.ndarray) else value
+        places = [places] if _is_whole(places) else list(places)
+        if places and all(_is_whole(x) and x >= 0 for x in places):
             return tuple(int(x) for x in places)
-    raise DeclarationError(f"{where}; it must be a slice, or a list of places, counted from 0")
+    raise DeclarationError(f"{where} a slice, or a list of places, counted from 0")
 
 
 def _is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def _is_place(value: Any) -> bool:
-    return _is_whole(value) and int(value) >= 0
 
 
 # Files
@@ -620,31 +548,31 @@ def _slice_of(text: str) -> slice | None:
     return slice(*values) if len(bounds) in (2, 3) else None
 
 
-def source_to_json(source: Source, names: Mapping[int, str]) -> dict[str, Any]:
-    """Return a source as JSON; settings that have their defaults are left out.
+def _to_json(value: Any, names: Mapping[int, str]) -> Any:
+    """Return settings as JSON; those that have their defaults are left out.
 
     Args:
-        source: the source.
         names: of the user's functions, by ``id``.
     """
-    kind = next(name for name, kind in KINDS.items() if isinstance(source, kind))
-    content = {"source": kind, **_to_json(source)}
-    if isinstance(source, Computed):
-        content["function"] = names[id(source.function)]
-    return content
-
-
-def _to_json(settings: Any) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for entry in fields(settings):
-        value = getattr(settings, entry.name)
-        if entry.default is not MISSING and value == entry.default:
+    if isinstance(value, slice):
+        return places_to_json(value)
+    if isinstance(value, tuple):
+        return [_to_json(x, names) for x in value]
+    if isinstance(value, dict):
+        return {k: _to_json(x, names) for k, x in value.items()}
+    if not is_dataclass(value):
+        return value
+    kinds = [("source", name) for name, kind in KINDS.items() if isinstance(value, kind)]
+    content: dict[str, Any] = dict(kinds)
+    for entry in fields(value):
+        setting = getattr(value, entry.name)
+        if setting in (entry.default, {}):
             continue
-        if callable(value):
-            continue
-        if entry.name in ("places", "to"):
-            value = places_to_json(value)
-        content[entry.name] = list(value) if isinstance(value, tuple) else value
+        if callable(setting):
+            name = names[id(setting)]
+            content[entry.name] = {"function": name} if entry.name == "goal" else name
+        else:
+            content[entry.name] = _to_json(setting, names)
     return content
 
 
@@ -661,30 +589,18 @@ def _source_from_json(data: Any, code: Mapping[str, Any], where: str) -> Source:
 
 
 def _from_json(kind: type[Any], data: Any, where: str) -> Any:
-    """Return settings of a kind; see ``_check_names`` for further fields."""
-    if not isinstance(data, Mapping):
-        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
-    _check_names(kind, data, where)
+    given = _given(kind, data, where)
     try:
-        return kind(**{f.name: data[f.name] for f in fields(kind) if f.name in data})
+        return kind(**given)
     except DeclarationError as error:
         raise DeclarationError(f"{where}: {error}") from None
 
 
-OTHER_FIELDS = (
-    *("source", "function", "fields", "choices", "whole"),
-    *("kind", "file", "code", "output", "outputs", "shapes", "logits", "sampled", "with_goal"),
-)
-"""Fields that a file has beside those of a mapping and its parts."""
-
-
-def _check_names(kind: type[Any], data: Mapping[str, Any], where: str) -> None:
-    """Raise a DeclarationError where an unknown field looks like a misspelt one."""
-    known = [f.name for f in fields(kind)]
-    for name in data:
-        if name not in (*known, *OTHER_FIELDS) and (hint := meant(str(name), known, "")):
-            place = f"{where}." if where else ""
-            raise DeclarationError(f"{place}{shortened(str(name), 80)} is unknown{hint}")
+def _given(kind: type[Any], data: Any, where: str) -> dict[str, Any]:
+    """Return the fields of a kind that an object has; further ones are ignored."""
+    if not isinstance(data, Mapping):
+        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
+    return {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
 
 
 def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any], Any]:
@@ -698,15 +614,3 @@ def _list(value: Any, where: str) -> Sequence[Any]:
     if not isinstance(value, list | tuple):
         raise DeclarationError(f"{where} is {short(value)}; it must be a list")
     return value
-
-
-__all__ = [
-    "Acts",
-    "Computed",
-    "Goal",
-    "LastAction",
-    "Part",
-    "PolicyMapping",
-    "Source",
-    "mapping_of",
-]

@@ -7,13 +7,10 @@ from dataclasses import fields
 from typing import Any, NoReturn
 
 import numpy as np
-from gymnasium import Space
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import error_text, short
-from skillweave.skills.goal_spaces import given_parts, in_words, parts_of
 from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.skills.probing import watch
 from skillweave.tracebacks import is_users
@@ -58,6 +55,22 @@ def called(
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
         raise kind(f"{who} raised {error_text(error)}{at_step(elapsed)}{given}{advice}") from error
+
+
+class Asked:
+    """A function of the user that makes numbers, asked by ``called``.
+
+    Args:
+        bare: the function.
+        who: its name in messages.
+    """
+
+    def __init__(self, bare: Any, who: str) -> None:
+        self.bare, self.who = bare, who
+
+    def __call__(self, obs: Array) -> Array:
+        """Return an array that it makes of observations."""
+        return as_array(called(self.bare, obs, self.who, kind=PolicyError), self.who, PolicyError)
 
 
 def required_arguments(function: Any) -> int:
@@ -153,134 +166,3 @@ def as_array(value: Any, who: str, kind: type[SkillweaveError] = SkillError) -> 
         raise kind(
             f"{who} returned {short(value)}, which is no array: {error_text(error)}"
         ) from error
-
-
-def checked_actions(
-    value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError] = PolicyError
-) -> Array:
-    """Convert ``value`` to actions (n, *shape) of ``space``, clipped to the bounds of a Box.
-
-    Actions of a Dict or Tuple are a dict or tuple of arrays, or one array of ``pack``; they become
-    one array (n,).
-
-    Raises:
-        PolicyError: the shape or the type of number is wrong, or an action does not exist; the
-            message names ``who`` and the space. ``kind`` is the type of the error.
-    """
-    if isinstance(space, Dict | Tuple):
-        return _checked_parts(value, n, space, who, kind)
-    action, shape = as_array(value, who, kind), (n, *(space.shape or ()))
-    if action.shape != shape:
-        raise kind(
-            f"{who} returned shape {action.shape}, but {shape} was expected: one action of {space} "
-            f"for each of the {n} environments"
-        )
-    real = space.dtype is not None and space.dtype.kind == "f"
-    if action.dtype.kind not in ("iubf" if real else "iub"):
-        wanted = "numbers" if real else "whole numbers"
-        advice = ""
-        if isinstance(space, Box) and action.dtype.kind == "f":
-            advice = ": round them in a function, numpy.rint(actions).astype(int)"
-        raise kind(f"{who} returned {action.dtype}, but actions of {space} are {wanted}{advice}")
-    if isinstance(space, Box):
-        if not np.isfinite(action).all():
-            raise kind(f"{who} returned a NaN or an infinity as an action of {space}")
-        return action.clip(space.low, space.high).astype(space.dtype, copy=False)
-    bounds = _bounds(space)
-    if bounds is not None and ((action < bounds[0]) | (action >= bounds[1])).any():
-        wrong = action[(action < bounds[0]) | (action >= bounds[1])][0]
-        raise kind(f"{who} returned {wrong}, which is no action of {space}")
-    return action.astype(space.dtype, copy=False)
-
-
-def _checked_parts(
-    value: Any, n: int, space: Space[Any], who: str, kind: type[SkillweaveError]
-) -> Array:
-    """Convert the parts of actions to one array (n,); see ``checked_actions``."""
-    from skillweave.spaces.packing import obs_dtype  # needs torch
-
-    given = given_parts(space, value)
-    if given is None:
-        has, expected = in_words(space, value, "array")
-        raise kind(
-            f"{who} returned {has}, but {expected} was expected, each with a row for each of the "
-            f"{n} environments: actions are of {short(space)}"
-        )
-    action = np.zeros(n, obs_dtype(space))
-    for name, part in (parts_of(space) or {}).items():
-        action[name] = checked_actions(given[name], n, part, f"{who}: part {name!r}", kind)
-    return action
-
-
-def decoded(
-    output: Array,
-    n: int,
-    space: Space[Any],
-    who: str,
-    *,
-    mask: Array | None = None,
-    deterministic: bool = True,
-    rng: np.random.Generator | None = None,
-) -> Array:
-    """Convert a network's output to actions.
-
-    Integers are actions, and for a Box all numbers are. Other numbers are logits: (n, A) for
-    Discrete(A), concatenated (n, ΣA) for MultiDiscrete, one per bit for MultiBinary. If
-    ``deterministic``, the largest logit wins; else actions are sampled with ``rng``.
-    """
-    shape = space.shape or ()
-    if output.dtype.kind in "iub" or isinstance(space, Box):
-        flat = output.shape == (n, int(np.prod(shape)))  # the last layer of a network is flat
-        return checked_actions(output.reshape(n, *shape) if flat else output, n, space, who)
-    if isinstance(space, Dict | Tuple):
-        raise PolicyError(
-            f"{who} is a network, whose one output cannot be read as actions of {short(space)}: "
-            "call it in a function that returns a dict or tuple of arrays, or let its skill write "
-            "one part alone (acts)"
-        )
-    width = _width(space)
-    if output.shape != (n, width):
-        raise PolicyError(
-            f"{who} returned shape {output.shape}, but {(n, width)} was expected: logits for the "
-            f"actions of {space}"
-        )
-    if np.isnan(output).any():
-        raise PolicyError(f"{who} returned NaN as a logit")
-    rng = rng or np.random.default_rng()
-    if isinstance(space, MultiBinary):
-        noise = 0.0 if deterministic else rng.logistic(size=output.shape)
-        bits: Array = (output + noise > 0).reshape(n, *shape).astype(space.dtype)
-        return bits
-    if mask is not None and mask.shape == output.shape:
-        output = np.where(mask, output, -np.inf)
-    if not deterministic:
-        output = output + rng.gumbel(size=output.shape)  # argmax of it is a softmax sample
-    ends = np.cumsum(_choices(space))[:-1]
-    action = np.stack([part.argmax(-1) for part in np.split(output, ends, axis=1)], axis=1)
-    start = np.asarray(space.start)  # type: ignore[attr-defined]
-    choices: Array = (action.reshape(n, *shape) + start).astype(space.dtype)
-    return choices
-
-
-def _choices(space: Space[Any]) -> list[int]:
-    if isinstance(space, Discrete):
-        return [int(space.n)]
-    assert isinstance(space, MultiDiscrete)
-    return [int(k) for k in space.nvec.reshape(-1)]
-
-
-def _width(space: Space[Any]) -> int:
-    if isinstance(space, MultiBinary):
-        return int(np.prod(space.shape))
-    if isinstance(space, Discrete | MultiDiscrete):
-        return sum(_choices(space))
-    raise PolicyError(f"a network's output cannot be read as actions of {space}")
-
-
-def _bounds(space: Space[Any]) -> tuple[Any, Any] | None:
-    """Return the first action and the one after the last; None for a Box."""
-    if isinstance(space, Discrete):
-        return space.start, space.start + space.n
-    if isinstance(space, MultiDiscrete):
-        return space.start, space.start + space.nvec
-    return (0, 2) if isinstance(space, MultiBinary) else None

@@ -27,11 +27,12 @@ from typing import Any
 
 import numpy as np
 from gymnasium import Space
+from gymnasium.spaces import Discrete
 
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import error_text
 from skillweave.notices import notice
-from skillweave.skills.goal_spaces import parts_of
+from skillweave.policies.spaces import space_of
 from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Step, read_only
 
@@ -214,9 +215,10 @@ def probe(
     if not n or not _seen.first_time(owner, name):
         return
     arguments = given if isinstance(given, tuple) else (given,)
-    sizes = _other_sizes(n, set(itertools.chain.from_iterable(_sizes(a, n) for a in arguments)))
+    sizes = _other_sizes(arguments, n)
     certain = all(_has_rows(a, n) for a in arguments)
     fault = (_faults.notes(owner) or {}).get(name)
+    leaves = space_of(space or Discrete(2)).leaves
     with untouched(function):
         for m in sizes:
             rows = np.arange(m) % n
@@ -229,8 +231,11 @@ def probe(
                     f"{who} answers for {n} environments, but for {m} it raised "
                     f"{error_text(error)}: {f'it {fault}' if fault else AXIS}"
                 ) from error
-            for part, shape in _leaves(answer, space):
-                actual, wanted = np.shape(part), (m, *shape)
+            for path, leaf in leaves.items():
+                part = answer
+                for key in path:
+                    part = part[int(key) if isinstance(part, tuple | list) else key]
+                actual, wanted = np.shape(part), (m, *leaf.shape)
                 if actual != wanted and certain:
                     raise kind(
                         f"{who} returned shape {actual} for {m} environments, but {wanted} was "
@@ -238,23 +243,18 @@ def probe(
                     )
 
 
-def _leaves(answer: Any, space: Space[Any] | None) -> Iterator[tuple[Any, tuple[int, ...]]]:
-    """Yield the parts of a result of ``space``, and the shape of each for one environment."""
-    inner = None if space is None else parts_of(space)
-    if inner is None:
-        yield answer, () if space is None else space.shape or ()
-        return
-    for i, (name, part) in enumerate(inner.items()):
-        yield from _leaves(answer[i if isinstance(answer, tuple | list) else name], part)
-
-
-def _other_sizes(n: int, taken: set[int]) -> tuple[int, ...]:
+def _other_sizes(arguments: tuple[Any, ...], n: int) -> tuple[int, ...]:
     """Return numbers of environments that differ from n and from the sizes of all other axes."""
-    free = (m for m in itertools.count(3) if m != n and m not in taken)
+    arrays = [x for a in arguments for x in _values(a) if isinstance(x, np.ndarray)]
+    taken = {n, *(size for x in arrays for size in (*x.shape[1:], *_sizes_in(x.dtype)))}
+    free = (m for m in itertools.count(3) if m not in taken)
     first = next(free)
-    if n > MOST:
-        return (first,)
-    return first, next(m for m in free if m > n)
+    return (first,) if n > MOST else (first, next(m for m in free if m > n))
+
+
+def _sizes_in(dtype: np.dtype[Any]) -> Iterator[int]:
+    for part, *_ in (dtype.fields or {}).values():
+        yield from (*part.shape, *_sizes_in(part.base))
 
 
 def _values(given: Any) -> Iterator[Any]:
@@ -267,20 +267,6 @@ def _values(given: Any) -> Iterator[Any]:
             yield from _values(value)
     else:
         yield given
-
-
-def _sizes(given: Any, n: int) -> Iterator[int]:
-    """Yield the sizes of all axes of an argument but the first."""
-    for array in _values(given):
-        if isinstance(array, np.ndarray):
-            yield from array.shape[1:]
-            yield from _sizes_of_fields(array.dtype)
-
-
-def _sizes_of_fields(dtype: np.dtype[Any]) -> Iterator[int]:
-    for part, *_ in (dtype.fields or {}).values():
-        yield from part.shape
-        yield from _sizes_of_fields(part.base)
 
 
 def _has_rows(given: Any, n: int) -> bool:

@@ -13,10 +13,9 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
-from skillweave.skills.foreign_policy import Foreign, checked_fit, fitted
+from skillweave.skills.foreign_policy import checked_fit, fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.residual import Correction, Residual, check_corrected, refuse_skill
@@ -32,16 +31,6 @@ def ready_policy(skill: Skill) -> Policy | None:
         DeclarationError: the attribute ``policy`` cannot act.
     """
     return None if is_trained(skill) else _as_policy(skill.policy, skill)
-
-
-def base_policy(skill: Skill) -> Policy | None:
-    """Return the ready policy that a skill learns to correct (``Residual``); None: it has none.
-
-    Raises:
-        DeclarationError: it cannot act.
-    """
-    residual = skill.policy
-    return _as_policy(residual.policy, skill) if isinstance(residual, Residual) else None
 
 
 def _as_policy(value: Any, skill: Skill) -> Policy:
@@ -101,22 +90,17 @@ def fitted_to_skill(
 
     spaces = observation_space, action_space
     goals, seen = goals_of(skill), policy.observation_space
-    sees_goal = seen is not None and same_space(seen, spaces[0])  # as saved here, for example
     if goals is None:
         return fitted(policy, *spaces, who, env)
-    if seen is not None and sees_goal:
+    if seen is not None and same_space(seen, spaces[0]):  # as saved here, for example
         if says := other_goals(goal_part(seen), goals.space):
             raise PolicyError(f"{who}: its policy {says}")
         return fitted(policy, *spaces, who, env)
-    if not isinstance(policy, Foreign):
+    if not hasattr(policy, "bind_with_goals"):
         raise PolicyError(
             f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
-            f"as {spaces[0]}"
-        )
-    if not isinstance(policy, MappedPolicy):
-        raise PolicyError(
-            f"{who} has goals, but its policy takes none: give a function, policy(self, obs, "
-            "goal), or a policy from elsewhere with Goal() at its place in sees"
+            f"as {spaces[0]}; or give a function, policy(self, obs, goal), or a policy from "
+            "elsewhere with Goal() at its place in sees"
         )
     bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
     return checked_fit(bound, *spaces, who, env)
@@ -143,13 +127,12 @@ def own_part(
         DeclarationError: the part does not fit the environment's spaces.
         PolicyError: the ready policy that it corrects does not.
     """
-    residual = skill.policy if isinstance(skill.policy, Residual) else None
     part = OwnPart(skill.sees, skill.acts, rest, *spaces, who)
-    if residual is None:
+    residual, seen = skill.policy, part.observation_space
+    if not isinstance(residual, Residual):
         return part
     check_corrected(part.action_space, who)
-    seen, base = part.observation_space, base_policy(skill)
-    assert base is not None
+    base = _as_policy(residual.policy, skill)
     if skill.goal_space is not None:
         seen = with_goal(seen, skill.goal_space)
     env += "" if skill.sees is None and skill.acts is None else PART

@@ -16,8 +16,11 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
+from skillweave.policies import parts
+from skillweave.policies.spaces import space_of
 from skillweave.skills.learnable import Learnable
-from skillweave.types import Array, Policy
+from skillweave.skills.mapping import floats
+from skillweave.types import Policy
 
 TAKES = "a function of observations, from_sb3(...), from_onnx(...), or another ready policy"
 
@@ -71,18 +74,13 @@ class Residual:
                 "the policy as it is: leave out learn, or let the skill learn on with the policy "
                 "itself, without Residual"
             )
-        scale = self.scale
-        try:
-            array = np.asarray(scale, np.float64)
-        except (TypeError, ValueError):
-            array = np.zeros(0)
-        right = array.ndim <= 1 and array.size and np.isfinite(array).all() and (array > 0).all()
-        if isinstance(scale, str | bool) or not right:
+        scale = floats(self.scale)
+        if scale is None or np.min(scale) <= 0:
             raise DeclarationError(
-                f"Residual.scale is {short(scale)}; it must be a number over 0, or one for each "
-                "number of the action"
+                f"Residual.scale is {short(self.scale)}; it must be a number over 0, or one for "
+                "each number of the action"
             )
-        object.__setattr__(self, "scale", array.tolist())
+        object.__setattr__(self, "scale", np.array(scale).tolist())
 
     def __repr__(self) -> str:
         return f"Residual({short(self.policy, 60)}, scale={self.scale})"
@@ -115,17 +113,16 @@ class Correction:
     Args:
         residual: as declared.
         base: its policy, fitted to the skill's spaces.
-        space: of the skill's actions.
+        space: of the skill's actions, real numbers: see ``check_corrected``.
         who: begins messages.
 
     Raises:
-        DeclarationError: actions are no real numbers, or ``scale`` does not fit them.
+        DeclarationError: ``scale`` does not fit the actions.
     """
 
     def __init__(self, residual: Residual, base: Policy, space: Space[Any], who: str) -> None:
-        check_corrected(space, who)
         assert isinstance(space, Box)
-        self.base, self.scale, self._box = base, residual.scale, space
+        self.base, self.scale = base, residual.scale
         size = int(np.prod(space.shape))
         if isinstance(self.scale, list) and len(self.scale) != size:
             raise DeclarationError(
@@ -134,15 +131,10 @@ class Correction:
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
         low, high = (np.where(bounded, x, 0.0).astype(np.float64) for x in (space.low, space.high))
         half = np.where(bounded, 0.5 * (high - low), 1.0)
-        self.step: Array = half * np.broadcast_to(self.scale, size).reshape(space.shape)
-        """The largest correction of each number."""
+        step = half * np.broadcast_to(self.scale, size).reshape(space.shape)
+        self.added = parts.Correction(step, space_of(space))
         self.space = Box(-1.0, 1.0, space.shape, np.float32)
         """Of what is learnt."""
-
-    def apply(self, base: Array, learnt: Array) -> Array:
-        """Return the skill's actions (n, …) of the base policy's and what was learnt, (n, …)."""
-        both = np.clip(base + self.step * learnt, self._box.low, self._box.high)
-        return np.asarray(both, self._box.dtype)
 
 
 def check_corrected(space: Space[Any], who: str) -> None:

@@ -19,12 +19,13 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
+from skillweave.policies.core import Turn
+from skillweave.policies.mapped import Shapes
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import checksum, made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
-from skillweave.skills.plan import Shapes
 from skillweave.skills.torch_module import weights_of, with_weights
 from skillweave.types import Array
 
@@ -49,7 +50,7 @@ class SB3Policy(MappedPolicy):
         mapping: PolicyMapping | None = None,
     ) -> None:
         self.algorithm = type(model).__name__
-        name = f"Stable-Baselines3's {self.algorithm}" + (f" of {file}" if file else "")
+        name = _name_of(model, file)
         mapping = mapping or PolicyMapping()
         self.model_space = model.observation_space
         seen = None if mapping.sees is not None else model.observation_space
@@ -81,8 +82,9 @@ class SB3Policy(MappedPolicy):
             bound.observation_space = theirs
         return bound
 
+    @property
     def expected(self) -> Shapes:
-        """Return the shapes of the model's observations."""
+        """The shapes of the model's observations."""
         space = self.model_space
         parts = dict(space.spaces) if isinstance(space, Dict) else {"": space}
         return {
@@ -92,31 +94,27 @@ class SB3Policy(MappedPolicy):
         }
 
     def call(
-        self,
-        inputs: Any,
-        state: tuple[Array, ...],
-        mask: Array | None,
-        deterministic: bool,
-        rng: np.random.Generator | None,
+        self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
     ) -> tuple[Array, tuple[Array, ...]]:
         """Return the model's actions, by its own ``predict``."""
         import torch
 
         from skillweave.spaces import unpack
 
-        if isinstance(inputs, dict):
-            parts: Any = inputs.get("", inputs)
-        else:
-            parts = unpack(self.observation_space, inputs)
-        if deterministic:
-            return self.policy.predict(parts, deterministic=True)[0], ()
-        # It samples from torch's global generator, which other code may use.
-        rng = rng or np.random.default_rng()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(rng.integers(2**62)))
-            rows = next(iter(inputs.values())) if isinstance(inputs, dict) else inputs
-            _reset_noise(self.policy, len(rows))
-            return self.policy.predict(parts, deterministic=False)[0], ()
+        parts: Any = inputs.get("", inputs)
+        if self.mapping.sees is None:
+            parts = unpack(self.observation_space, parts)
+        try:
+            if turn.greedy:
+                return self.policy.predict(parts, deterministic=True)[0], ()
+            # It samples from torch's global generator, which other code may use.
+            rng = turn.world.rng or np.random.default_rng()
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(int(rng.integers(2**62)))
+                _reset_noise(self.policy, len(next(iter(inputs.values()))))
+                return self.policy.predict(parts, deterministic=False)[0], ()
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
 
     def source(self) -> dict[str, Any]:
         """Return a zip's path and checksum, or the checksum of weights; and the mapping."""
@@ -133,6 +131,11 @@ class SB3Policy(MappedPolicy):
         copied = _copied(self.policy, self.model_space)
         policy.policy = with_weights(copied, content, self._who)
         return policy
+
+
+def _name_of(model: Any, file: Path | None) -> str:
+    """Return a model's name in messages."""
+    return f"Stable-Baselines3's {type(model).__name__}" + (f" of {file}" if file else "")
 
 
 def _copied(policy: Any, space: Space[Any]) -> Any:
@@ -238,45 +241,65 @@ def from_sb3(
         DeclarationError: an argument has a wrong type.
     """
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
-    if normalize is None:
-        normalize = _statistics_of(model)
-    elif normalize is False:
-        normalize = None
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_sb3(): learn is {short(learn)}; it must be True or False")
-    if not isinstance(model, str | Path):
-        if not (hasattr(model, "policy") and hasattr(model, "observation_space")):
-            raise DeclarationError(
-                f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
+    if normalize is None:
+        normalize = _statistics_of(model)
+    file = sha256 = None
+    if isinstance(model, str | Path):
+        file = Path(model)
+        if trust is not True:
+            check_file(file)
+            kind_of = (
+                algorithm.__name__ if isinstance(algorithm, type) else repr(algorithm or "ppo")
             )
-        if learn:
-            return _learnable(model, None, normalize, trust, options)
-        return SB3Policy(model, mapping=_mapping(model, normalize, trust, options))
-    file = Path(model)
-    if trust is not True:
-        check_file(file)
-        kind_of = algorithm.__name__ if isinstance(algorithm, type) else repr(algorithm or "ppo")
-        further = ", learn=True" if learn else ""
-        raise PolicyError(
-            f"{file} was not opened: a Stable-Baselines3 zip holds pickles, which can run any code "
-            "on your machine. If you trust its author: "
-            f"from_sb3({str(file)!r}, {kind_of}, trust=True{further})"
+            further = ", learn=True" if learn else ""
+            raise PolicyError(
+                f"{file} was not opened: a Stable-Baselines3 zip holds pickles, which can run any "
+                "code on your machine. If you trust its author: "
+                f"from_sb3({str(file)!r}, {kind_of}, trust=True{further})"
+            )
+        model, sha256 = _loaded(file, algorithm)
+    elif not (hasattr(model, "policy") and hasattr(model, "observation_space")):
+        raise DeclarationError(
+            f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
         )
-    kind = _algorithm(algorithm, file)
+    if isinstance(normalize, str | Path):
+        normalize = _opened(Path(normalize), trust, model)
+    if normalize is False or not getattr(normalize, "norm_obs", True):
+        normalize = None
+    if learn:
+        return _learnable(model, _name_of(model, file), normalize, options)
+    return SB3Policy(model, file, sha256, _mapping(model, normalize, options))
+
+
+def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
+    """Return the model in a trusted file, and the file's checksum."""
+    try:
+        import stable_baselines3
+    except ImportError as error:
+        raise MissingExtra("a Stable-Baselines3 model", "sb3") from error
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    kind: Any = algorithm
+    if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
+        kind = getattr(stable_baselines3, algorithm.upper())
+    if not (isinstance(kind, type) and hasattr(kind, "load")):
+        raise DeclarationError(
+            f"{file}: algorithm is {algorithm!r}; it must be the class that saved the file, or one "
+            f"of {', '.join(ALGORITHMS)}"
+        )
     content = read_file(file)
     # A replay buffer is for training only, and may take gigabytes.
-    less = {"buffer_size": 1} if _learns_off_policy(kind) else {}
+    less = {"buffer_size": 1} if issubclass(kind, OffPolicyAlgorithm) else {}
     try:
-        loaded = kind.load(io.BytesIO(content), device="cpu", **less)
+        return kind.load(io.BytesIO(content), device="cpu", **less), checksum(content)
     except Exception as error:
         raise PolicyError(
             f"{file} could not be opened as Stable-Baselines3's {kind.__name__}: "
             f"{type(error).__name__}: {shortened(' '.join(str(error).split()))}. "
-            + _other_version(content)
+            + _other_version(content, stable_baselines3.__version__)
         ) from error
-    if learn:
-        return _learnable(loaded, file, normalize, trust, options)
-    return SB3Policy(loaded, file, checksum(content), _mapping(loaded, normalize, trust, options))
 
 
 def _statistics_of(model: Any) -> Any:
@@ -294,9 +317,7 @@ def _statistics_of(model: Any) -> Any:
     return None
 
 
-def _learnable(
-    model: Any, file: Path | None, normalize: Any, trust: bool, options: dict[str, Any]
-) -> Learnable:
+def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -> Learnable:
     """Return the networks of a model.
 
     Raises:
@@ -304,12 +325,10 @@ def _learnable(
         DeclarationError: a mapping is given.
     """
     kind, policy = type(model).__name__, model.policy
-    name = f"Stable-Baselines3's {kind}" + (f" of {file}" if file else "")
     given = [k for k, v in options.items() if v is not None and v != 1]
     if given:
         raise DeclarationError(no_mapping(f"from_sb3(learn=True): {name}", " and ".join(given)))
     kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
-    spaces = model.observation_space, model.action_space
     if kind not in kinds or hasattr(policy, "lstm_actor") or _has_gsde(policy):
         raise PolicyError(
             f"{name} cannot learn on: only the networks of {', '.join(kinds)} without memory and "
@@ -323,12 +342,8 @@ def _learnable(
     modules = (policy, *policy.children())
     extractors = (getattr(module, "features_extractor", None) for module in modules)
     _check_features(next(x for x in extractors if x is not None), name)
-    scaling = None if normalize is None else _moments(normalize, trust, *spaces)
-    common: dict[str, Any] = {
-        "scaling": scaling,
-        "observation_space": spaces[0],
-        "action_space": spaces[1],
-    }
+    settings: dict[str, Any] = {}
+    log_std = None
     if kinds[kind] == "PPO":
         hidden = policy.mlp_extractor
         networks = {
@@ -336,21 +351,29 @@ def _learnable(
             "critic": layers_of([hidden.value_net, policy.value_net], name),
         }
         log_std = getattr(policy, "log_std", None)
-        common["log_std"] = None if log_std is None else array_of(log_std)
         # The critic's values are in units of reward.
         settings = PLAIN_PPO | {"normalize_returns": False}
-        return Learnable(name, "PPO", networks, env_units=True, settings=settings, **common)
-    if kind == "DQN":
-        plain = {"dueling": False, "noisy": False, "distributional": False}
+    elif kind == "DQN":
         networks = {"q": layers_of([policy.q_net.q_net], name)}
-        return Learnable(name, "DQN", networks, settings=plain, **common)
-    actor = policy.actor
-    if kind == "SAC":
-        mean, log_std = (layers_of([actor.latent_pi, x], name) for x in (actor.mu, actor.log_std))
-        networks = {"actor": mean.beside(log_std)}
+        settings = {"dueling": False, "noisy": False, "distributional": False}
+    elif kind == "SAC":
+        actor = policy.actor
+        mean, spread = (layers_of([actor.latent_pi, x], name) for x in (actor.mu, actor.log_std))
+        networks = {"actor": mean.beside(spread)}
     else:
-        networks = {"actor": layers_of(list(actor.mu)[:-1], name)}  # tanh follows here, too
-    return Learnable(name, kinds[kind], networks, **common)
+        networks = {"actor": layers_of(list(policy.actor.mu)[:-1], name)}  # tanh follows here, too
+    space = model.observation_space
+    return Learnable(
+        name,
+        kinds[kind],
+        networks,
+        None if log_std is None else array_of(log_std),
+        env_units=kinds[kind] == "PPO",
+        scaling=None if normalize is None else _moments(normalize, space),
+        observation_space=space,
+        action_space=model.action_space,
+        settings=settings,
+    )
 
 
 def _check_features(extractor: Any, name: str) -> None:
@@ -364,13 +387,8 @@ def _check_features(extractor: Any, name: str) -> None:
         )
 
 
-def _moments(
-    normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
-) -> tuple[Array, Array, float] | None:
-    """Return mean, variance and number of observations, by ``VecNormalize``; None: not scaled."""
-    normalize = _opened(normalize, trust, space, action_space)
-    if not getattr(normalize, "norm_obs", True):
-        return None
+def _moments(normalize: Any, space: Space[Any]) -> tuple[Array, Array, float]:
+    """Return mean, variance and number of observations, by ``VecNormalize``."""
     rms: Any = getattr(normalize, "obs_rms", None)
     if isinstance(rms, dict) or not isinstance(space, Box):
         raise PolicyError(
@@ -395,59 +413,12 @@ def _variance(rms: Any) -> Array:
     return known
 
 
-def _mapping(model: Any, normalize: Any, trust: bool, options: dict[str, Any]) -> PolicyMapping:
+def _mapping(model: Any, normalize: Any, options: dict[str, Any]) -> PolicyMapping:
     """Return the declared mapping, with the statistics of ``VecNormalize`` in it."""
-    scaling: dict[str, Scaling] = {}
-    if normalize is not None:
-        spaces = model.observation_space, model.action_space
-        scaling = _statistics(normalize, trust, *spaces)
-    if scaling and options["sees"] is None:
-        space = model.observation_space
-        whole: Any = Part(one_hot=False)
-        if isinstance(space, Dict):
-            whole = {name: Part(name, one_hot=False) for name in space.spaces}
-        options = options | {"sees": whole}
-    return mapping_of("from_sb3()", **options, scaling=scaling)
-
-
-def _opened_statistics(file: Path, space: Space[Any], action_space: Space[Any]) -> Any:
-    """Return the ``VecNormalize`` in a file, for a model with these spaces."""
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-
-    # VecNormalize compares the spaces of its environment, and no more.
-    spaces = {"observation_space": space, "action_space": action_space}
-    stub: Any = type("Stub", (Env,), spaces)
-    check_file(file)
-    try:
-        return VecNormalize.load(str(file), DummyVecEnv([stub]))
-    except (Exception, SystemExit) as error:
-        raise PolicyError(
-            f"{file} could not be opened as the VecNormalize of observations {space}: "
-            f"{error_text(error)}"
-        ) from error
-
-
-def _opened(normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]) -> Any:
-    """Return the ``VecNormalize`` that is given, or that is in the file that is given."""
-    if not isinstance(normalize, str | Path):
-        return normalize
-    file = Path(normalize)
-    if trust is not True:
-        raise PolicyError(
-            f"{file} was not opened: VecNormalize is saved as a pickle, which can run any code "
-            "on your machine. If you trust its author, add trust=True"
-        )
-    return _opened_statistics(file, space, action_space)
-
-
-def _statistics(
-    normalize: Any, trust: bool, space: Space[Any], action_space: Space[Any]
-) -> dict[str, Scaling]:
-    """Return the scaling of observations by ``VecNormalize``, by the name of the input."""
-    normalize = _opened(normalize, trust, space, action_space)
+    if normalize is None:
+        return mapping_of("from_sb3()", **options)
+    space: Any = model.observation_space
     rms: Any = getattr(normalize, "obs_rms", None)
-    if not getattr(normalize, "norm_obs", True):
-        return {}
     by_name = dict(rms) if isinstance(rms, dict) else {"": rms}
     parts = dict(space.spaces) if isinstance(space, Dict) else {"": space}
     shapes = {name: np.shape(getattr(one, "mean", 0.0)) for name, one in by_name.items()}
@@ -457,7 +428,7 @@ def _statistics(
             f"statistics of observations {space}; normalize=False takes none"
         )
     limit = float(normalize.clip_obs)
-    return {
+    scaling = {
         name: Scaling(
             offset=np.ravel(one.mean),
             scale=1.0 / np.sqrt(_variance(one) + normalize.epsilon),
@@ -465,13 +436,36 @@ def _statistics(
         )
         for name, one in by_name.items()
     }
+    if scaling and options["sees"] is None:
+        whole = {name: Part(name, one_hot=False) for name in parts}
+        options = options | {"sees": whole.get("", whole)}
+    return mapping_of("from_sb3()", **options, scaling=scaling)
 
 
-def _other_version(content: bytes) -> str:
-    """Return what a file that could not be opened may be, for messages."""
-    import stable_baselines3
+def _opened(file: Path, trust: bool, model: Any) -> Any:
+    """Return the ``VecNormalize`` in a file, for a model."""
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    here = stable_baselines3.__version__
+    if trust is not True:
+        raise PolicyError(
+            f"{file} was not opened: VecNormalize is saved as a pickle, which can run any code "
+            "on your machine. If you trust its author, add trust=True"
+        )
+    # VecNormalize compares the spaces of its environment, and no more.
+    spaces = {k: getattr(model, k) for k in ("observation_space", "action_space")}
+    stub: Any = type("Stub", (Env,), spaces)
+    check_file(file)
+    try:
+        return VecNormalize.load(str(file), DummyVecEnv([stub]))
+    except (Exception, SystemExit) as error:
+        raise PolicyError(
+            f"{file} could not be opened as the VecNormalize of observations "
+            f"{model.observation_space}: {error_text(error)}"
+        ) from error
+
+
+def _other_version(content: bytes, here: str) -> str:
+    """Return what a file that could not be opened may be, for messages; ``here``: a version."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             saved = archive.read("_stable_baselines3_version").decode("ascii", "replace").strip()
@@ -483,24 +477,3 @@ def _other_version(content: bytes) -> str:
             "install that version, or save it again by this one"
         )
     return "Did another algorithm save it?"
-
-
-def _algorithm(algorithm: str | type | None, file: Path) -> Any:
-    try:
-        import stable_baselines3
-    except ImportError as error:
-        raise MissingExtra("a Stable-Baselines3 model", "sb3") from error
-    if isinstance(algorithm, type) and hasattr(algorithm, "load"):
-        return algorithm
-    if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
-        return getattr(stable_baselines3, algorithm.upper())
-    raise DeclarationError(
-        f"{file}: algorithm is {algorithm!r}; it must be the class that saved the file, or one of "
-        f"{', '.join(ALGORITHMS)}"
-    )
-
-
-def _learns_off_policy(kind: type) -> bool:
-    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-
-    return issubclass(kind, OffPolicyAlgorithm)

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping
+from functools import cached_property, partial
 from typing import Any, Literal
 
-import numpy as np
 from gymnasium.spaces import Dict, Tuple
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
-from skillweave.policies.parts import GOAL, OBSERVATION
+from skillweave.policies.core import Memory, Turn
+from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.mapped import Function
+from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
-from skillweave.skills.mapped import (
-    MappedPolicy,
-    model_state,
-    parted,
-    rows_first,
-    state_shapes,
-)
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called, checked_actions, required_arguments
+from skillweave.skills.outputs import as_array, called, required_arguments
 from skillweave.skills.probing import probe
-from skillweave.types import Array, Memory, read_only
+from skillweave.types import Array, read_only
 
 
 class ScriptedPolicy(MappedPolicy):
@@ -42,119 +38,97 @@ class ScriptedPolicy(MappedPolicy):
         mapping: PolicyMapping | None = None,
     ) -> None:
         self.function = function
-        # How it takes a skill's goal: by the name goal, or as its second argument; None: not.
-        self._with_goal: Literal["goal", "second"] | None = None
+        # How it takes a skill's goal: by the name goal, or as its second argument; "": not.
+        self._with_goal: Literal["goal", "second", ""] = ""
         if mapping is None or not (mapping.sees or mapping.state):
             self._with_goal = _takes_goal(function)
         name = getattr(function, "__name__", type(function).__name__)
         super().__init__(f"function {name}()", observation_space, action_space, mapping)
 
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-        goal: Array | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return the function's actions, checked if the action space is known."""
-        if self.action_space is None and self.mapping.is_identity:
-            return self.call(obs, (), mask, deterministic, rng)[0], memory
-        return super().act(memory, obs, mask, deterministic=deterministic, rng=rng, goal=goal)
-
-    def call(
-        self,
-        inputs: Any,
-        state: tuple[Array, ...],
-        mask: Array | None,
-        deterministic: bool,
-        rng: np.random.Generator | None,
-    ) -> tuple[Array, tuple[Array, ...]]:
-        """Call the function."""
-        who = self._who
+    @property
+    def model(self) -> Function:
+        """The function, which is asked with all that helps when it fails."""
         mapping = self.mapping
-        only = inputs.get("") if isinstance(inputs, dict) else inputs
-        if only is not None and not mapping.state:
-            return self._actions(read_only(only)), ()
-        before = tuple(read_only(x) for x in model_state(state, mapping.state))
-        more: tuple[Any, ...] = before if mapping.single_state else (before,)
-        given: Any = only
-        if only is None:
-            given = {k: read_only(v) for k, v in inputs.items()}
-            given |= {"state": more[0]} if mapping.state else {}
-        value = called(self.function, given, who, kind=PolicyError, more=more)
-        action, after = parted(value, mapping, who)
-        # Copies: the function may return the same arrays each time.
-        arrays = [np.array(as_array(x, who, PolicyError)) for x in after]
-        n = len(next(iter(inputs.values())) if only is None else only)
-        return self._array(action, n), rows_first(arrays, mapping.state, who)
+        takes_goal = self._with_goal if self.joins else ""
+        how = mapping.state, mapping.single_state, takes_goal, self._who
+        return Function(_Asked(self), *how)
+
+    @cached_property
+    def in_place(self) -> InPlace:  # type: ignore[override]
+        """The policy that acts: the function alone, while its action space is not known."""
+        if self.action_space is None and self.mapping == PolicyMapping():
+            return _Alone(self)
+        return super().in_place
 
     @property
     def takes_goal(self) -> bool:
         """Return whether the goal of a skill is an argument or an input of it."""
-        return self._with_goal is not None or super().takes_goal
-
-    @property
-    def with_goal(self) -> Literal["goal", "second"] | None:
-        """Return how the function is given the goal of its skill; None: it is given none."""
-        return self._with_goal if self.has_goals else None
+        return bool(self._with_goal) or super().takes_goal
 
     advice = (
         "let the function take it by this name, policy(obs, goal), or write Goal() at its place in "
         "sees"
     )
 
-    def split(self, obs: Array) -> tuple[Array, Array | None]:
-        """Return observations and goals for its inputs; a function takes both from the whole."""
-        return (obs, None) if self._with_goal is not None else super().split(obs)
-
-    def _actions(self, given: Array) -> Array:
-        """Return what the function makes of its only input."""
-        who, function = self._who, self.function
-        if self.with_goal is not None:
-            obs, goal = read_only(given[OBSERVATION]), read_only(given[GOAL])
-            by_name = self.with_goal == GOAL
-            function = partial(function, goal=goal) if by_name else function
-            action = called(function, obs, who, kind=PolicyError, more=() if by_name else (goal,))
-            return self._array(action, len(given))
-        value = called(function, given, who, kind=PolicyError)
-        action = self._array(value, len(given))
-        mapping = self.mapping
-        space, n = self.action_space, len(given)
-        if space is not None and mapping.acts is None and mapping.chunk is None:
-            shape = space.shape or ()
-            if action.shape == (n, *shape):
-                probe(function, given, n, who, space, PolicyError)
-        return action
-
-    def _array(self, value: Any, n: int) -> Array:
-        """Return what the function returned for n observations as one array."""
-        if isinstance(value, Mapping):
-            self.must_be_bound()
-        if isinstance(self.action_space, Dict | Tuple):
-            return checked_actions(value, n, self.action_space, self._who)
-        return as_array(value, self._who, PolicyError)
-
-    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
-        """Return the declared shapes of its state, in float64."""
-        return state_shapes(self.mapping, np.float64)
-
     def source(self) -> dict[str, Any]:
         """Return the function's name, and the mapping."""
         return super().source() | {"name": qualified(self.function)}
 
 
-def _takes_goal(function: Any) -> Literal["goal", "second"] | None:
-    """Return how a function of observations takes a goal, too; None: it does not.
+class _Asked:
+    """The function of a policy, which is asked by ``called``."""
+
+    def __init__(self, policy: ScriptedPolicy) -> None:
+        self.bare, self.policy = policy.function, policy
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        """Return what it makes of its inputs, and perhaps of a goal or a state."""
+        policy, who = self.policy, self.policy._who
+        if not given:
+            return called(self.bare, named, who, kind=PolicyError)
+        function = partial(self.bare, **named) if named else self.bare
+        value = called(function, given[0], who, kind=PolicyError, more=given[1:])
+        mapping, space = policy.mapping, policy.action_space
+        if mapping.state and isinstance(value, tuple | list) and len(value) == 2:
+            output, after = value
+            several = not mapping.single_state and isinstance(after, tuple | list)
+            arrays = [as_array(x, who, PolicyError) for x in (after if several else (after,))]
+            after = arrays if several else arrays[0]
+            dicts = isinstance(space, Dict | Tuple)
+            return output if dicts else as_array(output, who, PolicyError), after
+        if mapping.state or isinstance(space, Dict | Tuple):
+            return value
+        if isinstance(value, Mapping):
+            policy.must_be_bound()
+        action, n = as_array(value, who, PolicyError), len(given[0])
+        plain = mapping.acts is None and mapping.chunk is None
+        alone = len(given) == 1 and not named
+        if space is not None and plain and alone and action.shape == (n, *(space.shape or ())):
+            probe(function, given[0], n, who, space, PolicyError)
+        return action
+
+
+class _Alone(InPlace):
+    """A function whose action space is not known."""
+
+    def __init__(self, policy: ScriptedPolicy) -> None:
+        self._function = _Asked(policy)
+
+    def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
+        """Return what the function returns."""
+        action: Array = self._function(read_only(obs))
+        return action
+
+
+def _takes_goal(function: Any) -> Literal["goal", "second", ""]:
+    """Return how a function of observations takes a goal, too; "": it does not.
 
     A second parameter with a default, and of another name, is no goal: ``scale=2.0``.
     """
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # of some functions written in C
-        return None
+        return ""
     kinds = {p.kind for p in parameters}
     if any(p.name == GOAL and p.kind in _BY_NAME for p in parameters):
         return "goal"
@@ -163,7 +137,7 @@ def _takes_goal(function: Any) -> Literal["goal", "second"] | None:
     second = list(parameters)[1:2]
     if second and second[0].name == GOAL:  # to be given by its place alone
         return "second"
-    return "goal" if inspect.Parameter.VAR_KEYWORD in kinds else None
+    return "goal" if inspect.Parameter.VAR_KEYWORD in kinds else ""
 
 
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)

@@ -9,23 +9,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
+from skillweave.policies.core import Turn
+from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import checksum, qualified
 from skillweave.skills.learnable import Learnable, no_mapping, of_module
-from skillweave.skills.mapped import (
-    MappedPolicy,
-    invoke,
-    model_state,
-    parted,
-    rows_first,
-    state_shapes,
-)
+from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.types import Array
 
@@ -78,30 +72,32 @@ class TorchPolicy(MappedPolicy):
             bound.module = copy.deepcopy(self.module).eval()
         return bound
 
+    @property
+    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
+        """The declared shapes of its state, in float64, which holds any module's."""
+        return states_of(self.mapping.state)
+
     def call(
-        self,
-        inputs: Any,
-        state: tuple[Array, ...],
-        mask: Array | None,
-        deterministic: bool,
-        rng: np.random.Generator | None,
-    ) -> tuple[Array, tuple[Array, ...]]:
+        self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
+    ) -> tuple[Array, Sequence[Array]]:
         """Call the module."""
         import torch
 
         from skillweave.spaces import unpack
 
-        mapping = self.mapping
+        mapping, given = self.mapping, dict[str, Any](inputs)
+        if mapping.sees is None:
+            given[""] = unpack(self.observation_space, given[""])
         weights = [*self.module.parameters(), *self.module.buffers()]
         device = weights[0].device if weights else None
         dtype = next((x.dtype for x in weights if x.is_floating_point()), torch.float32)
-        if isinstance(inputs, dict):
-            given = {name: _tensors(x, device, dtype) for name, x in inputs.items()}
-        else:
-            given = {"": _tensors(unpack(self.observation_space, inputs), device, dtype)}
-        before = [_tensors(x, device, dtype) for x in model_state(state, mapping.state)]
-        with torch.inference_mode():
-            value = invoke(self.module, given, before, mapping.single_state)
+        given = {name: _tensors(x, device, dtype) for name, x in given.items()}
+        before = [_tensors(x, device, dtype) for x in of_model(state, mapping.state)]
+        try:
+            with torch.inference_mode():
+                value = invoke(self.module, given, before, mapping.single_state)
+        except (Exception, SystemExit) as error:
+            raise self._failure(error) from error
         output, after = parted(value, mapping, self._who)
         for part, what in ((output, "one tensor"), *((x, "tensors as its state") for x in after)):
             if not isinstance(part, torch.Tensor):
@@ -111,10 +107,6 @@ class TorchPolicy(MappedPolicy):
         output = output.float() if output.is_floating_point() else output
         arrays = [x.to(torch.float64).cpu().numpy() for x in after]
         return output.cpu().numpy(), rows_first(arrays, mapping.state, self._who)
-
-    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
-        """Return the declared shapes of its state, in float64, which holds any module's."""
-        return state_shapes(self.mapping, np.float64)
 
     def source(self) -> dict[str, Any]:
         """Return the module's class, the checksum of its weights or its file, and the mapping."""

@@ -13,13 +13,10 @@ import numpy as np
 
 from skillweave.errors import EnvError
 from skillweave.messages import short
+from skillweave.policies.spaces import MOST_CHOICES, MOST_OF_ALL
 from skillweave.spaces.packing import parts
 
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary, Box, and Dict and Tuple of these"
-MOST_CHOICES = 256
-MOST_OF_ALL = 10_000
-"""The most values of a whole number of a Box, and of all its numbers: each is an output of a
-network."""
 
 
 def named_action(space: gym.Space[Any], place: str) -> str:

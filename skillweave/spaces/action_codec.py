@@ -84,12 +84,6 @@ class ActionCodec:
         units[:, bounded] = (units[:, bounded] - low[bounded]) / width * 2.0 - 1.0
         return units.astype(np.float32)
 
-    def choices_in(self, action: Array) -> Array:
-        """Return the value of each choice in actions (n, …), counted from 0: (n, K) int64."""
-        if not self.parts:
-            return np.zeros((len(action), 0), np.int64)
-        return self.from_env(action).reshape(len(action), -1)
-
     def allowed_at_random(self, action: Array, mask: Array, rng: np.random.Generator) -> Array:
         """Return actions (n, …) with choices at random among those that ``mask`` (n, A) allows.
 
@@ -198,11 +192,6 @@ class JointCodec(ActionCodec):
             units = codec.from_env(np.asarray(action[name]))
             found[:, self.columns[at]] = units.reshape(len(units), -1)
         return found
-
-    def choices_in(self, action: Array) -> Array:
-        """Return the value of each choice in actions (n,), counted from 0: (n, K) int64."""
-        found = [codec.choices_in(action[name]) for name, codec in self.members]
-        return np.concatenate(found, axis=1)
 
     def allowed_at_random(self, action: Array, mask: Array, rng: np.random.Generator) -> Array:
         """Return actions (n,) with choices that ``mask`` (n, A) allows; see ``ActionCodec``."""

@@ -18,6 +18,7 @@ import numpy as np
 from torch import Tensor
 
 from skillweave.errors import EnvError
+from skillweave.policies.spaces import space_of
 from skillweave.spaces.action_codec import ActionCodec, JointCodec, action_codec
 from skillweave.spaces.packing import obs_dtype
 from skillweave.types import Array
@@ -54,27 +55,11 @@ class ChoiceSpace(gym.spaces.Dict):
 
     def rows(self, choice: Array) -> Array:
         """Return choices (n,) as rows (n, row_size) float64: the number, then all goals."""
-        goals = [_leaves(choice[GOAL][name]) for name in self.goal_spaces]
-        parts = [choice[SKILL], *(leaf for each in goals for leaf in each)]
-        return np.concatenate([x.reshape(len(x), -1).astype(np.float64) for x in parts], axis=1)
+        return space_of(self).flat(choice)
 
     def of_rows(self, rows: Array) -> Array:
         """Return the choices (n,) of rows (n, row_size)."""
-        choice = np.zeros(len(rows), obs_dtype(self))
-        choice[SKILL] = rows[:, 0]
-        at = 1
-        for name in self.goal_spaces:
-            for leaf in _leaves(choice[GOAL][name]):
-                size = math.prod(leaf.shape[1:])
-                leaf[...] = rows[:, at : at + size].reshape(leaf.shape)
-                at += size
-        return choice
-
-
-def _leaves(goal: Array) -> list[Array]:
-    """Return views of the parts of goals (n, …) that have no parts themselves."""
-    names = goal.dtype.names
-    return [goal] if names is None else [x for name in names for x in _leaves(goal[name])]
+        return space_of(self).of_numbers(rows)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.errors import EnvError, RunError
+from skillweave.policies.spaces import Space
 from skillweave.reading import fit, shown
 from skillweave.settings import LARGEST, AtLeastOne, Check
 from skillweave.spaces.choices import ChoiceSpace
@@ -172,6 +173,28 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
         case "MultiDiscrete":
             return gym.spaces.MultiDiscrete(data["nvec"], start=data["start"], **_dtype(data))
     return gym.spaces.MultiBinary(data["n"])
+
+
+def gym_space(space: Space) -> gym.Space[Any]:
+    """Return a space of data as Gymnasium's."""
+    if space.parts is not None:
+        inner = [(name, gym_space(part)) for name, part in space.parts.items()]
+        if space.kind == "Tuple":
+            return gym.spaces.Tuple([part for _, part in inner])
+        return gym.spaces.Dict(inner)
+    dtype: Any = np.dtype(space.dtype)
+    low, high = (np.asarray(x) for x in (space.low, space.high))
+    if space.kind == "Box":
+        low, high = (np.broadcast_to(x.astype(dtype), space.shape).copy() for x in (low, high))
+        box: gym.Space[Any] = gym.spaces.Box(low, high, space.shape, dtype.type)
+        return box
+    if space.kind == "MultiBinary":
+        return gym.spaces.MultiBinary(space.shape if len(space.shape) > 1 else space.shape[0])
+    if space.kind == "Discrete":
+        return gym.spaces.Discrete(int(high - low + 1), start=int(low), dtype=dtype.type)
+    count = np.broadcast_to(high - low + 1, space.shape).astype(np.int64)
+    start = np.broadcast_to(low, space.shape).astype(np.int64)
+    return gym.spaces.MultiDiscrete(count, dtype=dtype.type, start=start)
 
 
 def same_space(a: gym.Space[Any], b: gym.Space[Any]) -> bool:

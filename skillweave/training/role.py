@@ -13,7 +13,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, level_of
 from skillweave.skills import Skill
-from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.ready import has_part, own_part
 
@@ -70,7 +70,7 @@ class Role:
         if self.own_goals is not None:
             space = with_goal(space, self.own_goals)
         if self.observed_goals:
-            return with_goal(space, goals_space(self.observed_goals))
+            return with_goal(space, gym.spaces.Dict(list(self.observed_goals.items())))
         if self.skill is None or self.skill.goal_space is None:
             return space
         return with_goal(space, self.skill.goal_space)

@@ -11,14 +11,23 @@ from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from calls.plain_worlds import episode
 from calls.reference import Moment
 from calls.test_calls import compare_finished, compare_with
-from calls.users import Learner, Played, collected, engine_of, in_a_loop, in_evaluation, one_by_one
+from calls.users import (
+    Learner,
+    Played,
+    collected,
+    engine_of,
+    in_a_loop,
+    in_evaluation,
+    one_by_one,
+    stand_ins,
+)
 from calls.worlds import (
     ACTIONS,
     GOALS,
@@ -38,14 +47,13 @@ import skillweave as sw
 from skillweave.api.player import Player
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.export import runner as runner_file
-from skillweave.export import states
-from skillweave.export.graphs import Graph, leaves_of, mask_width
+from skillweave.export.graphs import Graph, examples, mask_width
+from skillweave.export.runner import Runner
 from skillweave.export.write import Export, write_export
 from skillweave.policies.core import CallEnd
 from skillweave.policies.hierarchy import ActiveGuide
-from skillweave.skills import onnx_file
-from skillweave.spaces import ChoiceSpace
+from skillweave.policies.spaces import space_of
+from skillweave.spaces import ChoiceSpace, pack
 from skillweave.types import Array
 
 # Those that learn -------------------------------------------------------------------------------
@@ -126,8 +134,7 @@ class Session:
 
     known: list[tuple[Any, bool]] = []  # noqa: RUF012
 
-    def __init__(self, file: Any, *options: Any, **where: Any) -> None:
-        content = file if isinstance(file, bytes) else Path(file).read_bytes()
+    def __init__(self, content: bytes, who: str) -> None:
         self.net, self.sampled = self.known[int(content)]
 
     @classmethod
@@ -144,9 +151,9 @@ class Session:
         net = self.net
         found = [
             SimpleNamespace(
-                name=leaf.name, type=f"tensor({kinds[leaf.dtype.kind]})", shape=[1, *leaf.shape]
+                name=name, type=f"tensor({kinds[leaf.numpy().dtype.kind]})", shape=leaf.shape
             )
-            for leaf in leaves_of(net.observation_space)
+            for name, leaf in examples(net.observation_space).items()
         ]
         sizes = {}
         if isinstance(net, Network):
@@ -157,10 +164,6 @@ class Session:
             if size:
                 found.append(SimpleNamespace(name=name, type="tensor(float)", shape=[1, size]))
         return found
-
-    def get_outputs(self) -> list[Any]:
-        names = ["worth"] if isinstance(self.net, Worths) else ["action", "memory.after"]
-        return [SimpleNamespace(name=name, type="tensor(float)", shape=[1, 1]) for name in names]
 
     def run(self, _: Any, feeds: dict[str, Array]) -> list[Array]:
         given = {k: v for k, v in feeds.items() if k.startswith("obs")}
@@ -173,6 +176,8 @@ class Session:
             number, goals = found
             parts = [x for name in goals for _, x in leaves(goals[name], "")]
             found = np.concatenate([number[:, None], *parts], axis=1) if goals else number
+        elif isinstance(space := self.net.action_space, gym.spaces.Dict):
+            found = space_of(space).flat(pack(space, found))
         return [found, *after.values()]
 
 
@@ -180,28 +185,14 @@ class Session:
 def folder_of(world: World) -> Iterator[tuple[str, Export]]:
     """Its exported folder, whose networks are stand-ins."""
     pytest.importorskip("onnxruntime")
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        patch.object(states, "agent_graph", Session.graph),
-        patch.object(states, "worth_graph", Session.graph),
-        patch.object(runner_file.ort, "InferenceSession", Session),
-        patch.object(onnx_file, "_session", Session),
-    ):
+    with tempfile.TemporaryDirectory() as folder, stand_ins(Session):
         yield folder, write_export(Path(folder), made(world).hierarchy(), "crane")
 
 
 def exported(world: World) -> Played:
     with folder_of(world) as (folder, export):
-        runner = runner_file.Runner(folder, export.functions)
-        return one_by_one(world, runner, lambda: remembered_by(runner.root), SEEDS)
-
-
-def remembered_by(part: Any) -> dict[str, Any]:
-    """What the runner remembers of calls, by a player's names."""
-    found = {"skill": part.skill, "elapsed": part.elapsed, "end": part.why}
-    running = part.policies[part.skill]
-    below = remembered_by(running) if hasattr(running, "policies") else {}
-    return found | {f"{part.skill}.{k}": v for k, v in below.items()}
+        runner = Runner(folder, export.functions)
+        return one_by_one(world, runner, lambda: runner.memory, SEEDS)
 
 
 def read_again(world: World) -> Played:
@@ -215,10 +206,9 @@ def anything(world: World) -> bool:
 
 
 def can_be_exported(world: World) -> bool:
-    """ONNX has no policy that remembers what it observes, and the runner returns one array."""
+    """ONNX has no policy that remembers what it observes."""
     skills = [skill for level in world.level.all for skill in level.skills]
-    watches = any("watching" in (skill.policy, skill.corrects) for skill in skills)
-    return not watches and world.level.kind != "named"
+    return not any("watching" in (skill.policy, skill.corrects) for skill in skills)
 
 
 @dataclass(frozen=True)
@@ -237,8 +227,8 @@ USERS = {
     "joint": User(joint, learns="all"),
     "evaluation": User(evaluated),
     "deployment": User(deployed),
-    "exported": User(exported, can_be_exported, missing=r"rnn$|limit$|selector\.|goal\."),
-    "read again": User(read_again, can_be_exported, missing=r"rnn$"),
+    "exported": User(exported, can_be_exported),
+    "read again": User(read_again, can_be_exported),
 }
 
 

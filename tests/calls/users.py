@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -22,11 +24,13 @@ from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import acting_policy
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.export import states
+from skillweave.export import compile
 from skillweave.export.graphs import Graph
+from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
+from skillweave.policies import leaves
 from skillweave.policies.core import Memory, Policy, Turn, World, flat, restart, take
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.seeding import Seeds
@@ -461,8 +465,18 @@ class Session:
 
     known: list[tuple[Any, bool]] = []  # noqa: RUF012
 
-    def __init__(self, file: str, *options: Any, **where: Any) -> None:
-        self.policy, self.sampled = self.known[int(Path(file).read_bytes())]
+    def __init__(self, content: bytes, who: str) -> None:
+        self.policy, self.sampled = self.known[int(content)]
+
+    def get_inputs(self) -> list[Any]:
+        shapes = {"obs": ("float", self.policy.observation_space.shape[0])}
+        if not isinstance(self.policy, Worth):
+            shapes |= {"mask": ("bool", int(self.policy.action_space.n))}
+            shapes |= {"memory": ("float", self.policy.size)} if self.policy.size else {}
+        return [
+            SimpleNamespace(name=name, type=f"tensor({kind})", shape=[1, n])
+            for name, (kind, n) in shapes.items()
+        ]
 
     def run(self, _: None, feeds: dict[str, Array]) -> list[Array]:
         if isinstance(self.policy, Worth):
@@ -481,45 +495,24 @@ class Session:
         return Graph(b"%d" % (len(cls.known) - 1), int(policy.action_space.n), policy.size)
 
 
-def exported(case: Case) -> Played:
-    """The runner, which knows nothing of this library; its networks are those of the case."""
-    pytest.importorskip("onnxruntime")
-    from skillweave.export import runner as file
-
+@contextmanager
+def stand_ins(session: Any) -> Iterator[None]:
+    """Let networks be written and opened by ``session``."""
     with (
-        tempfile.TemporaryDirectory() as folder,
-        patch.object(states, "agent_graph", Session.graph),
-        patch.object(states, "worth_graph", Session.graph),
-        patch.object(file.ort, "InferenceSession", Session),
+        patch.object(compile, "agent_graph", session.graph),
+        patch.object(compile, "worth_graph", session.graph),
+        patch.object(leaves, "open_session", session),
     ):
+        yield
+
+
+def exported(case: Case) -> Played:
+    """The runner; its networks are those of the case."""
+    pytest.importorskip("onnxruntime")
+    with tempfile.TemporaryDirectory() as folder, stand_ins(Session):
         export = write_export(Path(folder), hierarchy(case.level), "walk")
-        runner = file.Runner(folder, export.functions)
-        found = one_by_one(case, runner, lambda: remembered_by(runner.root, case.level))
-    found.missing = r"\blimit$|chances$|(selector|guide)\.(skill|why|succeeded)$"
-    return found
-
-
-def remembered_by(part: Any, level: LevelCase) -> dict[str, Any]:
-    """What the runner remembers, by a player's names."""
-    found = {"skill": part.skill, "elapsed": part.elapsed, "end": part.why}
-    running, policy = level.skills[part.skill].policy, part.policies[part.skill]
-    below: dict[str, Any] = {}
-    if isinstance(running, LevelCase):
-        below = remembered_by(policy, running)
-    elif running == "counts":
-        below = {"rnn": policy.memory["memory"]}
-    found |= {f"{part.skill}.{k}": v for k, v in below.items()}
-    if level.selector == "counts":
-        found["selector.rnn"] = part.selector.memory["memory"]
-    for name, kind, who in (
-        ("selector", level.selector, part.selector), ("guide", level.guide, part.guide)
-    ):  # fmt: skip
-        if kind == "automaton":
-            found[f"{name}.state"] = who.state
-    return found
-
-
-# Which user plays which case --------------------------------------------------------------------
+        runner = Runner(folder, export.functions)
+        return one_by_one(case, runner, lambda: runner.memory)
 
 
 def drawn_by_automata(level: LevelCase) -> bool:

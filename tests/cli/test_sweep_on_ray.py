@@ -74,7 +74,7 @@ def test_a_node_of_another_version_ends_a_sweep_before_anything_is_trained(
 def test_a_python_that_differs_in_its_last_digit_will_do(monkeypatch, capsys, words):
     let_nodes_have(monkeypatch, SKILLWEAVE, PYTHON.rpartition(".")[0] + ".99")
     code, found = answer(capsys, words)
-    assert (code, [run["seed"] for run in found["runs"]]) == (0, [0])
+    assert (code, [run["seed"] for run in found["runs"]]) == (0, [0]), found["failed"]
 
 
 def test_a_run_whose_process_is_lost_is_named_and_the_others_are_trained(
@@ -83,7 +83,7 @@ def test_a_run_whose_process_is_lost_is_named_and_the_others_are_trained(
     (tmp_path / "still.py").write_text(DYING_RECIPE)
     monkeypatch.setattr(sweep, "RETRIES", 0)
     code, found = answer(capsys, [w.replace("0:1", "0:2") for w in words])
-    assert (code, [run["seed"] for run in found["runs"]]) == (1, [1])
+    assert (code, [run["seed"] for run in found["runs"]]) == (1, [1]), found["failed"]
     assert found["failed"][0]["run"].endswith("s0")
     assert "lost repeatedly: WorkerCrashedError" in found["failed"][0]["error"]
 

@@ -19,12 +19,12 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.player import Player
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.errors import RunError
+from skillweave.errors import RunError, SkillError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy, with_interruption
 from skillweave.selectors import ready_selector
-from skillweave.skills.goal_spaces import choice_space, goals_space, with_goal
+from skillweave.skills.goal_spaces import choice_space, with_goal
 from skillweave.skills.goals import goals_of
 
 pytest.importorskip("onnxscript")
@@ -158,7 +158,7 @@ def within(**how: Any) -> Any:
     spaces = {"go_to": GoTo.goal_space, "other": GoTo.goal_space}
     if how.get("cut"):
         config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
-        with_goals = with_goal(seen, goals_space(spaces))
+        with_goals = with_goal(seen, gym.spaces.Dict(list(spaces.items())))
         critic = mild(config, with_goals, gym.spaces.Discrete(3), seed=1)
         skills = with_interruption(skills, critic, 0.02)
     inner = selected(env, skills, how.get("inner", PPO), seen)
@@ -189,7 +189,7 @@ def interrupted() -> Any:
     env = Point()
     skills = skills_of(env, go_to(), Rest(), go_to("number", name="side"), call_steps=9)
     spaces = {s.name: s.goal_space for s in skills.skills if s.goal_space is not None}
-    seen = with_goal(env.observation_space, goals_space(spaces))
+    seen = with_goal(env.observation_space, gym.spaces.Dict(list(spaces.items())))
     config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
     critic = mild(config, seen, gym.spaces.Discrete(3), seed=1)
     return env, selected(env, with_interruption(skills, critic, 0.02), PPO)
@@ -242,11 +242,9 @@ def episodes(env: Point, policy: HierarchyPolicy, runner: Runner, other: Any) ->
             for theirs in others:
                 np.testing.assert_allclose(theirs, action, atol=1e-5)
             memory = players[0].memory
-            goal, below = policy.goal_now(memory), runner.root
-            while hasattr(below.policies[below.skill], "policies"):
-                below = below.policies[below.skill]
-            assert (goal is None) == (below.goal is None)
-            for mine, theirs in zip(*map(numbers_of, (goal, below.goal)), strict=True):
+            goal, its = policy.goal_now(memory), policy.goal_now(runner.memory)
+            assert (goal is None) == (its is None)
+            for mine, theirs in zip(*map(numbers_of, (goal, its)), strict=True):
                 np.testing.assert_allclose(theirs, mine, atol=1e-5)
             told.append((int(memory["skill"][0]), str(goal), np.round(action, 3).tolist()))
             obs, reward, terminated, truncated, info = env.step(action)
@@ -273,13 +271,13 @@ def test_a_hierarchy_with_goals_acts_the_same_elsewhere(make: Any, tmp_path: Pat
 def test_a_selector_that_samples_draws_goals_too(tmp_path: Path) -> None:
     env, policy = made(go_to(), Rest, greedy_selector=False)
     export = write_export(tmp_path, policy, "point")
-    entry = json.loads((tmp_path / "policy.json").read_text())["policy"]
+    entry = json.loads((tmp_path / "policy.json").read_text())["policy"]["policy"]
     assert entry["selector"]["noise"] == [["gumbel", 2], ["standard_normal", 2]]
     obs, goals = env.reset(seed=0)[0], []
     for seed in range(20):
         runner = Runner(tmp_path, export.functions, seed=seed)
         runner.act(obs)
-        goals.append(str(runner.root.goal))
+        goals.append(str(policy.goal_now(runner.memory)))
     assert len(set(goals)) > 2  # the other skill, and several goals
 
 
@@ -292,8 +290,8 @@ def test_a_selector_that_samples_chooses_goals_that_do_not_hold(tmp_path: Path) 
         player = Player(policy, seed=seed)
         runner.reset()
         assert len({str(p.act(obs)) for p in (player, runner)}) == 1
-        assert player.memory["goal"]["0"][0] == runner.root.goal[0] == 3
-        seen += [player.memory["selector"].get("rnn"), runner.root.selector.memory.get("memory")]
+        assert player.memory["goal"]["0"][0] == runner.memory["goal"]["0"][0] == 3
+        seen += [player.memory["selector"].get("rnn"), runner.memory["selector"].get("rnn")]
     for memory in seen[1:]:
         np.testing.assert_allclose(memory, seen[0], atol=1e-5)
 
@@ -304,15 +302,16 @@ def test_the_range_of_goals_is_in_the_file(tmp_path: Path) -> None:
     assert "go_to.clip_goal" in export.code
     file = tmp_path / "policy.json"
     content = json.loads(file.read_text())
-    goal = content["policy"]["skills"][0]["goal"]
+    goal = content["policy"]["policy"]["skills"][0]["goals"]
+    low, high = ({"array": x, "dtype": "float32"} for x in (-1.0, 1.0))
     assert goal["space"] == {
-        "type": "Box", "shape": [2], "dtype": "float32", "low": -1.0, "high": 1.0
+        "type": "Space", "kind": "Box", "dtype": "float32", "shape": [2], "low": low, "high": high
     }  # fmt: skip
     loaded = sw.load_policy(tmp_path, code=export.functions)
     assert loaded.skills.skills[0].goal_space == GoTo.goal_space
-    goal["space"]["low"] = 3.0
+    goal["space"]["low"]["array"] = 3.0
     file.write_text(json.dumps(content))
-    with pytest.raises(RunError, match=r"policy.skills\[0\].goal.space: not a space"):
+    with pytest.raises(RunError, match=r"policy.skills\[0\].goals.space: .* is no space"):
         sw.load_policy(tmp_path, code=export.functions)
 
 
@@ -327,20 +326,20 @@ AT = {"at": np.zeros((1, 2)), "side": np.zeros(1, int)}
 @pytest.mark.parametrize(
     ("space", "returned", "says"),
     [
-        ("box", chosen("go_to"), "'go_to' has goals, but the selector gave none"),
-        ("box", chosen("go_to", np.full((1, 2), 3.0)), "is out of its space"),
-        ("box", chosen("go_to", np.full((1, 2), np.nan)), "is out of its space"),
-        ("box", chosen("go_to", np.zeros((1, 3))), r"'go_to' has goals of .*Box.*: cannot reshape"),
-        ("box", chosen("go_to", [["a", "b"]]), r"'go_to' has goals of .* could not convert"),
-        ("box", chosen("go_to", {"go": np.zeros((1, 2))}), r"'go_to' has goals of .* given {'go'"),
-        ("box", chosen("go_to", {"rest": 1, "go_to": 2}), r"{skill: goals}, .* goals: go_to"),
-        ("box", chosen("goto", np.zeros((1, 2))), "the selector chose goto; it may .* go_to, rest"),
-        ("box", chosen(-1), "the selector chose -1; it may choose go_to, rest"),
-        ("number", chosen("go_to", np.full(1, 2.5)), "2.5 is not of int64"),
-        ("dict", chosen("go_to", {"at": AT["at"]}), r"'go_to' has goals of .* 'side'"),
-        ("dict", chosen("go_to", {**AT, "side": np.full(1, 2)}), "is out of its space"),
-        ("tuple", chosen("go_to", [AT["at"]]), r"'go_to' has goals of .*shorter"),
-        ("tuple", chosen("go_to", [*AT.values(), 1]), r"'go_to' has goals of .*longer"),
+        ("box", chosen("go_to"), "chose skill 'go_to' without a goal"),
+        ("box", chosen("go_to", np.full((1, 2), 3.0)), "is out of goal_space"),
+        ("box", chosen("go_to", np.full((1, 2), np.nan)), "is out of goal_space"),
+        ("box", chosen("go_to", np.zeros((1, 3))), r"goals of shape \(1, 3\) for skill 'go_to'"),
+        ("box", chosen("go_to", [["a", "b"]]), "goals of .* 'go_to' are|are numbers"),
+        ("box", chosen("go_to", {"go": np.zeros((1, 2))}), "'go', which is no skill"),
+        ("box", chosen("go_to", {"rest": 1, "go_to": 2}), "'rest', which has no goals"),
+        ("box", chosen("goto", np.zeros((1, 2))), "'goto', which is no skill .*go_to, rest"),
+        ("box", chosen(-1), "returned -1, which is no action of Discrete"),
+        ("number", chosen("go_to", np.full(1, 2.5)), "are whole numbers"),
+        ("dict", chosen("go_to", {"at": AT["at"]}), "'at', 'side' was expected"),
+        ("dict", chosen("go_to", {**AT, "side": np.full(1, 2)}), "is out of goal_space"),
+        ("tuple", chosen("go_to", [AT["at"]]), "a tuple of 2 parts was expected"),
+        ("tuple", chosen("go_to", [*AT.values(), 1]), "a tuple of 2 parts was expected"),
     ],
 )
 def test_wrong_goals_are_said_by_the_runner(
@@ -351,7 +350,7 @@ def test_wrong_goals_are_said_by_the_runner(
     env, policy = made(walk, Rest, selector=lambda obs: np.full(len(obs), "rest"))
     export = write_export(tmp_path, policy, "point")
     functions = export.functions | {"selector": returned}
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(SkillError, match=says):
         Runner(tmp_path, functions).act(env.reset(seed=0)[0])
 
 
@@ -359,7 +358,7 @@ def test_goals_of_two_skills_are_given_by_name(tmp_path: Path) -> None:
     env, policy = made(go_to(), Side(), selector=each)
     export = write_export(tmp_path, policy, "point")
     functions = export.functions | {"selector": lambda obs, last: chosen("go_to", -obs / 2)(obs)}
-    with pytest.raises(ValueError, match=r"give {skill: goals}, of skills with goals: go_to, side"):
+    with pytest.raises(SkillError, match="go_to, side have goals"):
         Runner(tmp_path, functions).act(env.reset(seed=0)[0])
 
 
@@ -367,5 +366,5 @@ def test_a_clipped_goal_of_another_shape_is_said(tmp_path: Path) -> None:
     env, policy = made(Reaching, selector=far)
     export = write_export(tmp_path, policy, "point")
     functions = export.functions | {"go_to.clip_goal": lambda obs, goal: goal[:, :1]}
-    with pytest.raises(ValueError, match=r"'go_to' has goals of .*Box.*: cannot reshape"):
+    with pytest.raises(SkillError, match=r"clip_goal\(\) gave goals of shape \(1, 1\)"):
         Runner(tmp_path, functions).act(env.reset(seed=0)[0])

@@ -13,8 +13,8 @@ from skills.mapped_models import ACTION, CASES, SPACE, observations
 import skillweave as sw
 from skillweave.api.player import Player
 from skillweave.errors import PolicyError
+from skillweave.export.foreign import as_file
 from skillweave.export.runner import Runner
-from skillweave.export.states import States
 from skillweave.export.write import write_export
 from skillweave.types import Array
 
@@ -121,4 +121,4 @@ def test_what_the_runner_cannot_sample_says_what_to_do() -> None:
 
     policy = sw.from_sb3(sb3.PPO("MlpPolicy", "CartPole-v1", device="cpu"))
     with pytest.raises(PolicyError, match=r"policy of 'x' samples by .*greedy_skills=True"):
-        States(policy.action_space).policy(policy, "x", sampled=True)
+        as_file(policy.in_place, "the policy of 'x'", sampled=True)

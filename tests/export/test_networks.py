@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SkillweaveError
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.api.player import Player
-from skillweave.export import runner as runner_module
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
@@ -201,14 +201,32 @@ def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> N
         agent_graph(agent(*CASES["ppo, normalised"]), False, "it")
 
 
-def test_the_runner_is_short_and_needs_numpy_and_onnxruntime_alone() -> None:
-    source = Path(runner_module.__file__).read_text()
-    assert len(source.splitlines()) <= 850
+def test_what_acts_in_an_export_needs_numpy_and_onnxruntime_alone(tmp_path: Path) -> None:
+    write_export(tmp_path, agent(*CASES["ppo, normalised"]), "toy")
     found = set()
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            found |= {a.name.split(".")[0] for a in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level
-            found.add((node.module or "").split(".")[0])
+    for file in tmp_path.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {a.name.split(".")[0] for a in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                found.add((node.module or "").split(".")[0])
     assert found - set(sys.stdlib_module_names) == {"numpy", "onnxruntime"}
+
+
+def test_two_runners_are_loaded_by_their_paths(tmp_path: Path) -> None:
+    """Each acts by the package beside it."""
+    config, obs, actions = CASES["ppo, normalised"]
+    found = []
+    for seed in range(2):
+        policy, folder = agent(config, obs, actions, seed=seed), tmp_path / str(seed)
+        write_export(folder, policy, "toy")
+        spec = importlib.util.spec_from_file_location(f"runner_{seed}", folder / "runner.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        runner, player = module.Runner(folder), Player(policy)
+        for one in one_by_one(obs, 5):
+            assert same(runner.act(one), player.act(one))
+        found.append(sys.modules[type(runner).__mro__[1].__module__].__file__)
+    assert [str(tmp_path / str(seed)) in path for seed, path in enumerate(found)] == [True, True]

@@ -15,7 +15,7 @@ from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
 from skillweave.api.policies import load_policy
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.errors import PolicyError
+from skillweave.errors import PolicyError, SkillError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -28,6 +28,8 @@ from skillweave.planning import (
     held,
     record_calls,
 )
+from skillweave.policies.codec import read_folder
+from skillweave.policies.core import Turn, World
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -130,7 +132,7 @@ def test_the_runner_acts_as_the_planner(
     bound = planner.among(names).bind(NOISY.spaces.observation, choices, "selector")
     policy = HierarchyPolicy(bound, skills)
     export = write_export(tmp_path, policy, "corridor")
-    assert "selector.npz" in export.files
+    assert "arrays.npz" in export.files
     runner, player = Runner(tmp_path, code=export.functions), Player(policy)
     calls_fail = 0
     for seed in range(3):
@@ -139,8 +141,8 @@ def test_the_runner_acts_as_the_planner(
             assert acted == played(env(), player, seed)
             calls_fail += acted != played(Noisy(), runner, seed)
     assert calls_fail, "the wall changes what is done"
-    with pytest.raises(PolicyError, match="is a plan, which only the runner beside it acts by"):
-        load_policy(tmp_path, code=export.functions)
+    loaded = Player(load_policy(tmp_path, code=export.functions))
+    assert played(Walled(), loaded, 0) == played(Walled(), player, 0)
 
 
 def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Path) -> None:
@@ -157,7 +159,7 @@ def test_features_and_goals_of_an_export(logs: dict[bool, CallLog], tmp_path: Pa
         exported(planner)
     planner = Planner(logs[False], at_four, features=lambda obs: np.stack([obs[:, PLACE] ** 2], 1))
     export = exported(planner)
-    assert export.code["selector.features.wait"] == "observations (1, ...) to features (1, F)"
+    assert export.code["selector.features"] == "observations (n, ...) to features (n, F)"
     played(Noisy(), Runner(tmp_path, code=export.functions), 1)
 
 
@@ -233,11 +235,7 @@ def acted_in(env: Any, policy: Any, actor: Any, seed: int) -> list[Any]:
     found, reward, over = [], None, False
     while not over:
         action = actor.act(obs, reward=reward, info=info)
-        if isinstance(actor, Runner):
-            skill, goal = actor.root.skill, actor.root.goal
-            goal = None if goal is None else goal[0]
-        else:
-            skill, goal = int(actor.memory["skill"][0]), policy.goal_now(actor.memory)
+        skill, goal = int(actor.memory["skill"][0]), policy.goal_now(actor.memory)
         found.append((skill, str(goal), action.tolist()))
         obs, reward, terminated, truncated, info = env.step(action)
         over = terminated or truncated
@@ -261,7 +259,7 @@ def test_the_runner_chooses_the_goals_of_a_plan(case: str, tmp_path: Path) -> No
         calls_fail += plain[0] != fenced[0]
     assert len(goals) > 2
     assert calls_fail, "the fence changes what is done"
-    is_apart = [options == 1 for _, options in runner.root.selector.entry["groups"]]
+    is_apart = [group.options == 1 for group in policy.selector.in_place.options.groups]
     assert all(is_apart) == (case in ("few goals", "few numbers"))
 
 
@@ -302,8 +300,8 @@ def test_a_plan_that_must_call_a_skill_that_was_never_called_says_so(tmp_path: P
     runner = Runner(tmp_path, code=export.functions)
     obs, _ = Point().reset(seed=0)
     runner.act(obs)
-    assert runner.root.skill == 1
-    runner.root.may_start = lambda: np.array([True, False])
-    runner.reset()
-    with pytest.raises(ValueError, match=r"skill 'go_to' has goals, but .* gave none"):
-        runner.act(obs)
+    assert runner.memory["skill"].tolist() == [1]
+    planned = read_folder(tmp_path, export.functions)[0].policy.selector
+    only = Turn(World(), np.array([[True, False]]))
+    with pytest.raises(SkillError, match=r"chose skill 'go_to' without a goal .* so record some"):
+        planned.act(planned.start(1), np.arange(1), obs[None], only)

@@ -19,6 +19,7 @@ from skillweave import PPO, EnvSpec, Hierarchy, Network, from_function
 from skillweave.api.player import Player
 from skillweave.cli import main
 from skillweave.errors import DeclarationError
+from skillweave.hierarchy.policy import HierarchyPolicy
 
 torch.set_num_threads(1)
 
@@ -69,14 +70,15 @@ def test_the_command_exports_and_its_runner_runs_without_the_library(
 ) -> None:
     pytest.importorskip("onnxscript")
     run = Hierarchy.pretrained("lunar-lander")
-    run.policy.skills = replace(run.policy.skills, greedy=True)  # by chance both would differ
+    greedy = replace(run.policy.skills, greedy=True)  # by chance both would differ
+    run.policy = HierarchyPolicy(run.policy.selector, greedy)
     weights, out = run.save_weights(tmp_path / "w.safetensors"), tmp_path / "out"
     ask = ["export", str(weights), "--recipe", "lunar-lander", "-o", str(out)]
     assert main(ask) == 1
     assert "--onnx" in capsys.readouterr().err
     assert main([*ask, "--onnx", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["code"] == {"engines off.condition": "observations (1, ...) to (1,) bool"}
+    assert told["code"] == {"engines off.condition": "observations (n, ...) to (n,) bool"}
     obs = np.random.default_rng(0).normal(size=(30, 8)).astype(np.float32)
     wanted = [int(run.act(x)) for x in obs]
     program = f"""
@@ -92,6 +94,20 @@ print([int(runner.act(x)) for x in {obs.tolist()}])
     done = subprocess.run(command, cwd=out, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == wanted
     assert len(set(wanted)) > 1
+
+
+def test_a_nan_is_an_error_unless_it_is_to_be_a_zero() -> None:
+    policy = agent(PPO(network=Network((8,))), NESTED, gym.spaces.Discrete(4))
+    for good in one_by_one(NESTED, 20):
+        kind, place = good["inner"]
+        bad, zero = ({**good, "inner": (kind, np.array([place[0], x]))} for x in (np.nan, 0.0))
+        with pytest.raises(
+            DeclarationError, match=r"with NaN in obs\['inner'\]\['1'\].*nan=\"zero"
+        ):
+            Player(policy).act(bad)
+        assert Player(policy, nan="zero").act(bad) == Player(policy).act(zero)
+    with pytest.raises(DeclarationError, match=r"nan is 'mean'; it must be"):
+        Player(policy, nan="mean")  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("no_trials")

@@ -14,12 +14,12 @@ import torch
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
 
-from skillweave import PPO, RNN, Automaton, Network, Reflex, tree
+from skillweave import PPO, RNN, Automaton, Network, Reflex
 from skillweave.algorithms.config import SkillCritic
 from skillweave.api.player import Player
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import PolicyError
-from skillweave.export import states
+from skillweave.export import compile
 from skillweave.export.graphs import agent_graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
@@ -40,7 +40,7 @@ def traced_before(policy: Any, sampled: bool) -> Any:
 @pytest.fixture(autouse=True)
 def traced_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tracing takes a second, and these policies share their networks."""
-    monkeypatch.setattr(states, "agent_graph", lambda p, sampled, _: traced_before(p, sampled))
+    monkeypatch.setattr(compile, "agent_graph", lambda p, sampled, _: traced_before(p, sampled))
 
 
 class LongWalk(Walk):
@@ -153,7 +153,7 @@ def played(policy: HierarchyPolicy, runner: Runner, episodes: int) -> list[tuple
             action = player.act(obs, reward=reward, info=info)
             assert runner.act(obs, reward=reward, info=info) == action
             memory = player.memory
-            assert runner.root.skill == memory["skill"][0]
+            assert runner.memory["skill"][0] == memory["skill"][0]
             told.append((int(memory["skill"][0]), int(action), memory["elapsed"][0] == 0))
             obs, reward, terminated, truncated, info = env.step(action)
             over = terminated or truncated
@@ -177,11 +177,11 @@ def test_code_that_is_missing_is_named_with_what_it_is(tmp_path: Path) -> None:
     export = write_export(tmp_path, policy, "walk")
     needs = {"careful.initiation", "careful.termination", "careful.policy", "left.policy"}
     assert set(export.code) == needs | {"shy.condition"}
-    assert "'shy.condition': observations (1, ...) to (1,) bool" in str(export)
-    with pytest.raises(ValueError, match=r"shy\.condition.*observations .* bool"):
+    assert "'shy.condition': observations (n, ...) to (n,) bool" in str(export)
+    with pytest.raises(PolicyError, match=r"shy\.condition.*observations .* bool"):
         Runner(tmp_path)
     assert set(export.functions) == set(export.code)
-    assert Runner(tmp_path, export.functions).root is not None
+    assert Runner(tmp_path, export.functions).act(np.zeros(4, np.float32)) in range(3)
 
 
 def test_two_functions_of_one_name_are_told_apart(tmp_path: Path) -> None:
@@ -194,9 +194,6 @@ def test_what_cannot_be_exported_says_what_to_do(tmp_path: Path) -> None:
     policy = trained(skill_set(Counter, Left))
     with pytest.raises(PolicyError, match=r"policy of 'counter'.*memory.*train the skill"):
         write_export(tmp_path, policy, "walk")
-    chosen = ready(tree.Fallback("free", "left"), skill_set(Left, Free))
-    with pytest.raises(PolicyError, match=r"selector is a tree.*Automaton"):
-        write_export(tmp_path, chosen, "walk")
     assert not list(tmp_path.iterdir())
 
 
@@ -243,12 +240,16 @@ def test_networks_from_elsewhere_are_exported_too(tmp_path: Path) -> None:
 def test_a_selector_that_samples_in_any_case_samples_when_exported(tmp_path: Path) -> None:
     policy = trained(skill_set(Free, Left, greedy_selector=False))
     write_export(tmp_path, policy, "walk")
-    told = json.loads((tmp_path / "policy.json").read_text())["policy"]
+    told = json.loads((tmp_path / "policy.json").read_text())["policy"]["policy"]
     assert told["selector"]["noise"] == [["gumbel", 2]]
-    assert told["skills"][0]["policy"]["noise"] == []
-    chosen = ready(AUTOMATON, skill_set(Careful, Left, Zigzag, Right, greedy_selector=False))
-    with pytest.raises(PolicyError, match=r"is an automaton that draws .*greedy_selector"):
-        write_export(tmp_path / "other", chosen, "walk")
+    assert "noise" not in told["skills"][0]["policy"]
+    skills = skill_set(Careful, Left, Zigzag, Right, greedy_selector=False)
+    export = write_export(tmp_path / "other", ready(AUTOMATON, skills), "walk")
+    far_left = np.array([-8.0, 0, 0, 0], np.float32)
+    runners = [Runner(tmp_path / "other", export.functions, seed=seed) for seed in range(20)]
+    assert all(runner.act(far_left) in range(3) for runner in runners)
+    drawn = {int(runner.memory["skill"][0]) for runner in runners}
+    assert len(drawn) == 2  # of the skills of its first state
 
 
 @pytest.mark.slow
@@ -256,8 +257,8 @@ def test_skills_that_sample_draw_as_often_as_their_network_says(tmp_path: Path) 
     policy = trained(skill_set(Free, greedy=False))
     export = write_export(tmp_path, policy, "walk")
     told = json.loads((tmp_path / "policy.json").read_text())
-    assert told["policy"]["skills"][0]["policy"]["noise"] == [["gumbel", 3]]
-    assert export.files == ("selector.onnx", "free.onnx", "policy.json", "runner.py")
+    assert told["policy"]["policy"]["skills"][0]["policy"]["noise"] == [["gumbel", 3]]
+    assert export.files[:4] == ("selector.onnx", "free.onnx", "policy.json", "runner.py")
     obs, runner = np.array([1.0, 0.5, 2.0, 0.0], np.float32), Runner(tmp_path, seed=0)
     head = Free.policy.heads(obs[None])[0]
     wanted = np.exp(head - head.max()) / np.exp(head - head.max()).sum()

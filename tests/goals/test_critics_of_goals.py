@@ -15,11 +15,11 @@ import skillweave as sw
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet, hierarchy_of
-from skillweave.policies.core import INTERRUPTED, RUNNING
-from skillweave.policies.hierarchy import Interruption
+from skillweave.policies.core import INTERRUPTED, RUNNING, Policy
+from skillweave.policies.hierarchy import CalledSkill, Hierarchy, Interruption
 from skillweave.seeding import Seeds
-from skillweave.skills.goal_spaces import draw_from, goals_space, with_goal
-from skillweave.skills.goals import CallGoals, goals_of
+from skillweave.skills.goal_spaces import draw_from, with_goal
+from skillweave.skills.goals import goals_of
 from skillweave.types import Step
 
 SELECTOR = sw.PPO(num_envs=4, n_steps=64, batch_size=16, update_epochs=2, network=SMALL)
@@ -28,7 +28,7 @@ TOGETHER: Any = {"selector": SELECTOR, "learn": "together", "train_defaults": OF
 
 
 def random_critic(space: Any, goals: dict[str, Any], **how: Any) -> AgentPolicy:
-    seen = with_goal(space, goals_space(goals))
+    seen = with_goal(space, gym.spaces.Dict(list(goals.items())))
     settings = SkillCritic(network=SMALL, sees_goals=True, deciding=True, normalize_obs=False)
     algorithm = make_algorithm(settings, seen, gym.spaces.Discrete(2))
     policy = AgentPolicy.of(algorithm, algorithm.init([Seeds(0)]))
@@ -39,6 +39,13 @@ def random_critic(space: Any, goals: dict[str, Any], **how: Any) -> AgentPolicy:
     return AgentPolicy(algorithm, weights)
 
 
+def of_skills(goals: dict[int, Any]) -> Hierarchy:
+    skills = (
+        CalledSkill(of.skill.name, of.skill.name, Policy(), goals=of) for of in goals.values()
+    )
+    return Hierarchy(None, tuple(skills))
+
+
 @pytest.mark.parametrize("space", ["box", "number", "dict", "picture"])
 def test_what_a_skill_is_worth_depends_on_its_goal_and_a_decision_does_not(space):
     critic = random_critic(Point.observation_space, {"go_to": SPACES[space]})
@@ -46,7 +53,7 @@ def test_what_a_skill_is_worth_depends_on_its_goal_and_a_decision_does_not(space
     assert goals is not None
     values = draw_from(SPACES[space], 20, np.random.default_rng(0))
     obs = np.tile(np.float32([0.3, -0.4]), (20, 1))
-    seen = CallGoals({0: goals}).join(obs, np.zeros(20, int), {0: values})
+    seen = of_skills({0: goals}).beside_calls(obs, np.zeros(20, int), {0: values})
     worth = critic.heads(seen)
     assert worth.shape == (20, 3)
     assert len(np.unique(worth[:, 0].round(4))) > 1
@@ -57,7 +64,7 @@ def test_goals_of_skills_that_do_not_run_are_not_seen():
     goals = {i: goals_of(go_to("box", name=f"go{i}")) for i in range(2)}
     obs, running = np.zeros((2, 2), np.float32), np.array([0, 1])
     mine = {i: np.full((2, 2), i + 0.5, np.float32) for i in range(2)}
-    seen = CallGoals(goals).join(obs, running, mine)["goal"]
+    seen = of_skills(goals).beside_calls(obs, running, mine)["goal"]
     assert seen["go0"].tolist() == [[0.5, 0.5], [0, 0]]
     assert seen["go1"].tolist() == [[0, 0], [1.5, 1.5]]
 

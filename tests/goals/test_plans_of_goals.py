@@ -100,10 +100,8 @@ def test_fewer_calls_than_options() -> None:
     log.goals["go"] = np.arange(1.0, 6.0)[:, None]
     planner = bound(Planner(log, at(1), neighbours=2, caution=0.0), LINE)
     obs = np.float32([[4], [0]])
-    assert (
-        np.isfinite(planner._values(planner.graph.near(obs), obs, planner.machine.start(2))).sum()
-        == 10
-    )
+    near, corners = planner.graph.near(obs), planner.states.corners(planner.machine.start(2))
+    assert np.isfinite(planner.in_place.valued(near, obs, corners)).sum() == 10
     q = planner.values(obs)[:, 0]
     assert q[1] > q[0]
     choice, _ = planner.act(planner.start(2), obs)

@@ -59,11 +59,24 @@ def test_other_algorithms_say_which_one_can(algorithm, tmp_path):
         sw.train_agent(on("dict"), algorithm, 100, tmp_path / "run", quiet=True)
 
 
-def test_an_export_is_refused(tmp_path):
-    pytest.importorskip("onnx")
+def test_an_export_acts_as_here(tmp_path):
+    pytest.importorskip("onnxscript")
     run = sw.train_agent(on("dict"), ON, 64, tmp_path / "run", quiet=True)
-    with pytest.raises(sw.PolicyError, match=r"actions of Dict.* cannot be exported"):
-        run.export(tmp_path / "export")
+    export, env = run.export(tmp_path / "export"), Reach("dict")
+    assert export.code == {}
+    actors = [run.player(), Runner(export.path), sw.Player(sw.load_policy(export.path))]
+    told = set()
+    obs, _ = env.reset(seed=0)
+    for _ in range(20):
+        action, *others = (actor.act(obs) for actor in actors)
+        assert env.action_space.contains(action)
+        for other in others:
+            assert {k: np.round(x, 4).tolist() for k, x in other.items()} == {
+                k: np.round(x, 4).tolist() for k, x in action.items()
+            }
+        told.add(str(action))
+        obs, *_ = env.step(action)
+    assert len(told) > 5
 
 
 def declared(name: str) -> sw.Hierarchy:

@@ -17,6 +17,7 @@ import skillweave as sw
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.infos import checked_mask, random_actions
 from skillweave.networks.heads import head_of
+from skillweave.policies.spaces import space_of
 from skillweave.spaces import action_codec, env_form, obs_dtype, obs_shape, put_observation
 
 often = reports_every(40)
@@ -62,7 +63,7 @@ def _numbers(action: Any, space: Any) -> Any:
     codec = action_codec(space)
     packed = np.zeros((1, *obs_shape(space)), obs_dtype(space))
     put_observation(space, packed, 0, action)
-    return np.cumsum([0, *codec.counts[:-1]]) + codec.choices_in(packed)[0]
+    return np.cumsum([0, *codec.counts[:-1]]) + space_of(space).choices_in(packed)[0]
 
 
 def masked(kind: str = "dict", form: str = "parts") -> sw.EnvSpec:
@@ -192,7 +193,7 @@ def test_a_mask_of_a_tuple_may_be_one_list():
     assert checked_mask([1, 0, 1, 1, 0], space).tolist() == expected
     assert checked_mask([[1, 0], (1, 1, 0)], space).tolist() == expected
     assert checked_mask((None, [1, 1, 0]), space).tolist() == [True, True, True, True, False]
-    with pytest.raises(ValueError, match=r"has 3 parts, but actions of .* have 2"):
+    with pytest.raises(ValueError, match=r"has the parts \['0', '1', '2'\], but .* have '0', '1'"):
         checked_mask(([1, 0], [1, 1, 1], [1]), space)
 
 

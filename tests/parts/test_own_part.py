@@ -11,7 +11,7 @@ from crane import Crane
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 import skillweave as sw
-from skillweave.skills.own_part import OwnPart, Rest, part_from_json, part_to_json
+from skillweave.skills.own_part import OwnPart, part_from_json, part_to_json, rest_of
 from skillweave.spaces import pack
 
 OBS = Crane.observation_space
@@ -48,8 +48,8 @@ def observations(n: int = 4) -> Any:
 def test_what_it_sees_is_in_its_space(sees, space):
     own, obs = part(sees), observations()
     assert own.observation_space == space
-    seen = own.see(obs)
-    again = own.see(obs.reshape(2, 2))
+    seen = own.part.see(obs)
+    again = own.part.see(obs.reshape(2, 2))
     assert again.reshape(seen.shape).tobytes() == seen.tobytes()
     for row in range(4):
         one: Any = seen[row]
@@ -60,12 +60,12 @@ def test_what_it_sees_is_in_its_space(sees, space):
 
 def test_parts_are_joined_in_their_order():
     obs = observations()
-    seen = part(("hook", "arm", "mode", lambda o: 2 * o["hook"])).see(obs)
+    seen = part(("hook", "arm", "mode", lambda o: 2 * o["hook"])).part.see(obs)
     assert (seen[:, :1] == obs["hook"]).all()
     assert (seen[:, 1:3] == obs["arm"]).all()
     assert (seen[:, 3:6].argmax(1) == obs["mode"]).all()
     assert (seen[:, 6:] == 2 * obs["hook"]).all()
-    scaled = part(sw.Part("arm", offset=1.0, scale=2.0)).see(obs)
+    scaled = part(sw.Part("arm", offset=1.0, scale=2.0)).part.see(obs)
     assert np.allclose(scaled, 2 * (obs["arm"] - 1))
 
 
@@ -74,11 +74,12 @@ PLACES = (2, 0), [2, 0], np.array([2, 0]), range(2, -1, -2)
 
 @pytest.mark.parametrize("places", PLACES)
 def test_places_are_given_in_the_same_kinds_everywhere(places):
-    flat = part(slice(0, 3)).see(observations())
-    assert part(places).see(observations()).tolist() == flat[:, [2, 0]].tolist()
-    joined = part(("hook", places)).see(observations())
+    flat = part(slice(0, 3)).part.see(observations())
+    assert part(places).part.see(observations()).tolist() == flat[:, [2, 0]].tolist()
+    joined = part(("hook", places)).part.see(observations())
     assert joined[:, 1:].tolist() == flat[:, [2, 0]].tolist()
-    assert part(sw.Part(places=places)).inputs[""].sources == part(places).inputs[""].sources
+    again = part(sw.Part(places=places)).part.see(observations())
+    assert again.tolist() == flat[:, [2, 0]].tolist()
     assert mine(sees=places, acts=places).validate() is None
     outside = sw.from_function(lambda x: x, sees=places, acts=places).mapping
     assert outside == sw.from_function(lambda x: x, sees=(2, 0), acts=(2, 0)).mapping
@@ -86,7 +87,7 @@ def test_places_are_given_in_the_same_kinds_everywhere(places):
 
 @pytest.mark.parametrize("place", [2, np.int64(2)])
 def test_a_place_alone_is_given_everywhere(place):
-    assert part(place).see(observations()).shape == (4, 1)
+    assert part(place).part.see(observations()).shape == (4, 1)
     assert part(acts=place).action_space == Box(BOX.low[[2]], BOX.high[[2]], dtype=np.float32)
     assert sw.from_function(lambda x: x, acts=place).mapping.acts == sw.Acts(to=(2,))
     assert sw.Part(places=place) == sw.Part(places=(2,))
@@ -96,7 +97,7 @@ def test_a_place_alone_is_given_everywhere(place):
 def test_its_numbers_of_a_box(acts):
     own = part(acts=acts, rest=(0.0, 1.5, 0.0))
     assert own.action_space == Box(BOX.low[[2, 0]], BOX.high[[2, 0]], dtype=np.float32)
-    action = own.write(np.array([[0.5, -0.5]], np.float32), None)
+    action = own.part.write(np.array([[0.5, -0.5]], np.float32), None)
     assert action.dtype == np.float32
     assert action.tolist() == [[-0.5, 1.5, 0.5]]
 
@@ -104,7 +105,7 @@ def test_its_numbers_of_a_box(acts):
 def test_its_numbers_of_a_matrix():
     space = Box(-1, 1, (2, 2), np.float64)
     own = part(acts=slice(1, 3), space=space, rest=0.25)
-    action = own.write(np.array([[0.5, -0.5]]), None)
+    action = own.part.write(np.array([[0.5, -0.5]]), None)
     assert action.tolist() == [[[0.25, 0.5], [-0.5, 0.25]]]
     assert space.contains(action[0])
 
@@ -113,30 +114,30 @@ def test_its_choices_of_several():
     space = MultiDiscrete([3, 4, 2], start=[1, 0, 5])
     own = part(acts=(2, 0), space=space, rest=(1, 3, 5))
     assert own.action_space == MultiDiscrete([2, 3], start=[5, 1])
-    action = own.write(np.array([[6, 3]]), None)
+    action = own.part.write(np.array([[6, 3]]), None)
     assert action.tolist() == [[3, 3, 6]]
     assert action.dtype == space.dtype
     mask = np.ones((1, 9), bool)
     mask[0, [1, 7]] = False  # the second choice of place 0, the first of place 2
-    assert own.mask(mask).tolist() == [[False, True, True, False, True]]
+    assert own.part.mask(mask).tolist() == [[False, True, True, False, True]]
 
 
 def test_its_bits():
     own = part(acts=(1,), space=MultiBinary(3), rest="hold")
     assert own.action_space == MultiBinary(1)
     last = np.array([[1, 1, 0]], np.int8)
-    assert own.write(np.array([[0]], np.int8), last).tolist() == [[1, 0, 0]]
+    assert own.part.write(np.array([[0]], np.int8), last).tolist() == [[1, 0, 0]]
     mask = np.array([[1, 1, 0, 1, 1, 0]], bool)
-    assert own.mask(mask).tolist() == [[False, True]]
+    assert own.part.mask(mask).tolist() == [[False, True]]
 
 
 def test_its_choices_of_one():
     space = Discrete(5, start=10)
     own = part(acts=(4, 1), space=space)
     assert own.action_space == Discrete(2)
-    assert own.write(np.array([0, 1, 0]), None).tolist() == [14, 11, 14]
+    assert own.part.write(np.array([0, 1, 0]), None).tolist() == [14, 11, 14]
     mask = np.array([[1, 1, 1, 1, 0], [0, 0, 0, 0, 0]], bool)
-    assert own.mask(mask).tolist() == [[False, True], [True, True]]  # all where none is left
+    assert own.part.mask(mask).tolist() == [[False, True], [True, True]]  # all where none is left
 
 
 ROBOT = Dict(
@@ -150,33 +151,33 @@ def test_its_names_of_a_dict():
     assert own.action_space == ROBOT["arm"]
     last = pack(ROBOT, {"arm": {"joints": np.ones((1, 2)), "brake": [1]}, "hand": [[0.5]]})
     mine = pack(ROBOT["arm"], {"joints": np.full((1, 2), 0.25), "brake": [0]})
-    action = own.write(mine, last)
+    action = own.part.write(mine, last)
     assert action["arm"]["joints"].tolist() == [[0.25, 0.25]]
     assert action["arm"]["brake"].tolist() == [0]
     assert action["hand"].tolist() == [[0.5]]
     two = part(acts=("arm.brake", "hand"), space=ROBOT)
     assert two.action_space == Dict({"arm.brake": Discrete(2), "hand": ROBOT["hand"]})
     alone = part(acts="arm.joints", space=ROBOT)
-    action = alone.write(np.full((1, 2), 0.5, np.float32), None)
+    action = alone.part.write(np.full((1, 2), 0.5, np.float32), None)
     assert action["arm"]["joints"].tolist() == [[0.5, 0.5]]
     assert action["hand"].tolist() == [[0.0]]
 
 
 @pytest.mark.parametrize("space", [BOX, MultiDiscrete([3, 4, 2]), MultiBinary(3), ROBOT])
 def test_the_last_action_is_held_as_it_was(space):
-    rest = Rest("hold", space)
+    names = tuple(space) if space is ROBOT else slice(None)
+    held = part(acts=names, rest="hold", space=space).part
     batch = gym.vector.utils.batch_space(space, 3)
     batch.seed(0)
     actions = pack(space, batch.sample())
-    assert rest.filled(3, actions).tobytes() == actions.tobytes()
-    assert rest.start(0).shape == (0, *rest.start(2).shape[1:])
+    assert held.filled(3, actions).tobytes() == actions.tobytes()
 
 
 def test_zero_is_the_nearest_to_zero():
     low, high = np.array([1.0, -3.0], np.float32), np.array([2.0, -1.0], np.float32)
     space = Box(low, high)
-    assert Rest("zero", space).filled(1, None).tolist() == [[1.0, -1.0]]
-    assert Rest("zero", MultiDiscrete([3], start=[4])).filled(1, None).tolist() == [[4]]
+    assert rest_of("zero", space)[0].tolist() == [[1.0, -1.0]]
+    assert rest_of("zero", MultiDiscrete([3], start=[4]))[0].tolist() == [[4]]
 
 
 def mine(**attributes: Any) -> sw.Skill:
@@ -261,10 +262,10 @@ def test_a_misspelt_part_is_noticed(attributes, meant):
 def test_a_function_that_gives_no_number_is_an_error():
     own = part(("hook", lambda obs: np.where(obs["hook"] == 0.0, np.inf, obs["arm"])))
     obs = observations()
-    assert own.see(obs).shape == (4, 3)
+    assert own.part.see(obs).shape == (4, 3)
     obs["hook"][1] = 0.0
     with pytest.raises(sw.SkillError, match=r"skill 'x': sees gives .*inf.*finite numbers"):
-        own.see(obs)
+        own.part.see(obs)
 
 
 def test_tuples_of_actions_have_names():

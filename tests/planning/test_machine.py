@@ -98,8 +98,8 @@ def test_rewards_may_be_functions_of_a_step() -> None:
 def test_several_states_of_one_step_at_once() -> None:
     task = RewardMachine({("a", "b"): (A, 1.0), ("b", "c"): held(B, 2)}, accepting={"c"})
     every = np.array([[0, 0], [1, 0], [1, 1], [2, 0]])
-    readings = task.read(step_to([[1, 1], [0, 0]]))
-    after, reward = task.advance(np.stack([every, every]), readings)
+    readings = task.acts.read(step_to([[1, 1], [0, 0]]))
+    after, reward = task.acts.advance(np.stack([every, every]), readings)
     assert after.tolist() == [
         [[1, 0], [1, 1], [2, 0], [2, 0]],
         [[0, 0], [1, 0], [1, 0], [2, 0]],
@@ -155,7 +155,7 @@ TASKS = {
 def test_its_automaton_is_in_the_same_states(name: str) -> None:
     task = TASKS[name]
     skills = {"a": "go_a", "b": ["go_b", "wait"], "c": "no", "d": "go_d", "e": "go_d"}
-    automaton = task.automaton(skills)
+    automaton = task.automaton(skills).among(("go_a", "go_b", "wait", "no", "go_d"))
     n = 200
     rng = np.random.default_rng(0)
     state, memory = task.start(n), automaton.start(n)

@@ -332,7 +332,7 @@ def test_goals() -> None:
     assert own.of(obs).tolist() == [[3], [0]]
     assert own.put(obs, np.array([7])).tolist() == [[0, 7], [0, 7]]
     assert own.arrives(step_to(obs, obs)).tolist() == [False, True]
-    machine = own.own()
+    machine = own.at(None)
     _, reward, done = machine.step(machine.start(2), step_to(obs, obs))
     assert (reward.tolist(), done.tolist()) == ([0, 1], [False, True])
     fixed = GoalTask(near, goal=[4])

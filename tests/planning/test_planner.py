@@ -28,8 +28,9 @@ from skillweave.planning import (
     record_calls,
 )
 from skillweave.planning.neighbours import nearest, tie_order
-from skillweave.planning.states import LEVELS, PlanningStates
+from skillweave.planning.states import LEVELS, exact_states, planning_states
 from skillweave.policies.core import CallEnd
+from skillweave.policies.plan import nearest_corner
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -210,7 +211,7 @@ def test_a_counter_that_is_longer_than_a_call_leads_on() -> None:
     for steps in (100, 1_000):
         task = Mission(held(at(10), steps))
         planner = Planner(line(), task, neighbours=1, gamma=0.999, caution=0.0)
-        assert PlanningStates(task).count == min(steps, LEVELS) + 1
+        assert planning_states(task).count == min(steps, LEVELS) + 1
         counted = np.array([0, steps // 3, steps // 2, steps - 3])
         q = planner.values(at_end, np.stack([0 * counted, counted], 1))
         assert (q[:, 1] > q[:, 0]).all()
@@ -222,16 +223,17 @@ def test_levels_of_counters() -> None:
         {("a", "b"): held(at(1), 4), ("b", "c"): [held(at(1), 100), held(at(2), 3)]},
         accepting={"c"},
     )
-    states = PlanningStates(task)
+    states = planning_states(task)
+    exact = exact_states(states)
     assert states.count == 4 + 64 * 3 + 1  # fewer levels, as there would be too many
-    assert states.exact[:5].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0], [0, 3, 0], [1, 0, 0]]
+    assert exact[:5].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0], [0, 3, 0], [1, 0, 0]]
     rng = np.random.default_rng(0)
     state = np.stack([np.ones(50, int), rng.integers(100, size=50), rng.integers(3, size=50)], 1)
     places, weights = states.corners(state)
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
-    mean = (states.exact[places] * weights[..., None]).sum(1)
+    mean = (exact[places] * weights[..., None]).sum(1)
     np.testing.assert_allclose(mean, state, atol=0.51)  # a level is a whole number
-    assert (states.place(states.exact) == np.arange(states.count)).all()
+    assert (nearest_corner(*states.corners(exact)) == np.arange(states.count)).all()
 
 
 def test_every_length_is_learnt_from_the_longest() -> None:

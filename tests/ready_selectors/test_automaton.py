@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from ready_selectors.chain import NAMES, Corridor, bound, got_key, hierarchy, story
 
+import skillweave as sw
 from skillweave import Automaton
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.policies.core import CallEnd
@@ -178,3 +179,29 @@ def test_its_checksum_is_of_its_structure():
         source(STATES, dict(reversed(ARROWS.items()))),
     ]
     assert len({source(STATES, ARROWS), *others}) == len(others) + 1
+
+
+def test_a_subclass_with_another_way_to_watch_is_asked(tmp_path):
+    class Never(Automaton):
+        def watch(self, memory, step, last):
+            return memory
+
+    class One(sw.Skill):
+        call_steps = 1
+
+        def policy(self, obs):
+            return np.zeros(len(obs), int)
+
+    class Two(One):
+        pass
+
+    states, always = {"a": "one", "b": "two"}, {("a", "b"): lambda s: np.ones(len(s.reward), bool)}
+    for kind, wanted in ((Never, ["one"] * 3), (Automaton, ["one", "two", "two"])):
+        run = sw.Hierarchy("CartPole-v1", [One(), Two()], selector=kind(states, always)).train(
+            tmp_path / kind.__name__, quiet=True
+        )
+        player, seen = run.player(), []
+        for _ in range(3):
+            player.act(np.zeros(4, np.float32))
+            seen.append(run.policy.acts(player.memory))
+        assert seen == wanted

@@ -35,7 +35,7 @@ def made(root: Any, names: tuple[str, ...] = ABC) -> TreeSelector:
 def told(policy: Any, memory: Any, succeeded: Any) -> Any:
     """The memory after calls that ended so."""
     why = np.full(len(succeeded), CallEnd.OWN, np.int8)
-    called = np.array(policy._plan.skills)[memory["leaf"]]
+    called = policy.in_place.skill_of[memory["leaf"]]
     return policy.watch(memory, None, LastCall(called, why, np.array(succeeded)))
 
 

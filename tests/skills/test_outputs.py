@@ -5,9 +5,17 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from skillweave.errors import SkillweaveError
-from skillweave.skills.outputs import checked_actions, decoded
+from skillweave.policies.core import Turn, World
+from skillweave.policies.mapped import Outputs
+from skillweave.policies.spaces import space_of
 
 UNIT = Box(-1.0, 1.0, (2, 3), np.float32)
+
+
+def decoded(output, n, space, who, *, mask=None, deterministic=True, rng=None):
+    """Actions for the outputs of a network."""
+    outputs = Outputs(space_of(space), logits=True, who=who)
+    return outputs(output, n, mask, Turn(World(rng), mask, None, deterministic))[0]
 
 
 @pytest.mark.parametrize(
@@ -31,14 +39,14 @@ UNIT = Box(-1.0, 1.0, (2, 3), np.float32)
 )
 def test_what_is_no_action_is_said_with_the_space(value, space, says):
     with pytest.raises(SkillweaveError, match=f"skill 'x'.*{says}") as raised:
-        checked_actions(value, 2, space, "skill 'x'")
+        space_of(space).actions(value, 2, "skill 'x'")
     assert str(space) in str(raised.value) or "NaN" in says
 
 
 def test_what_is_an_action_gets_the_type_of_the_space_and_a_box_its_bounds():
-    found = checked_actions([True, False], 2, Discrete(2), "")
+    found = space_of(Discrete(2)).actions([True, False], 2, "")
     assert (found.dtype, found.tolist()) == (np.int64, [1, 0])
-    found = checked_actions(np.full((1, 2, 3), 7), 1, UNIT, "")
+    found = space_of(UNIT).actions(np.full((1, 2, 3), 7), 1, "")
     assert (found.dtype, found.min()) == (np.float32, 1.0)
 
 

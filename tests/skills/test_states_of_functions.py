@@ -19,13 +19,12 @@ from skillweave.notices import collected_notices
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall
 from skillweave.selectors import Automaton, ready_selector
-from skillweave.selectors.base import goals_at
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import check_spaces
+from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
 from skillweave.skills.outputs import called
-from skillweave.skills.plan import numbers_of
 from skillweave.skills.probing import watch
 from skillweave.types import Memoryless
 
@@ -54,6 +53,11 @@ class Goal(Best):
         return super().__call__(obs)[:, None]
 
 
+class OfObservations(Best):
+    def __call__(self, obs: Any) -> Any:
+        return super().__call__(obs)[:, None]
+
+
 class Own(Memoryless):
     observation_space, action_space = SPACES
 
@@ -67,6 +71,11 @@ class Own(Memoryless):
 def acts(**how: Any) -> Any:
     policy = from_function(Best(), **how).bind(*SPACES, "it")
     policy.try_out()
+    return lambda: policy.act({}, OBS)
+
+
+def reads(function: Any) -> Any:
+    policy = from_function(lambda x: np.zeros(len(x), int), sees=function).bind(*SPACES, "it")
     return lambda: policy.act({}, OBS)
 
 
@@ -94,16 +103,21 @@ def places() -> dict[str, list[Callable[[], Any]]]:
     never = Predicate(lambda obs: obs[:, 0] > 9)
     machine = RewardMachine({("a", "b"): (never, Best())}, accepting={"b"})
     task, inverse = GoalTask(Two(), goal=[1.0]), ~Predicate(Best())
-    goal, computed, own = Best(), Best(), cast(Any, Own())
+    own = cast(Any, Own())
+    choices = choice_space(1, {"a": Box(0, 9, (1,))}, ["a"])
+    by_function = Automaton({"x": ("a", OfObservations())}, {}).among(("a",))
+    with_goals = by_function.bind(SPACES[0], choices, "it")
     condition, reflex = Reflex(Best(), 0), Reflex(lambda obs: obs[:, 0] > -1, Best())
     return {
         "planning.goal": [lambda: task.holds(OBS, OBS)],
-        "planning.machine": [lambda: machine.read(step())],
         "planning.predicates": [lambda: inverse.at(OBS)],
-        "selectors.automaton": [chooses(Automaton({"x": "a", "y": "b"}, {("x", "y"): Best()}))],
-        "selectors.base": [lambda: goals_at(goal, None, OBS, "it")],
-        "selectors.function": [chooses(Best()), chooses(Two())],
-        "selectors.tree_policy": [chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b"))],
+        "selectors.base": [
+            chooses(Automaton({"x": "a", "y": "b"}, {("x", "y"): Best()})),
+            chooses(tree.Fallback(tree.Sequence(Best(), "a"), "b")),
+            lambda: with_goals.act({"state": np.zeros(4, int)}, OBS),
+            lambda: machine.acts.read(step()),
+        ],
+        "selectors.ready": [chooses(Best()), chooses(Two())],
         "skills.base": [
             lambda: condition.holds(OBS),
             lambda: reflex.apply(OBS, np.zeros(4, int), SPACES[1]),
@@ -111,8 +125,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
         ],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
         "skills.goals": [*map(method, Skill.of_goals)],
-        "skills.plan": [lambda: numbers_of(computed, OBS, "it")],
-        "skills.scripted": [acts(), acts(sees={"about": slice(0, 1)})],
+        "skills.scripted": [acts(), acts(sees={"about": slice(0, 1)}), reads(Best())],
     }
 
 

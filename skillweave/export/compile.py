@@ -1,0 +1,167 @@
+"""A policy that acts here as one of plain data, with its networks as ONNX files.
+
+Stands alone because ``write`` makes a folder of it, which is another thing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.collecting.skill_set import in_place
+from skillweave.errors import PolicyError
+from skillweave.export.foreign import as_file
+from skillweave.export.graphs import agent_graph, worth_graph
+from skillweave.policies.actor import Deployed
+from skillweave.policies.core import Around, Policy
+from skillweave.policies.functional import Returns
+from skillweave.policies.hierarchy import (
+    ActiveGuide,
+    CalledSkill,
+    CallGoals,
+    Critic,
+    Hierarchy,
+    Interruption,
+)
+from skillweave.policies.leaves import Network, Ready, Selector
+from skillweave.policies.mapped import Function, Mapped, Outputs
+from skillweave.policies.parts import Corrects, Override, PartOf, Reflexes, Viewed
+from skillweave.policies.planned import Planned
+from skillweave.policies.spaces import Space, space_of
+from skillweave.skills.goals import Goals
+from skillweave.types import Policy as AnyPolicy
+
+
+def deployed(policy: AnyPolicy) -> Deployed:
+    """Return a policy of plain data, which acts the same.
+
+    Raises:
+        PolicyError: a part of it cannot be exported; the message names it, and what to do.
+        MissingExtra: the packages that write ONNX are not installed.
+    """
+    spaces = policy.observation_space, policy.action_space
+    sees, acts = map(space_of, spaces)
+    return Deployed(_compiled(in_place(policy), "", sampled=False), sees, acts)
+
+
+def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
+    """Return a policy of plain data.
+
+    Args:
+        name: its path: ``landing``, or ``outer/landing`` for a skill in a nested hierarchy.
+        sampled: it samples; else it is greedy.
+    """
+    where = f"the policy of {name!r}" if name else "the policy"
+    match policy:
+        case Hierarchy():
+            return _hierarchy(policy, f"{name}/" if name else "", sampled)
+        case Viewed():
+            raise PolicyError(f"{where} {_OF_A_TASK}")
+        case PartOf() if policy.part.view is not None:
+            raise PolicyError(f"{where} {_OF_A_TASK}")
+        case Reflexes():
+            if isinstance(space := policy.space, Space):  # of a policy that was read
+                return replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
+            rules = tuple(_rule(reflex, space) for reflex in policy.reflexes)
+            inside = _compiled(policy.policy, name, sampled=sampled)
+            return Reflexes(inside, rules, space_of(space))
+        case Corrects():
+            inside = _compiled(policy.policy, name, sampled=sampled)
+            base = _compiled(policy.base, f"{name}.base", sampled=False)
+            return Corrects(inside, base, policy.correction)
+        case Around():
+            return replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
+        case Mapped():
+            return as_file(policy, where, sampled=sampled)
+        case Returns():
+            return _leaf(policy, where, sampled)
+        case Planned() if type(policy) is not Planned:
+            raise PolicyError(
+                f"{name} plans again for each goal that it observes, which the runner does not: "
+                "export a plan of one goal, GoalTask(reached, goal=[...]), or train a selector"
+            )
+    return policy
+
+
+_OF_A_TASK = (
+    "acts where observations hold the state of a task, which no runner follows: export the run "
+    "that its skills are from"
+)
+
+
+def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
+    """Return what is no combinator: a network, or a function."""
+    inside = policy.policy
+    if isinstance(inside, AgentPolicy):
+        return _network(inside, sampled, where)
+    if isinstance(policy, Ready) or inside.start(1):
+        kind = type(inside).__name__
+        raise PolicyError(
+            f"{where} is a {kind}, whose memory cannot be written as ONNX: train the skill, or "
+            "give it an ONNX file"
+        )
+    space = space_of(inside.action_space)
+    return Mapped(Function(partial(_actions, inside)), Outputs(space, logits=False))
+
+
+def _actions(policy: AnyPolicy, obs: Any) -> Any:
+    return policy.act({}, obs)[0]
+
+
+def _network(policy: AgentPolicy, sampled: bool, where: str) -> Network:
+    graph = agent_graph(policy, sampled, where)
+    sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
+    return Network(graph.content, sees, acts, graph.choices, graph.memory, graph.noise)
+
+
+def _hierarchy(policy: Hierarchy, prefix: str, sampled: bool) -> Hierarchy:
+    guide = policy.guide
+    if guide is not None:
+        of = _compiled(guide.selector, f"{prefix}guide", sampled=False)
+        guide = ActiveGuide(of, guide.restricts)
+    samples = sampled or not policy.greedy_selector
+    assert policy.selector is not None
+    ready = (policy.selector, None if guide is None else guide.selector)
+    knows = any(isinstance(x, Selector) and x.ends_matter for x in ready)
+    return Hierarchy(
+        _compiled(policy.selector, f"{prefix}selector", sampled=samples),
+        tuple(_skill(one, prefix, knows, sampled=not policy.greedy) for one in policy.skills),
+        policy.lengths,
+        guide,
+        _interruption(policy.interruption, prefix),
+        policy.fresh_calls,
+        policy.greedy,
+        policy.greedy_selector,
+    )
+
+
+def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> CalledSkill:
+    """Return a skill; ``knows``: its selector knows whether calls have succeeded."""
+    goals = skill.goals
+    if isinstance(goals, Goals):
+        clip = goals.skill.clip_goal if goals.skill.defines("clip_goal") else None
+        goals = CallGoals(skill.path, space_of(goals.space), clip, skill.termination)
+    inside = _compiled(skill.policy, prefix + skill.name, sampled=sampled)
+    success = skill.success if knows else None
+    return replace(skill, policy=inside, goals=goals, success=success)
+
+
+def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
+    if how is None or isinstance(how.worth, Critic):
+        return how
+    if not isinstance(how.critic, AgentPolicy):
+        raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
+    sees = space_of(how.critic.observation_space)
+    content = worth_graph(how.critic, "the skill critic").content
+    values = int(how.critic.heads(sees.start(1)).shape[1])
+    worth = Space("Box", "float32", (values,), np.array(-np.inf), np.array(np.inf))
+    return Interruption(Critic(Network(content, sees, worth)), how.margin)
+
+
+def _rule(reflex: Any, space: Any) -> Override:
+    action = reflex.action if callable(reflex.action) else reflex.fixed(space)[None]
+    return Override(reflex.name, reflex.condition, action)

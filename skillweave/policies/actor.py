@@ -1,0 +1,170 @@
+"""A policy in one environment, an observation at a time: of ``Player``, and of exported folders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from .core import Array, Memory, Policy, Step, Turn, World
+from .errors import DeclarationError, PolicyError
+from .infos import batched_infos
+from .spaces import Space, at
+
+ROW = np.zeros(1, np.int64)
+"""The one environment."""
+MASK = "action_mask"
+"""The name of masks in ``info`` and in observations."""
+
+
+@dataclass(eq=False)
+class Deployed:
+    """A policy with the spaces of its environment."""
+
+    policy: Policy
+    sees: Space
+    acts: Space
+
+    @cached_property
+    def observed_mask(self) -> bool:
+        """Observations have a part that is the mask of actions."""
+        part = (self.sees.parts or {}).get(MASK) if self.sees.kind == "Dict" else None
+        size = sum(self.acts.counts)
+        return part is not None and size > 0 and int(np.prod(part.shape)) == size
+
+
+class Actor:
+    """Acts in one environment, and keeps the policy's memory.
+
+    Args:
+        deployed: the policy.
+        deterministic: act greedily, else sample.
+        seed: the seed of sampled actions.
+        nan: what a NaN in an observation is: an error, or a zero.
+    """
+
+    def __init__(
+        self,
+        deployed: Deployed,
+        *,
+        deterministic: bool = True,
+        seed: Any = 0,
+        nan: Literal["error", "zero"] = "error",
+    ) -> None:
+        if nan not in ("error", "zero"):
+            raise DeclarationError(f'nan is {nan!r}; it must be "error" or "zero"')
+        self._deployed = deployed
+        self._deterministic = deterministic
+        self._nan = nan
+        self._real = [p for p, leaf in deployed.sees.leaves.items() if leaf.record.kind == "f"]
+        self._world = World(np.random.default_rng(seed))
+        self.reset()
+
+    def reset(self) -> None:
+        """Start a new episode with an empty memory."""
+        self.memory: Memory = self._deployed.policy.start(1)
+        self._before: tuple[Array, Array] | None = None
+        self._elapsed = 0
+
+    def act(
+        self,
+        obs: Any,
+        reward: float = 0.0,
+        info: Mapping[str, Any] | None = None,
+        mask: Any = None,
+    ) -> Any:
+        """Return the action for one observation, as the environment takes it.
+
+        Args:
+            obs: what the environment's ``reset`` or ``step`` returned.
+            reward: the reward of the step; needed only where a skill's ``termination`` reads it.
+            info: the step's info; an ``action_mask`` in it is used where ``mask`` is left out.
+            mask: (A,) the actions that the environment allows, ``env.action_masks()`` for example;
+                of a Dict or Tuple also a dict or tuple of masks. None: the mask in ``info``, or the
+                observation's part ``action_mask``; else all.
+
+        Raises:
+            DeclarationError: the observation or the mask does not fit the policy; the message
+                names what does.
+        """
+        deployed, choices = self._deployed, self._deployed.acts.counts
+        seen, given = self._seen(obs), dict(info or {})
+        if choices and given.get(MASK) is not None:
+            given[MASK] = self._allowed(given[MASK])[0]
+        if self._before is not None:
+            self._elapsed += 1
+            deployed.policy.observe(self.memory, ROW, self._step(seen, reward, given))
+        if mask is not None and not choices:
+            raise DeclarationError(
+                f"act(): mask is {str(mask)[:100]}, but actions of {deployed.acts} are real "
+                "numbers alone, none of which can be forbidden: leave it out"
+            )
+        if mask is None and choices:
+            mask = given.get(MASK)
+        if mask is None and deployed.observed_mask:
+            mask = seen[MASK].reshape(-1)
+        allowed = None if mask is None else self._allowed(mask)
+        turn = Turn(self._world, allowed, greedy=self._deterministic)
+        if self._before is None:
+            self._begin(seen)
+        action = deployed.policy.act(self.memory, ROW, seen, turn)
+        self._before = seen, action
+        return deployed.acts.unpacked(action[0])
+
+    def _begin(self, seen: Array) -> None:
+        """Prepare the memory for an episode that starts in an observation (1, …)."""
+
+    def _seen(self, obs: Any) -> Array:
+        """Return one observation as a batch of one."""
+        try:
+            seen = np.array(self._deployed.sees.packed(obs))[None]  # the user may change it
+        except PolicyError as error:
+            space = str(self._deployed.sees)[:300]
+            raise DeclarationError(
+                f"act() was given an observation that does not fit {space}: {error}"
+            ) from error
+        for path in self._real:
+            part = at(seen, path)
+            if not np.isnan(part).any():
+                continue
+            where = "obs" + "".join(f"[{name!r}]" for name in path)
+            if self._nan == "error":
+                raise DeclarationError(
+                    f"act() was given an observation with NaN in {where}: find out what the sensor "
+                    'gives there, or let a NaN count as 0, nan="zero"'
+                )
+            seen = seen.copy()
+            at(seen, path)[...] = np.nan_to_num(part, posinf=np.inf, neginf=-np.inf)
+        return seen
+
+    def _allowed(self, mask: Any) -> Array:
+        """Return a mask as a batch of one."""
+        acts = self._deployed.acts
+        try:
+            allowed = acts.allowed(mask)
+        except ValueError as error:
+            raise DeclarationError(f"act(): {error}") from error
+        starts = np.cumsum((0, *acts.counts[:-1]))
+        if not np.logical_or.reduceat(allowed, starts).all():
+            raise DeclarationError("act(): its action_mask allows no action")
+        return allowed[None]
+
+    def _step(self, seen: Array, reward: float, info: Mapping[str, Any]) -> Step:
+        """Return the step that led to an observation."""
+        assert self._before is not None
+        obs, action = self._before
+        no = np.zeros(1, bool)
+        return Step(
+            obs,
+            action,
+            seen,
+            np.array([reward], np.float32),
+            terminated=no,
+            truncated=no,
+            timed_out=no,
+            elapsed=np.array([self._elapsed]),
+            info=batched_infos([dict(info)]),
+        )

@@ -1,0 +1,420 @@
+"""Policies as JSON: one tree of their fields, with files and arrays beside it, functions by name.
+
+Nothing but data is read: types that are listed, with fields that are checked, files with recorded
+checksums. Functions are given by who reads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
+from difflib import get_close_matches
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces
+from .actor import Deployed
+from .core import Array
+from .errors import PolicyError, RunError
+from .files import parse_json, read_file, shown
+
+FORMAT = 3
+"""Version of ``policy.json``."""
+MANIFEST = "policy.json"
+"""The name of the file that describes a policy."""
+ARRAYS = "arrays.npz"
+"""The name of the file with its large arrays."""
+SMALL = 64
+"""The most numbers of an array that stands in the JSON."""
+LARGEST = 100_000_000
+"""The most bytes of ``policy.json``."""
+ROOMS = (actor, hierarchy, leaves, mapped, parts, plan, planned, selectors, spaces)
+
+OTHERS = (parts.Given, parts.Viewed, plan.Near, selectors.Rule)
+"""Types in these files that are never written."""
+
+
+@cache
+def kinds() -> dict[str, type[Any]]:
+    """Return the types that may be written, by name."""
+    found = (x for room in ROOMS for x in vars(room).values() if isinstance(x, type))
+    here = {room.__name__ for room in ROOMS}
+    return {
+        kind.__name__: kind
+        for kind in found
+        if "__dataclass_fields__" in vars(kind) and kind.__module__ in here and kind not in OTHERS
+    }
+
+
+# Writing ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Written:
+    """Content that is written beside the tree."""
+
+    files: dict[str, bytes] = field(default_factory=dict)
+    arrays: dict[str, Array] = field(default_factory=dict)
+    code: dict[str, str] = field(default_factory=dict)
+    """By name, a description of each function that a reader needs."""
+    functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
+
+    def tree(self, value: Any, path: str = "", own: Field[Any] | None = None) -> Any:
+        """Return a value as JSON.
+
+        Args:
+            path: of the skill that it belongs to: ``landing``, or ``outer/landing``.
+            own: the field that it is the value of.
+
+        Raises:
+            PolicyError: it has no form; the message names its place.
+        """
+        match value:
+            case np.generic():  # first: some of these are floats, too
+                return self.tree(np.asarray(value), path, own)
+            case None | bool() | int() | str():
+                return value
+            case float():
+                return value if math.isfinite(value) else {"float": repr(value)}
+            case bytes():
+                name = f"{path.replace('/', '.') or 'agent'}.onnx"
+                return {"file": _free(self.files, name, value)}
+            case np.ndarray():
+                return self._array(value, path, own)
+            case tuple() | list():
+                return [self.tree(x, path, own) for x in value]
+            case dict():
+                return {name: self.tree(x, path, own) for name, x in value.items()}
+        kind = type(value)
+        if kinds().get(kind.__name__) is kind:
+            return self._object(value, path)
+        if callable(value) and own is not None:
+            return {"code": self._function(value, path, own)}
+        raise PolicyError(f"{path or 'the policy'} has {kind.__name__}, which cannot be written")
+
+    def _object(self, value: Any, path: str) -> dict[str, Any]:
+        entry: dict[str, Any] = {"type": type(value).__name__}
+        if isinstance(value, hierarchy.CalledSkill | parts.Override):
+            name = value.name
+            path = f"{path}/{name}" if path else name
+        made: Any = type(value)
+        for one in written_fields(made):
+            own = getattr(value, one.name)
+            unset = one.default if one.default is not MISSING else None
+            if own is unset or (isinstance(unset, bool | int | float | str) and own == unset):
+                continue
+            entry[one.name] = self.tree(own, _below(path, one.name), one)
+        return entry
+
+    def _array(self, value: Array, path: str, own: Field[Any] | None) -> dict[str, Any]:
+        if value.size > SMALL or value.dtype.names is not None:
+            name = f"{path}.{own.name}" if own is not None else path
+            return {"stored": _free(self.arrays, name, value)}
+        return {"array": self.tree(value.tolist(), path), "dtype": str(value.dtype)}
+
+    def _function(self, value: Any, path: str, own: Field[Any]) -> str:
+        bare = getattr(value, "bare", value)
+        label = own.metadata.get("label") or getattr(bare, "__name__", type(bare).__name__)
+        alone = path.rpartition("/")[2] == label  # of a selector that is a function
+        wanted = path if alone else f"{path}.{label}".removeprefix(".")
+        name = _free(self.functions, wanted, bare)
+        self.code[name] = own.metadata.get("what", "observations (n, ...) to numbers (n, ...)")
+        return name
+
+    def content(self) -> dict[str, bytes]:
+        """Return the files, with one of the arrays."""
+        if not self.arrays:
+            return self.files
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **self.arrays)  # type: ignore[arg-type]
+        return self.files | {ARRAYS: buffer.getvalue()}
+
+
+def _free(table: dict[str, Any], wanted: str, value: Any) -> str:
+    """Return the name of a value in a table; a second value of a name gets a number."""
+    stem, dot, suffix = wanted.rpartition(".") if wanted.endswith(".onnx") else (wanted, "", "")
+    tried = (wanted if i == 1 else f"{stem}#{i}{dot}{suffix}" for i in range(1, 10_000))
+    name = next(n for n in tried if table.get(n, value) is value)
+    table[name] = value
+    return name
+
+
+NAMED = ("selector", "guide", "critic", "base")
+"""Fields whose names are added to the path: of files and functions below them."""
+
+
+def _below(path: str, name: str) -> str:
+    if name not in NAMED:
+        return path
+    return f"{path}.{name}" if name == "base" else f"{path}/{name}".removeprefix("/")
+
+
+@cache
+def written_fields(kind: Any) -> tuple[Field[Any], ...]:
+    """Return the fields of a type that are written."""
+    return tuple(one for one in fields(kind) if one.metadata.get("written", True))
+
+
+# Reading ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Reader:
+    """Content that is read beside the tree."""
+
+    code: Mapping[str, Callable[..., Any]]
+    files: Mapping[str, bytes]
+    arrays: Mapping[str, Array]
+
+    def read(self, kind: Any, entry: Any, where: str) -> Any:
+        """Return the value of an entry, which must be of a kind: any annotation of a field.
+
+        Raises:
+            PolicyError: it is not; the message names the place ``where``.
+        """
+        origin, inner = get_origin(kind), get_args(kind)
+        if origin in (Union, UnionType):
+            options = [option for option in inner if _may_be(option, entry)]
+            if len(options) != 1:
+                raise _unfit(where, entry, " or ".join(map(_described, inner)))
+            return self.read(options[0], entry, where)
+        if not _may_be(kind, entry):
+            raise _unfit(where, entry, _described(kind))
+        if kind is float:
+            return float(entry["float"]) if isinstance(entry, dict) else float(entry)
+        if kind in (int, bool, str, NoneType) or origin is Literal:
+            return entry
+        if kind is bytes:
+            return self._beside(self.files, entry["file"], where, "files")
+        if kind == Array:
+            return self._array(entry, where)
+        if origin is Callable:
+            return self._beside(self.code, entry["code"], where, "code")
+        if origin is tuple:
+            some = inner[:1] * len(entry) if inner[1:] == (...,) else inner
+            if len(some) != len(entry):
+                raise _unfit(where, entry, f"a list of {len(some)}")
+            pairs = enumerate(zip(some, entry, strict=True))
+            return tuple(self.read(k, x, f"{where}[{i}]") for i, (k, x) in pairs)
+        if origin is dict:
+            return {k: self.read(inner[1], x, f"{where}[{k!r}]") for k, x in entry.items()}
+        return self._object(entry, where)
+
+    def _object(self, entry: dict[str, Any], where: str) -> Any:
+        made: Any = kinds()[entry["type"]]
+        own = {one.name: one for one in written_fields(made)}
+        if wrong := [name for name in entry if name not in own and name != "type"]:
+            near = get_close_matches(str(wrong[0]), own, 1)
+            hint = f": is {near[0]!r} meant" if near else f"; it has {', '.join(own)}"
+            raise PolicyError(f"{where}.{shown(wrong[0])} is unknown{hint}")
+        hints, values = hints_of(made), dict[str, Any]()
+        if "who" in hints and "who" not in own:
+            values["who"] = where
+        for name, one in own.items():
+            if name in entry:
+                kind = one.metadata.get("kind", hints[name])
+                values[name] = self.read(kind, entry[name], f"{where}.{name}")
+            elif one.default is MISSING and one.default_factory is MISSING:
+                raise PolicyError(f"{where} has no field {name!r}")
+        try:
+            return made(**values)
+        except PolicyError as error:
+            raise PolicyError(f"{where}: {error}") from error
+
+    def _array(self, entry: dict[str, Any], where: str) -> Array:
+        if "stored" in entry:
+            found: Array = self._beside(self.arrays, entry["stored"], where, ARRAYS)
+            return found
+        try:
+            dtype = np.dtype(entry["dtype"])
+            kind = float if dtype.kind == "f" else bool if dtype.kind == "b" else int
+            numbers = self._numbers(kind, entry["array"], f"{where}.array")
+            with np.errstate(over="raise"):
+                found = np.array(numbers, dtype)
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+            raise PolicyError(f"{where} is no array: {str(error)[:200]}") from error
+        if dtype.kind not in "biuf" or found.size > SMALL:
+            raise PolicyError(f"{where} is no array of at most {SMALL} numbers")
+        return found
+
+    def _numbers(self, kind: type[Any], entry: Any, where: str) -> Any:
+        if isinstance(entry, list):
+            return [self._numbers(kind, x, where) for x in entry]
+        return self.read(kind, entry, where)
+
+    def _beside(self, table: Mapping[str, Any], name: str, where: str, what: str) -> Any:
+        if name not in table:
+            raise PolicyError(f"{where} is {shown(name)}, which {what} does not list")
+        return table[name]
+
+
+def _may_be(kind: Any, entry: Any) -> bool:
+    """Return whether an entry has the form of a kind."""
+    origin = get_origin(kind)
+    if kind is float:
+        infinite = isinstance(entry, dict) and entry.get("float") in ("inf", "-inf")
+        return infinite or type(entry) is float or (type(entry) is int and abs(entry) < 2**63)
+    if kind is int:
+        return type(entry) is int and abs(entry) < 2**63
+    if kind in (bool, str):
+        return type(entry) is kind
+    if kind is NoneType:
+        return entry is None
+    if origin is Literal:
+        return isinstance(entry, str | int) and entry in get_args(kind)
+    if origin is tuple:
+        return isinstance(entry, list)
+    if not isinstance(entry, dict):
+        return False
+    if kind is bytes:
+        return set(entry) == {"file"} and isinstance(entry["file"], str)
+    if kind == Array:
+        return isinstance(entry.get("stored"), str) or "array" in entry
+    if origin is Callable:
+        return set(entry) == {"code"} and isinstance(entry["code"], str)
+    if origin is dict:
+        return "type" not in entry
+    named = entry.get("type")
+    return isinstance(named, str) and issubclass(kinds().get(named, NoneType), kind)
+
+
+@cache
+def hints_of(kind: type[object]) -> dict[str, Any]:
+    """Return the annotations of a type."""
+    return get_type_hints(kind)
+
+
+def _described(kind: Any) -> str:
+    origin, inner = get_origin(kind), get_args(kind)
+    plain = {
+        float: "a number",
+        int: "a whole number",
+        bool: "true or false",
+        str: "a text",
+        NoneType: "null",
+        bytes: '{"file": its name}',
+    }
+    if kind in plain:
+        return plain[kind]
+    if kind == Array:
+        return "an array"
+    if origin is Callable:
+        return '{"code": its name}'
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, inner))}"
+    if origin is tuple:
+        return "a list"
+    if origin is dict:
+        return "an object"
+    options = [name for name, one in kinds().items() if issubclass(one, kind)]
+    return f'an object whose field "type" is one of {", ".join(options)}'
+
+
+def _unfit(where: str, entry: Any, wanted: str) -> PolicyError:
+    text = shown(entry.get("type", entry) if isinstance(entry, dict) else entry)
+    return PolicyError(f"{where} is {text}; it must be {wanted}")
+
+
+# Folders ----------------------------------------------------------------------------------------
+
+
+def checksum(content: bytes) -> str:
+    """Compute the SHA-256 as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def read_folder(
+    path: Any,
+    code: Mapping[str, Callable[..., Any]] | None = None,
+    archive: bytes | None = None,
+) -> tuple[Deployed, dict[str, Any], bytes]:
+    """Return the policy in a folder, the content of its ``policy.json``, and an archive of both.
+
+    Args:
+        code: the functions that its field ``code`` lists.
+        archive: is read in place of the folder.
+
+    Raises:
+        RunError: a file is missing or damaged; the message names it and the field.
+        PolicyError: it needs a function that was not given.
+    """
+    folder, code = Path(path), dict(code or {})
+    file = folder / MANIFEST
+    read: dict[str, bytes] = {}
+    kept = None if archive is None else zipfile.ZipFile(io.BytesIO(archive))
+
+    def opened(name: str, most: int | None = None) -> bytes:
+        found = read_file(folder / name, most) if kept is None else kept.read(name)
+        read[name] = found
+        return found
+
+    content = parse_json(opened(MANIFEST, LARGEST), file)
+    version = content.get("format") if isinstance(content, dict) else None
+    if version != FORMAT:
+        raise RunError(
+            f"{file} has format {shown(version)}, but this version reads {FORMAT}: export the "
+            "policy again"
+        )
+    for name, kind in FIELDS.items():
+        if name not in content:
+            raise RunError(f"{file} is damaged: no field {name!r}")
+        if not isinstance(content[name], kind):
+            raise RunError(f"{file}: {name} is {shown(content[name])}; it must be {kind.__name__}")
+    if missing := {name: what for name, what in content["code"].items() if name not in code}:
+        raise PolicyError(
+            f"{folder} needs Python code, code={{name: function}}, for "
+            + "; ".join(f"{name!r}: {what}" for name, what in missing.items())
+        )
+    files = {name: _content(folder, name, x, opened) for name, x in content["files"].items()}
+    try:
+        arrays = _arrays(files.pop(ARRAYS, b""))
+        reader = Reader({name: code[name] for name in content["code"]}, files, arrays)
+        found: Deployed = reader.read(Deployed, content["policy"], "policy")
+        found.policy.check(found.sees, found.acts, None, "policy")
+    except PolicyError as error:
+        raise RunError(f"{file}: {error}") from error
+    return found, content, archive or _archived(read)
+
+
+FIELDS = {"env": str, "licence": str, "origin": str, "files": dict, "code": dict, "policy": dict}
+"""The fields of ``policy.json`` beside its format, and their types."""
+
+
+def _content(folder: Path, name: str, recorded: Any, opened: Callable[[str], bytes]) -> bytes:
+    """Return a file of a folder, compared with its checksum."""
+    if set(name) & set("/\\\0") or not name.endswith((".onnx", ARRAYS)) or name.startswith("."):
+        raise RunError(f"{folder / MANIFEST}: files has {shown(name)}, no file of the folder")
+    content = opened(name)
+    if checksum(content) != recorded:
+        raise RunError(
+            f"{folder / name} has another checksum than {folder / MANIFEST} records in files: it "
+            "is damaged, or another version. Get both from one source"
+        )
+    return content
+
+
+def _archived(files: Mapping[str, bytes]) -> bytes:
+    """Return files as one, which has the same bytes each time."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name in sorted(files):
+            archive.writestr(zipfile.ZipInfo(name), files[name])
+    return buffer.getvalue()
+
+
+def _arrays(content: bytes) -> dict[str, Array]:
+    if not content:
+        return {}
+    try:
+        with np.load(io.BytesIO(content)) as data:
+            return dict(data)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise PolicyError(f"{ARRAYS} is damaged: {str(error)[:200]}") from error

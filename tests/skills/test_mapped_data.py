@@ -1,0 +1,204 @@
+"""Mapped policies as data: they refuse what contradicts itself, and act the same in any rows."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skills.mapped_models import onnx_model, weights
+
+from skillweave.policies.core import Memory, Turn, World
+from skillweave.policies.errors import PolicyError
+from skillweave.policies.mapped import (
+    Function,
+    Input,
+    Linear,
+    Mapped,
+    OnnxFile,
+    Outputs,
+    Take,
+)
+from skillweave.policies.spaces import Space
+from skillweave.types import Array
+
+
+def box(*shape: int) -> Space:
+    return Space("Box", "float32", shape, np.array(-1.0), np.array(1.0))
+
+
+def choice(n: int) -> Space:
+    return Space("Discrete", "int64", (), np.array(0), np.array(n - 1))
+
+
+def zeros(x: Array, *more: Any) -> Array:
+    return np.zeros((len(x), 2), np.float32)
+
+
+SEEN = Take("observation", (3,))
+GOAL = Take("goal", (1,))
+FUNCTION = Function(zeros)
+BOTH = Space("Dict", parts={"a": box(2), "b": choice(2)})
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Take("function", (2,)), "Take.function is None"),
+        (lambda: Take("goal", (2,), function=zeros), "Take.source is 'goal'"),
+        (lambda: Take("observation", (3,), places=(0, 3)), r"Take.places is \(0, 3\).* 0 to 2"),
+        (lambda: Take("observation", (3,), places=()), "Take.places is "),
+        (lambda: Take("observation", (3,), places=(-1,)), "Take.places is "),
+        (lambda: Take("observation", (2,), choices=((3, 0),)), "Take.choices is .*Take.shape"),
+        (lambda: Take("observation", (), choices=((0, 0),)), "Take.choices is "),
+        (lambda: Take("observation", (), choices=((3, 0),), whole=True), "Take.whole is true"),
+        (lambda: Take("goal", (2,), low=np.zeros(3)), r"Take.low has the shape \(3,\)"),
+        (lambda: Take("last_action", (2, 2)), r"Take.shape is \(2, 2\)"),
+        (lambda: Input((), (0,)), "Input.shape"),
+        (lambda: Input((SEEN,), (4,)), r"Input.shape is \(4,\), but Input.takes gives 3"),
+        (lambda: Input((SEEN,), (3,), (Linear(np.zeros(2)),)), "Linear.offset has the shape"),
+        (lambda: Outputs(box(3), (0, 3)), r"Outputs.to is \(0, 3\)"),
+        (lambda: Outputs(box(3), (0, 0), rest=np.zeros(3)), "Outputs.to is .*each one once"),
+        (lambda: Outputs(box(3), (0,)), "Outputs.rest must give"),
+        (lambda: Outputs(box(3), (0,), rest=np.zeros(2)), "Outputs.rest has the shape"),
+        (lambda: Outputs(box(2), (0, 1), np.zeros(3)), "Outputs.scale has the shape"),
+        (lambda: Outputs(box(2), (0, 1), clip=(1.0, 0.0)), "Outputs.clip is "),
+        (lambda: Outputs(BOTH, (0,)), "Outputs.to needs actions of a Box or a Discrete"),
+        (lambda: Outputs(BOTH, logits=True), "is a network, whose one output"),
+        (lambda: Function(zeros, ((2, 3),)), "Function.state is .*None once"),
+        (lambda: Function(zeros, single_state=True), "Function.single_state"),
+        (lambda: Function(zeros, ((None, 1),), takes_goal="goal"), "Function.takes_goal"),
+        (lambda: Mapped(FUNCTION, Outputs(box(2)), every=0), "Mapped.every is 0; .*100,000"),
+        (lambda: Mapped(FUNCTION, Outputs(box(2)), chunk=0), "Mapped.chunk is 0"),
+        (lambda: Mapped(FUNCTION, Outputs(box(2)), chunk=100_001), "Mapped.chunk is 100001"),
+        (lambda: Mapped(FUNCTION, Outputs(BOTH), chunk=2), "policy: chunk needs actions of one"),
+        (lambda: Mapped(FUNCTION, Outputs(box(2)), {"": Input((GOAL,), (1,))}), "no Mapped.goal"),
+        (
+            lambda: Mapped(FUNCTION, Outputs(box(2)), {"": Input((GOAL,), (1,))}, goal=np.zeros(2)),
+            "Mapped.inputs and Mapped.goal have goals of",
+        ),
+        (
+            lambda: Mapped(
+                FUNCTION, Outputs(choice(2)), {"": Input((Take("last_action", (2,)),), (2,))}
+            ),
+            "takes the last action, which is 0 numbers",
+        ),
+        (
+            lambda: Mapped(Function(zeros, takes_goal="goal"), Outputs(box(2))),
+            "Function.takes_goal needs Mapped.goal_space",
+        ),
+    ],
+)
+def test_what_contradicts_itself_is_refused(make: Any, says: str) -> None:
+    with pytest.raises(PolicyError, match=says):
+        make()
+
+
+def test_what_does_not_fit_the_spaces_is_refused() -> None:
+    made = Mapped(FUNCTION, Outputs(box(2)), {"": Input((SEEN,), (3,))})
+    made.check(box(3), box(2), None, "policy")
+    for sees, acts, says in (
+        (box(4), box(2), r"policy.inputs\[''\] takes the observation of shape \(3,\)"),
+        (BOTH, box(2), "takes the observation"),
+        (box(3), box(1), "policy.outputs.space is Box"),
+    ):
+        with pytest.raises(PolicyError, match=says):
+            made.check(sees, acts, None, "policy")
+    aims = Mapped(FUNCTION, Outputs(box(2)), {"": Input((GOAL,), (1,))}, goal_space=box(1))
+    with pytest.raises(PolicyError, match=r"policy.goal_space is .*goals are of None"):
+        aims.check(box(3), box(2), None, "policy")
+
+
+@pytest.fixture
+def content(tmp_path: Path) -> bytes:
+    pytest.importorskip("onnxruntime")
+    nodes = [("MatMul", ["obs", "w"], ["s"]), ("Add", ["s", "h"], ["after"])]
+    shapes: Any = {"obs": ["n", 3], "h": ["n", 2]}, {"after": ["n", 2], "s": ["n", 2]}
+    return onnx_model(tmp_path / "x.onnx", nodes, *shapes, {"w": weights(3, 2)}).read_bytes()
+
+
+def test_an_onnx_file_that_its_fields_do_not_fit_is_refused(content: bytes) -> None:
+    right: Any = {"output": "after", "inputs": ("obs",), "state": (("h", "after"),)}
+    file = OnnxFile(content, **right)
+    assert (file.expected, file.states) == ({"obs": (3,)}, [((2,), np.float32)])
+    for change, says in (
+        ({"output": "action"}, r"no output 'action' \(output\); it has: after, s"),
+        ({"inputs": ("camera",)}, r"no input 'camera' \(inputs\); it has: obs, h"),
+        ({"state": (("c", "after"),)}, r"no input 'c' \(state\)"),
+        ({"state": (("h", "h.after"),)}, r"no output 'h.after' \(state\)"),
+        ({"inputs": ()}, "OnnxFile.inputs is empty"),
+    ):
+        with pytest.raises(PolicyError, match=says):
+            OnnxFile(content, **(right | change))
+    with pytest.raises(PolicyError, match="cannot be run by onnxruntime"):
+        OnnxFile(b"junk", **right)
+    with pytest.raises(PolicyError, match="has weights in other files"):
+        OnnxFile(content + b"\n\x08location\x12\x01x", **right)
+    four = Input((Take("observation", (4,)),), (4,))
+    with pytest.raises(PolicyError, match=r"Mapped.inputs has .*but the model takes"):
+        Mapped(file, Outputs(box(2)), {"": four})
+    with pytest.raises(PolicyError, match=r"policy.model takes"):
+        Mapped(file, Outputs(box(2))).check(box(4), box(2), None, "policy")
+    again = pickle.loads(pickle.dumps(file))
+    assert again.session is None
+    obs, state, turn = np.ones((2, 3), np.float32), (np.ones((2, 2), np.float32),), Turn(World())
+    found, other = (x.call({"": obs}, state, turn) for x in (file, again))
+    np.testing.assert_array_equal(found[0], other[0])
+
+
+# Rows -------------------------------------------------------------------------------------------
+
+
+def recurrent(chunk: int | None) -> Mapped:
+    """A policy with all that can be remembered; its state has the environments last."""
+
+    def model(x: Array, state: Array) -> tuple[Array, Array]:
+        after = np.tanh(0.5 * state + x[:, :2].T + 0.1 * x[:, 3:].sum(axis=1))
+        outputs = np.stack([after.T * (i + 1) for i in range(chunk or 1)], axis=1)
+        return (outputs if chunk else outputs[:, 0]), after
+
+    takes = SEEN, Take("last_action", (2,)), Take("goal", (2,), low=np.array(-0.5))
+    inputs = {"": Input(takes, (7,), (Linear(np.full(7, 0.1), np.full(7, 0.5)),))}
+    outputs = Outputs(box(3), (2, 0), np.full(2, 0.5), clip=(-0.75, 0.75), rest=np.full(3, 0.25))
+    function = Function(model, ((2, None),), single_state=True)
+    return Mapped(function, outputs, inputs, 2, chunk, np.array([0.25, -1.0]), box(2))
+
+
+@pytest.mark.parametrize("chunk", [None, 3])
+@pytest.mark.parametrize("aims", [False, True])
+def test_some_rows_act_as_each_does_alone(chunk: int | None, aims: bool) -> None:
+    rng, n, policy = np.random.default_rng(0), 5, recurrent(chunk)
+    together, alone = policy.start(n), [policy.start(1) for _ in range(n)]
+    assert set(together) == {"state.0", "last", "phase", "held"}
+    actions = set[float]()
+    for _ in range(40):
+        rows = np.flatnonzero(rng.random(n) < 0.6)
+        obs = rng.normal(size=(len(rows), 3)).astype(np.float32)
+        goal = rng.uniform(-1, 1, (len(rows), 2)).astype(np.float32) if aims else None
+        acted = policy.act(together, rows, obs, Turn(World(), None, goal))
+        for k, i in enumerate(rows):
+            own = None if goal is None else goal[k : k + 1]
+            one = policy.act(alone[i], np.zeros(1, int), obs[k : k + 1], Turn(World(), None, own))
+            np.testing.assert_array_equal(acted[k], one[0])
+        _same(together, alone)
+        actions |= set(acted.reshape(-1).tolist())
+    assert len(actions) > 20
+
+
+def _same(together: Memory, alone: list[Memory]) -> None:
+    for name, values in together.items():
+        np.testing.assert_array_equal(values, np.concatenate([one[name] for one in alone]))
+
+
+def test_records_are_held_as_records() -> None:
+    def both(obs: Array) -> dict[str, Array]:
+        return {"a": obs[:, :2], "b": (obs[:, 2] > 0).astype(int)}
+
+    policy = Mapped(Function(both), Outputs(BOTH), every=2)
+    memory, rows, turn = policy.start(2), np.arange(2), Turn(World())
+    first = policy.act(memory, rows, np.array([[0.5, 1, 1], [0, 0, -1.0]]), turn)
+    assert memory["held"].dtype == BOTH.record
+    assert policy.act(memory, rows, np.zeros((2, 3)), turn).tobytes() == first.tobytes()
+    assert first["b"].tolist() == [1, 0]
