@@ -209,7 +209,7 @@ class Network(Policy):
 
     def _run(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         n = len(rows)
-        feeds = {name: at(obs, path) for name, path in self._inputs.items()}
+        feeds = {k: np.ascontiguousarray(at(obs, path)) for k, path in self._inputs.items()}
         if self.choices:
             feeds["mask"] = np.ones((n, self.choices), bool) if turn.mask is None else turn.mask
         if self.memory:
@@ -217,7 +217,9 @@ class Network(Policy):
         rng = turn.world.rng or np.random.default_rng() if self.noise else None
         for i, (kind, width) in enumerate(self.noise):
             feeds[f"noise.{i}"] = getattr(rng, kind)(size=(n, width)).astype(np.float32)
-        each = [{k: np.ascontiguousarray(v[i : i + 1]) for k, v in feeds.items()} for i in range(n)]
+        each = [feeds]
+        if n > 1:
+            each = [{k: v[i : i + 1] for k, v in feeds.items()} for i in range(n)]
         try:
             found = [self.session.run(None, one) for one in each]
         except Exception as error:  # onnxruntime's own errors have no common class
