@@ -9,17 +9,18 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Self
 
 import gymnasium as gym
-import numpy as np
 
-from skillweave.collecting.skill_set import SkillSet, policy_of
+from skillweave.collecting.skill_set import SkillSet, policy_of, selects
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning.task_env import OwnView
 from skillweave.policies.core import LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.leaves import Selector
 from skillweave.policies.parts import Viewed
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
@@ -72,6 +73,29 @@ class OwnPolicy(Functional):
         return source_of(self.policy)
 
 
+class ViewedSelector(Viewed, Selector):
+    """A ready selector that sees what ``view`` makes of observations."""
+
+    policy: Selector
+
+    @property
+    def ends_matter(self) -> bool:  # type: ignore[override]
+        """As the selector's."""
+        return self.policy.ends_matter
+
+    def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
+        """Return how likely the selector's choices are, see ``Selector``."""
+        return self.policy.chances(memory, rows, self.view(obs), may)
+
+    def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
+        """Return which choices the selector leaves, see ``Selector``."""
+        return self.policy.ahead(memory, rows, may)
+
+    def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
+        """Show the selector what it sees of a step, and how the last calls ended."""
+        self.policy.watch(memory, rows, self.seen(step), last)
+
+
 class OwnSelector(ReadySelector):
     """A ready selector that sees the environment's own observations; see ``OwnPolicy``."""
 
@@ -97,45 +121,10 @@ class OwnSelector(ReadySelector):
         changed.selector, changed.skills = selector, selector.skills
         return changed
 
-    @property
-    def ranges(self) -> dict[str, range]:
-        """Return the valid range of each index in its memory."""
-        ranges: dict[str, range] = self.selector.ranges
-        return ranges
-
-    def start(self, n: int) -> Memory:
-        """Return the selector's memory of ``n`` environments."""
-        memory: Memory = self.selector.start(n)
-        return memory
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return the selector's choices (n,)."""
-        how: Any = {"deterministic": deterministic, "rng": rng}
-        choice, after = self.selector.act(memory, self._view.obs(obs), mask, **how)
-        return choice, after
-
-    def chances(self, memory: Memory, obs: Array, mask: Array | None) -> tuple[Array, Memory]:
-        """Return the probability of each choice."""
-        chances, after = self.selector.chances(memory, self._view.obs(obs), mask)
-        return chances, after
-
-    def allowed(self, memory: Memory) -> Array | None:
-        """Return what it may choose next."""
-        allowed: Array | None = self.selector.allowed(memory)
-        return allowed
-
-    def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
-        """Return the memory after a step."""
-        after: Memory = self.selector.watch(memory, self._view.step(step), last)
-        return after
+    @cached_property
+    def in_place(self) -> ViewedSelector:
+        """The selector, which sees its own observations."""
+        return ViewedSelector(selects(self.selector, "the selector"), self._view.obs)
 
     def source(self) -> dict[str, Any]:
         """Return the selector's source."""

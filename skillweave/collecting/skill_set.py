@@ -10,7 +10,7 @@ import gymnasium as gym
 
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import PolicyError
-from skillweave.policies.core import Around, Policy
+from skillweave.policies.core import Policy, innermost
 from skillweave.policies.functional import Functional, Returns
 from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
 from skillweave.policies.leaves import Ready
@@ -139,10 +139,10 @@ def hierarchy_of(
         selector, guide = guide.selector, None
     inside = tuple(_skill(skills, i) for i in range(len(skills.skills)))
     return Hierarchy(
-        None if selector is None else _selects(selector, "the selector's act()"),
+        None if selector is None else selects(selector, "the selector's act()"),
         inside,
         lengths=skills.lengths,
-        guide=guide and replace(guide, selector=_selects(guide.selector, "the guide")),
+        guide=guide and replace(guide, selector=selects(guide.selector, "the guide")),
         interruption=skills.interruption,
         fresh_calls=goals is not None,
         greedy=skills.greedy,
@@ -153,10 +153,9 @@ def hierarchy_of(
 
 def within(policy: Policy) -> Hierarchy:
     """Return the hierarchy that reflexes and the like stand around."""
-    while isinstance(policy, Around):
-        policy = policy.policy
-    assert isinstance(policy, Hierarchy)
-    return policy
+    inside = innermost(policy)
+    assert isinstance(inside, Hierarchy)
+    return inside
 
 
 def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
@@ -228,8 +227,12 @@ ENDS = ("initiation", "termination", "success")
 """The methods of a skill that are asked while it acts."""
 
 
-def _selects(selector: Any, who: str) -> Policy:
-    """Return a selector's policy; one that is not trained watches how calls end."""
+def selects(selector: Any, who: str) -> Policy:
+    """Return a selector's policy; one that is not trained watches how calls end.
+
+    Args:
+        who: for messages.
+    """
     if not hasattr(selector, "watch"):
         return in_place(selector, who)
     kind, asked = type(selector), ("start", "act", "chances", "allowed", "watch")

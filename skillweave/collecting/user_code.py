@@ -25,9 +25,9 @@ from gymnasium.envs.registration import load_env_creator
 
 from skillweave.envs.make import EnvSpec
 from skillweave.notices import notice
+from skillweave.policies.files import checksum
 from skillweave.reading import shown
 from skillweave.skills import Reflex, Skill
-from skillweave.skills.foreign_policy import checksum
 from skillweave.tracebacks import is_own_code, is_own_module
 
 Texts = dict[str, str]

@@ -12,11 +12,10 @@ from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.policies.core import OWN_REWARD, SUCCESS
 from skillweave.policies.infos import NUMBERS, batched_infos
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import allows_each, space_of
 from skillweave.skills.info_words import info_keys
 from skillweave.spaces import (
     action_codec,
-    allows_each,
     choice_counts,
     obs_dtype,
     obs_shape,

@@ -20,8 +20,9 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.messages import short
 from skillweave.policies.actor import Deployed
-from skillweave.policies.codec import checksum, read_folder
-from skillweave.policies.core import Around, Policy
+from skillweave.policies.codec import read_folder
+from skillweave.policies.core import Around, Policy, innermost
+from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import CalledSkill, Hierarchy
 from skillweave.policies.mapped import Mapped, Take
@@ -54,7 +55,7 @@ def read_policy(
         DeclarationError: it takes no goal.
     """
     deployed, _, archive = read_folder(folder, code)
-    if isinstance(_inside(deployed.policy), Hierarchy):
+    if isinstance(innermost(deployed.policy), Hierarchy):
         if goal is not None:
             raise DeclarationError(f"load_policy(): the policy in {folder} takes no goal")
         return ExportedHierarchy(deployed, checksum(archive))
@@ -172,7 +173,7 @@ def _skill_set(tree: Hierarchy, deployed: Deployed) -> SkillSet:
 
 def _policy(skill: CalledSkill, deployed: Deployed) -> AnyPolicy:
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
-    if isinstance(_inside(skill.policy), Hierarchy):
+    if isinstance(innermost(skill.policy), Hierarchy):
         return ExportedHierarchy(inside, "")
     alone: Any = Functional(skill.policy, joins=skill.goals is not None)
     alone.observation_space = gym_space(deployed.sees)
@@ -215,9 +216,3 @@ def _reflexes(policy: Policy) -> tuple[Reflex, ...]:
                 found.append(Reflex(rule.condition, action, rule.name))
         policy = policy.policy
     return tuple(found)
-
-
-def _inside(policy: Policy) -> Policy:
-    while isinstance(policy, Around):
-        policy = policy.policy
-    return policy

@@ -11,7 +11,8 @@ from typing import Any
 
 from skillweave import policies
 from skillweave.export.compile import deployed
-from skillweave.policies.codec import FORMAT, MANIFEST, Written, checksum
+from skillweave.policies.codec import FORMAT, MANIFEST, Written
+from skillweave.policies.files import checksum
 from skillweave.runs.files import write_bytes
 from skillweave.terminal import printable
 from skillweave.types import Policy

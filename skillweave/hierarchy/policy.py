@@ -14,10 +14,11 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies.core import Memory as InPlaceMemory
 from skillweave.policies.core import flat, split
+from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide, Interruption
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.skills.foreign_policy import checksum, source_of
+from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.types import Array, Policy

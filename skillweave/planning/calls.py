@@ -25,7 +25,8 @@ from skillweave.planning.blame import Blame, blame
 from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
-from skillweave.skills.foreign_policy import checksum, source_of
+from skillweave.policies.files import checksum
+from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.spaces import obs_codec, same_space
 from skillweave.types import Array

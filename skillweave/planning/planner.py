@@ -25,11 +25,11 @@ from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbours import check_features, check_number
 from skillweave.planning.states import planning_states
 from skillweave.planning.task import Task, as_task
+from skillweave.policies.files import checksum
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
+from skillweave.policies.spaces import space_of
 from skillweave.selectors.base import ReadySelector
-from skillweave.skills.foreign_policy import checksum
-from skillweave.skills.goal_spaces import numbers_in
 from skillweave.types import Array
 
 MOST_GOALS = 256
@@ -321,7 +321,7 @@ class Planner(ReadySelector):
                 f"{who}: the hierarchy has one skill, {self.log.skills[0]!r}, and a guide says "
                 "nothing about goals, so this planner would guide nothing: use it as the selector"
             )
-        own = {name: numbers_in(space) for name, space in spaces.items()}
+        own = {name: space_of(space).size for name, space in spaces.items()}
         if spaces and own != sizes:
             raise RunError(
                 f"{who}: the planner's log has goals of {_shown_sizes(sizes)}, but the hierarchy's "

@@ -12,7 +12,7 @@ import numpy as np
 from .core import Array, Memory, Policy, Step, Turn, World
 from .errors import DeclarationError, PolicyError
 from .infos import batched_infos
-from .spaces import Space, at
+from .spaces import Space, allows_each, at
 
 ROW = np.zeros(1, np.int64)
 """The one environment."""
@@ -147,8 +147,7 @@ class Actor:
             allowed = acts.allowed(mask)
         except ValueError as error:
             raise DeclarationError(f"act(): {error}") from error
-        starts = np.cumsum((0, *acts.counts[:-1]))
-        if not np.logical_or.reduceat(allowed, starts).all():
+        if not allows_each(allowed, acts.counts):
             raise DeclarationError("act(): its action_mask allows no action")
         return allowed[None]
 

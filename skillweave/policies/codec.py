@@ -6,7 +6,6 @@ checksums. Functions are given by who reads.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import math
 import zipfile
@@ -24,7 +23,7 @@ from . import actor, hierarchy, leaves, mapped, parts, plan, planned, selectors,
 from .actor import Deployed
 from .core import Array
 from .errors import PolicyError, RunError
-from .files import parse_json, read_file, shown
+from .files import checksum, parse_json, read_file, shown
 
 FORMAT = 3
 """Version of ``policy.json``."""
@@ -324,11 +323,6 @@ def _unfit(where: str, entry: Any, wanted: str) -> PolicyError:
 
 
 # Folders ----------------------------------------------------------------------------------------
-
-
-def checksum(content: bytes) -> str:
-    """Compute the SHA-256 as hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def read_folder(

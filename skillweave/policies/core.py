@@ -282,6 +282,13 @@ class Around(Policy):
         self.holds = policy.holds
 
 
+def innermost(policy: Policy) -> Policy:
+    """Return the policy that combinators stand around."""
+    while isinstance(policy, Around):
+        policy = policy.policy
+    return policy
+
+
 def _forward(name: str) -> Callable[..., Any]:
     def call(self: Around, *arguments: Any) -> Any:
         return getattr(self.policy, name)(*arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -26,6 +27,11 @@ def shown(value: object, most: int = _SHOWN) -> str:
 
 
 # Files
+
+
+def checksum(content: bytes) -> str:
+    """Compute the SHA-256 as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def check_file(path: Path, most: int | None = None) -> None:

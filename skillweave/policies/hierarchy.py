@@ -47,7 +47,7 @@ from .core import (
 from .errors import PolicyError, SkillError
 from .leaves import Selector
 from .parts import GOAL, OBSERVATION, joined, joint_dtype, with_goal
-from .spaces import Space
+from .spaces import Space, discrete
 
 SKILL = "skill"
 """The part of a choice that names the skill; ``GOAL`` has a goal for each skill with goals."""
@@ -594,8 +594,7 @@ class Hierarchy(Policy):
         if not names or len(set(names)) < len(names):
             raise PolicyError(f"{where}.skills are {names}; they must have names of their own")
         seen = sees if goal is None or not self.fresh_calls else with_goal(sees, goal)
-        first, last = np.asarray(0), np.asarray(self.choices - 1)
-        choice = plain = Space("Discrete", "int64", (), first, last)
+        choice = plain = discrete(self.choices)
         spaces = {self.skills[i].name: own.space for i, own in self.goals.items()}
         if spaces:
             of = Space("Dict", parts=spaces)

@@ -192,7 +192,7 @@ class Network(Policy):
     def _size(self) -> tuple[int, ...]:
         if self.acts.parts is None:
             return self.acts.shape
-        return (sum(int(np.prod(leaf.shape)) for leaf in self.acts.leaves.values()),)
+        return (self.acts.size,)
 
     def start(self, n: int) -> Memory:
         """Return zeros (n, M), where the network is recurrent."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from .core import Array, Memory, Policy, Turn, World, code, read_only
 from .errors import PolicyError
-from .spaces import Space, at
+from .spaces import Space, at, discrete
 
 Shapes = Mapping[str, tuple[int | None, ...] | None]
 """Shapes of a model's inputs for one environment, by name; None: unknown."""
@@ -293,8 +293,7 @@ class Outputs:
         self.count = len(self.to)
         self._to = np.array(self.to)
         if not box:
-            last = np.array(self.count - 1)
-            self._chosen = Space("Discrete", "int64", (), np.array(0), last)
+            self._chosen = discrete(self.count)
             return
         for name in ("scale", "offset"):
             check_size(getattr(self, name), (self.count,), f"Outputs.{name}")
@@ -775,8 +774,7 @@ class Mapped(Policy):
         if self.goal is not None and not callable(self.goal):
             given[np.shape(self.goal)] = "Mapped.goal"
         if self.goal_space is not None:
-            size = sum(prod(leaf.shape) for leaf in self.goal_space.leaves.values())
-            given[(size,)] = "Mapped.goal_space"
+            given[(self.goal_space.size,)] = "Mapped.goal_space"
         if shapes and len(given) > 1:
             raise PolicyError(f"{' and '.join(given.values())} have goals of {list(given)}")
         if shapes and self.goal is None and self.goal_space is None:

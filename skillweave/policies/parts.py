@@ -13,7 +13,7 @@ import numpy as np
 from .core import Around, Array, Memory, Policy, Step, Turn, World, asked, code, observed
 from .errors import PolicyError, SkillError
 from .mapped import Input, check_places
-from .spaces import Space, at
+from .spaces import Space, allows_each, at
 
 OBSERVATION, GOAL = "observation", "goal"
 """The parts of what a skill with a goal observes."""
@@ -237,13 +237,8 @@ class Part:
         if self._columns is None:  # real numbers alone, which a mask is not for
             return None
         own = mask[..., self._columns]
-        free = self._free(own)
+        free = allows_each(own, self.own.counts)
         return own if free.all() else own | ~free[..., None]
-
-    def _free(self, own: Array) -> Array:
-        """Return where a mask (…, B) of its own choices allows an option of each, (…) bool."""
-        starts = np.cumsum([0, *self.own.counts[:-1]])
-        return np.asarray(np.logical_or.reduceat(own, starts, axis=-1).all(axis=-1))
 
     def check_mask(self, mask: Array | None, action: Array) -> None:
         """Raise a SkillError where a mask (n, A) leaves it no choice, or forbids the rest.
@@ -253,7 +248,10 @@ class Part:
         """
         if mask is None or self._all:
             return
-        if self._columns is not None and not self._free(mask[:, self._columns]).all():
+        if (
+            self._columns is not None
+            and not allows_each(mask[:, self._columns], self.own.counts).all()
+        ):
             raise SkillError(
                 f"{self.who}: the environment's action mask allows none of the choices that it "
                 "owns (acts): let it start only where one is allowed, or let it own more"
@@ -379,8 +377,11 @@ class Viewed(Around):
     def observe(self, memory: Memory, rows: Array, step: Step) -> None:
         """Let the policy notice what it sees of a step."""
         if self.watches:
-            seen = replace(step, obs=self.view(step.obs), next_obs=self.view(step.next_obs))
-            self.policy.observe(memory, rows, seen)
+            self.policy.observe(memory, rows, self.seen(step))
+
+    def seen(self, step: Step) -> Step:
+        """Return what the policy sees of a step."""
+        return replace(step, obs=self.view(step.obs), next_obs=self.view(step.next_obs))
 
 
 @dataclass(eq=False)

@@ -76,7 +76,7 @@ class Planned(Rule):
         for name, space in self.goals.items():
             if (aims := all_aims.get(name)) is None:
                 raise PolicyError(f"a plan has goals of {name!r}, but no skill {name!r} with goals")
-            size = space.flat(space.start(1)).shape[1]
+            size = space.size
             check("numbers", self.numbers.get(name), "f", (len(aims), size))
         self._aimed = np.array([aims is not None for aims in options.aims])
         self._aim = max((aims.shape[1] for aims in options.aims if aims is not None), default=1)

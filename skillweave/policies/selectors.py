@@ -30,7 +30,7 @@ from .files import shown
 from .hierarchy import SKILL
 from .leaves import Selector
 from .parts import GOAL
-from .spaces import Space
+from .spaces import Space, discrete
 
 
 @dataclass(eq=False)
@@ -56,8 +56,7 @@ class Rule(Selector):
             raise PolicyError(f"{self.who} needs skills of different names, not {self.skills}")
         for name in self.goals:
             self.number(name, ": its field goals", PolicyError)
-        last = np.asarray(self.count - 1)
-        self._choices = self._numbers = Space("Discrete", "int64", (), np.asarray(0), last)
+        self._choices = self._numbers = discrete(self.count)
         if self.goals:
             parts = {SKILL: self._numbers, GOAL: Space("Dict", parts=self.goals)}
             self._choices = Space("Dict", parts=parts)

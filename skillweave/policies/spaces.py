@@ -6,7 +6,7 @@ They are Gymnasium's, without Gymnasium.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -94,6 +94,11 @@ class Space:
                 ends = tuple(x.astype(self.dtype) for x in ends)
         low, high = ends
         return low, high
+
+    @cached_property
+    def size(self) -> int:
+        """The number of numbers of one element, as ``flat`` has them."""
+        return sum(math.prod(leaf.shape) for leaf in self.leaves.values())
 
     @cached_property
     def counts(self) -> list[int]:
@@ -389,6 +394,16 @@ class Space:
         return found
 
 
+def allows_each(mask: Array, counts: Sequence[int]) -> Array:
+    """Return where a mask (…, A) allows an option of each choice, (…) bool.
+
+    Args:
+        counts: the number of options of each choice, as of ``Space.counts``.
+    """
+    starts = np.cumsum((0, *counts[:-1]))
+    return np.asarray(np.logical_or.reduceat(mask, starts, axis=-1).all(axis=-1))
+
+
 def at(x: Array, path: tuple[str, ...]) -> Array:
     """Return the part of records (…) with these names."""
     for name in path:
@@ -406,6 +421,11 @@ def _numbers(value: Any) -> Array:
         with suppress(TypeError, ValueError):
             mask = np.concatenate([np.ravel(part) for part in value])
     return mask
+
+
+def discrete(n: int) -> Space:
+    """Return the space of the numbers below ``n``."""
+    return Space("Discrete", "int64", (), np.asarray(0), np.asarray(n - 1))
 
 
 def space_of(space: Any) -> Space:

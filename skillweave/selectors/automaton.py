@@ -16,6 +16,7 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies import selectors
 from skillweave.policies.errors import PolicyError
+from skillweave.policies.files import checksum
 from skillweave.policies.selectors import skill_and_goal
 from skillweave.selectors.base import (
     ReadySelector,
@@ -23,7 +24,6 @@ from skillweave.selectors.base import (
     function_name,
     goal_as_json,
 )
-from skillweave.skills.foreign_policy import checksum
 from skillweave.types import Array, Memory, Step
 
 Event = Callable[[Step], Any] | str

@@ -12,10 +12,11 @@ from typing import Any
 
 from skillweave.errors import DeclarationError
 from skillweave.policies import selectors
+from skillweave.policies.files import checksum
 from skillweave.policies.selectors import Branch, Check, Leaf, skill_and_goal
 from skillweave.selectors.base import ReadySelector, checked_function, goal_as_json
 from skillweave.selectors.tree import Composite, Condition, Node, Sequence
-from skillweave.skills.foreign_policy import checksum, made_up
+from skillweave.skills.foreign_policy import made_up
 
 
 class TreeSelector(ReadySelector):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NotRequired, Self, TypedDict
@@ -14,6 +13,7 @@ from gymnasium import Space
 from skillweave.errors import PolicyError, RunError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
+from skillweave.policies.files import checksum
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import untouched, watch
@@ -221,11 +221,6 @@ def as_recorded(
     if checksum(content) != recorded.get("sha256"):
         raise RunError(f"{where}: the copy of its policy is damaged: another checksum")
     return policy.restored(content)
-
-
-def checksum(content: bytes) -> str:
-    """Compute the SHA-256 as hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def qualified(thing: Any) -> str:

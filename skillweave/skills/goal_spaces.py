@@ -152,12 +152,6 @@ def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
     return np.repeat(fixed[None], n, axis=0)
 
 
-def numbers_in(space: gym.Space[Any]) -> int:
-    """Return how many numbers a goal of a space has."""
-    whole = space_of(space)
-    return whole.flat(whole.start(1)).size
-
-
 def from_numbers(space: gym.Space[Any], numbers: Array) -> Array:
     """Return goals (n, *goal_shape) of a space from their numbers (n, G); see ``Goals.flat``."""
     return space_of(space).of_numbers(numbers)

@@ -56,7 +56,7 @@ class Goals:
             raise DeclarationError(f"{self._who}: {text}") from error
         self.data = space_of(space)
         """The space as data."""
-        self.size = self.flat(self.start(1)).size
+        self.size = self.data.size
         """The numbers of a goal."""
         if not self.size:
             raise DeclarationError(

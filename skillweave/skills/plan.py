@@ -67,7 +67,7 @@ def fitted_mapping(
             )
         own = {"last_action": (outputs.count,)}
         if goal_space is not None:
-            own["goal"] = goal_space.flat(goal_space.start(1)).shape[1:]
+            own["goal"] = (goal_space.size,)
         elif callable(goal):
             own["goal"] = numbers_of(goal, made_up(seen, 2), f"{who}: goal()").shape[1:]
             if len(own["goal"]) != 1:

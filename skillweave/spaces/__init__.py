@@ -8,7 +8,6 @@ from skillweave.spaces.action_codec import (
     ActionCodec,
     JointCodec,
     action_codec,
-    allows_each,
     choice_counts,
 )
 from skillweave.spaces.choices import (
@@ -30,7 +29,6 @@ __all__ = [
     "NumberedChoiceCodec",
     "ObsCodec",
     "action_codec",
-    "allows_each",
     "choice_codec",
     "choice_counts",
     "env_form",

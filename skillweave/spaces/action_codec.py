@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -257,16 +256,6 @@ def choice_counts(space: gym.Space[Any]) -> tuple[int, ...]:
         return action_codec(space).counts
     except EnvError:
         return ()
-
-
-def allows_each(mask: Array, counts: Sequence[int]) -> Array:
-    """Return where a mask (…, A) allows a value of each choice, (…) bool.
-
-    Args:
-        counts: the number of values of each choice, as of ``choice_counts``.
-    """
-    starts = np.cumsum((0, *counts[:-1]))
-    return np.asarray(np.logical_or.reduceat(mask, starts, axis=-1).all(axis=-1))
 
 
 def _joint(space: gym.Space[Any], place: tuple[str, ...]) -> JointCodec:
