@@ -255,7 +255,8 @@ class Policy:
         """Raise a PolicyError where it does not fit these spaces: it may be from a file.
 
         Args:
-            sees, acts: ``Space`` of its observations and actions.
+            sees: ``Space`` of its observations.
+            acts: ``Space`` of its actions.
             goal: of the calls that it acts in; None: they have none.
             where: begins the message.
         """
