@@ -54,8 +54,9 @@ from skillweave import (
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
+from skillweave.collecting.learners import Calling
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.experience import Batch
@@ -194,7 +195,7 @@ class ManyRooms:
 
 def collector_of(
     skills: list[Skill], config: AlgorithmConfig, goal: int, state: Any = None
-) -> tuple[HierarchyCollector, Stack]:
+) -> tuple[Collector, Stack]:
     """Return a selector over skills in environments that begin anywhere, and its fresh learner."""
     policies: Any = tuple(ready_policy(s) for s in skills)
     space = FourRooms.observation_space
@@ -202,7 +203,7 @@ def collector_of(
     algorithm = make_algorithm(config, space, choices)
     engine: Any = ManyRooms(goal, config.num_envs)
     acting = Acting([(algorithm, 1)], config.num_envs)
-    collector = HierarchyCollector(engine, acting, SkillSet(tuple(skills), policies))
+    collector = Collector(engine, acting, Calling(SkillSet(tuple(skills), policies)))
     return collector, Stack(algorithm, state)
 
 

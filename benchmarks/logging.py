@@ -25,6 +25,7 @@ import skillweave as sw
 from benchmarks.common import median, report, table
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.learners import Calling
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning.recorder import Recorder
@@ -100,7 +101,7 @@ def collecting(run: Any, engine: Any, rows: int) -> Callable[[bool], float]:
     assert isinstance(policy, HierarchyPolicy)
     role = roles_of(run.hierarchy)["selector"]
     role = replace(role, spec=replace(role.spec, engine=engine))
-    task = selector_task(role, policy.skills)
+    task = selector_task(role, Calling(policy.skills))
     algorithm = make_algorithm(sw.PPO(), task.observation_space, task.action_space)
     params = algorithm.acting_params(algorithm.init([Seeds(0)]))
     spaces = role.spec.spaces.observation, role.spec.spaces.action

@@ -62,7 +62,9 @@ SCHEMA: dict[str, Column] = {
     "env_truncated": Column(raw=True, rollout=False),  # (T, N) bool, the environment's own limit
     "call_elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the call so far
     # In a trace alone. Under the path of a level (``inner/skill``), of its steps:
-    "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps of the episode so far
+    "elapsed": Column(raw=True, rollout=False),  # (T, N) int64, steps so far of the episode, or
+    # of the call of a skill that learns apart
+    "end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` of these
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
     "goal": Column(raw=True, rollout=False),  # (T, N, *goal_shape), under the path of a skill
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
@@ -168,6 +170,12 @@ class Trace(Batch):
         """T and N."""
         rows, envs = self["next_obs"].shape[:2]
         return rows, envs
+
+    @property
+    def ended(self) -> Array:
+        """Rows (T, N) bool that end an episode, or the call of a skill that learns apart."""
+        ended: Array = self["end"] != 0
+        return ended
 
     def rows(self, part: slice) -> Trace:
         """Return a slice of the T steps."""

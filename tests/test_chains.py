@@ -13,7 +13,7 @@ from small_runs import ON, Heard, StopAt, Stopped, assert_same, new_run
 from test_together import declare
 
 from skillweave import Automaton, SkillweaveError, Together
-from skillweave.collecting import skill_collector
+from skillweave.collecting import search
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy import training
 from skillweave.skills import Skill
@@ -44,7 +44,7 @@ def chain(*skills, **how):
 
 
 def test_a_skill_that_nobody_leads_to_is_told_with_who_was_tried(tmp_path, monkeypatch):
-    monkeypatch.setattr(skill_collector, "PATIENCE", 60)
+    monkeypatch.setattr(search, "PATIENCE", 60)
     hierarchy = chain(GetKey(), Beyond(), Unlock(), learn="apart", skill_steps=600)
     says = (
         r"'beyond': initiation\(\) was never true in 60 steps of calling 'get_key', so .*"

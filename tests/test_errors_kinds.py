@@ -22,7 +22,7 @@ import skillweave as sw
 from skillweave import recipes
 from skillweave.buffers import ram
 from skillweave.cli.overrides import apply_overrides
-from skillweave.collecting import skill_collector
+from skillweave.collecting import search
 from skillweave.collecting.workers import error_to_send
 from skillweave.errors import KINDS, kind_of, make_error, reworded
 from skillweave.hierarchy import options
@@ -226,7 +226,7 @@ def diverges() -> Any:
 
 
 def no_start(patch: pytest.MonkeyPatch) -> Any:
-    patch.setattr(skill_collector, "PATIENCE", 4)
+    patch.setattr(search, "PATIENCE", 4)
     never = skill(name="never", initiation=lambda _, obs: np.zeros(len(obs), bool))
     return train(skills=[never, Plain()])
 

@@ -17,7 +17,7 @@ from small_runs import assert_same
 import skillweave as sw
 from skillweave.algorithms import ppo
 from skillweave.api import Run, repairing
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.collector import Collector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
 from skillweave.hierarchy.roles import roles_of
@@ -272,7 +272,7 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     policies = {name: RandomChoice(3) for name in roles.skills}
     entry = {"name": "r", "budget": 100, "repair": {"skill": "press", "after": "flip"}}
     collector = repair.repair_stage(roles, entry).learning_task(policies).collector(2, None)
-    assert isinstance(collector, SkillCollector)
+    assert isinstance(collector, Collector)
     assert collector.call_limit == 5, "of 8 by itself"
 
 

@@ -19,8 +19,8 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.learners import Alone, Calling
+from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.seeding import Seeds
@@ -98,6 +98,26 @@ class Rememberer(gym.Env):
         return np.zeros(1, np.float32), change, False, False, {}
 
 
+def alone_in(
+    engine: Any, acting: Any, skill: Any = None, reflexes: Any = (), *starts: Any, **more: Any
+) -> Collector:
+    """A collector of a plain agent, or of a skill that learns apart; ``starts``: of ``Starts``."""
+    return Collector(engine, acting, Alone(skill, reflexes, starts=Starts(*starts, **more)))
+
+
+def calling_in(
+    engine: Any,
+    acting: Any,
+    skills: SkillSet,
+    keep_rewards: bool = False,
+    guide: Any = None,
+    as_skill: Any = None,
+    **learners: Any,
+) -> Collector:
+    """A collector of a selector that calls skills."""
+    return Collector(engine, acting, Calling(skills, guide, as_skill, keep_rewards), **learners)
+
+
 class Toy:
     """An engine whose N environments are written as one; subclasses say ``first`` and ``play``."""
 
@@ -120,7 +140,7 @@ class Toy:
 
     def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
         """A collector of its environments."""
-        return SkillCollector(self, acting)
+        return alone_in(self, acting)
 
     def mask(self) -> Array | None:
         return None
@@ -263,9 +283,7 @@ class Calls(Toy):
 
     def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
         calls = tuple(Call(i, (1, 10)[i], self.allowed[i]) for i in range(2))
-        return HierarchyCollector(
-            self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared
-        )
+        return calling_in(self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared)
 
     def play(self, action: Array) -> Any:
         reward = np.where(action == 1, 3 * (self.under_way == 0), 1)
@@ -510,7 +528,7 @@ def training(
         learner = learner_of(stack, n, seeds, row_steps=row_steps, goes_on_at=goes_on_at)
     acting = Acting([(algorithm, p)], n)
     own = isinstance(env, Toy)
-    collector = env.collector(acting, shared) if own else SkillCollector(env, acting)
+    collector = env.collector(acting, shared) if own else alone_in(env, acting)
     return Training(learner, Collectors([collector], p), seeds, Episodes())
 
 

@@ -93,6 +93,8 @@ class Acting:
         self.to_env, self.memory_size = first.to_env, first.memory_size
         self.widened = first.widened
         self.keeps_head = first.store == "rollout"
+        self.row = 0
+        """The request's row that is collected."""
         self._span: _Span | None = None
 
     def begin(self, request: Request, every_step: bool = True) -> None:
@@ -101,7 +103,7 @@ class Acting:
         Args:
             every_step: all act in each of its steps, so what they need of chance is drawn at once.
         """
-        self._request, self._at = request, 0
+        self._request, self.row, self._every = request, 0, every_step
         self._noises: list[Any] = []
         self._generators = [[s.torch() for s in self._seeds(i)] for i in range(len(self.stacks))]
         if every_step and not (request.at_random or request.greedy):
@@ -109,18 +111,6 @@ class Acting:
                 algorithm.noise(generators, request.rows, self.each)
                 for (algorithm, _), generators in zip(self.stacks, self._generators, strict=True)
             ]
-
-    @torch.inference_mode()
-    def all(self, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in all environments, in the request's next step; obs (N, …), mask (N, A)."""
-        at, self._at = self._at, self._at + 1
-        acted = self._act(lambda stack: self._noises[stack][at], obs, mask, memory)
-        request = self._request
-        if request.action_repeat is not None and not (request.at_random or request.greedy):
-            self._hold_actions(
-                acted.action, request.action_repeat, request.action_repeat.at + at, mask
-            )
-        return acted
 
     def _hold_actions(
         self, action: Array, action_repeat: ActionRepeat, row: int, mask: Array | None
@@ -159,13 +149,22 @@ class Acting:
 
     @torch.inference_mode()
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Array | None) -> Acted:
-        """Act in environments ``rows`` (n,) only; all arguments are of these."""
-        if self.members == 1:
+        """Act in environments ``rows`` (n,); all arguments are of these."""
+        if self.members == 1 and not self._every:
             return self._act(lambda stack: self._draw(stack, len(obs)), obs, mask, memory)
+
+        def noise(stack: int) -> Any:
+            return self._noises[stack][self.row] if self._every else self._draw(stack, self.each)
+
         # Networks of several members take equally many rows of each, so all act, and some count.
         n = self.each * self.members
-        whole = (_spread(x, rows, n) for x in (obs, mask, memory))
-        acted = self._act(lambda stack: self._draw(stack, self.each), *whole)
+        obs, mask, memory = (_spread(x, rows, n) for x in (obs, mask, memory))
+        acted, request = self._act(noise, obs, mask, memory), self._request
+        repeat = request.action_repeat
+        if self._every and repeat is not None and not (request.at_random or request.greedy):
+            self._hold_actions(acted.action, repeat, repeat.at + self.row, mask)
+        if len(rows) == n:
+            return acted
         head, after = acted.dist_params, acted.recurrent_state
         return Acted(
             acted.action[rows],

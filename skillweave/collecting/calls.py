@@ -28,15 +28,14 @@ class OpenCalls:
 
     Args:
         level: whose selector it is.
-        num_envs: N.
         shaped: the collector's dict of arrays (N, …) whose shape is known when a call starts.
         keep_rewards: of each call, keep the reward of every step.
     """
 
     def __init__(
-        self, level: Level, num_envs: int, shaped: dict[str, Array], *, keep_rewards: bool = False
+        self, level: Level, shaped: dict[str, Array], *, keep_rewards: bool = False
     ) -> None:
-        n, hierarchy, self._shaped = num_envs, level.hierarchy, shaped
+        n, hierarchy, self._shaped = len(level.memory["skill"]), level.hierarchy, shaped
         self.level, self.keep_rewards = level, keep_rewards
         self.memory_size = 0 if level.selector is None else level.selector.net.memory_size
         self.kept: dict[str, Array] = {

@@ -1,4 +1,4 @@
-"""The part that all collectors share: open environments, from one request to the next."""
+"""The collector: N environments, who acts in them, and their open episodes between requests."""
 
 from __future__ import annotations
 
@@ -10,16 +10,31 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
+from skillweave.collecting.judge import judge, seen_by
+from skillweave.collecting.learners import Alone, Calling, LevelLearners, OneLearner
 from skillweave.collecting.restored import check_numbers, opened
+from skillweave.collecting.search import Search
+from skillweave.collecting.views import steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
-from skillweave.envs.engine import Engine, checksums
-from skillweave.envs.infos import info_numbers
-from skillweave.errors import RunError
-from skillweave.experience import Batch, Trace, padded_last_axis, side_by_side
+from skillweave.envs.engine import Engine, RawStep, checksums
+from skillweave.envs.infos import info_numbers, reported_success
+from skillweave.errors import DeclarationError, RunError
+from skillweave.experience import INFO, Batch, Trace, padded_last_axis, side_by_side
+from skillweave.policies.core import (
+    LIMIT,
+    OWN,
+    Turn,
+    World,
+    end_with_episode,
+    flat,
+    part_of,
+    restart,
+)
+from skillweave.policies.spaces import Space, space_of
 from skillweave.seeding import Seeds, seed_global_generators
-from skillweave.skills.goals import Goals
+from skillweave.skills.goals import goals_of
 from skillweave.skills.info_words import info_keys
-from skillweave.types import Array, prefixed, unprefixed
+from skillweave.types import Array, Step, prefixed, unprefixed
 
 RETURN, TASK_RETURN, LENGTH, SUCCESS = range(4)
 """The first columns of ``Collected.episodes``."""
@@ -52,30 +67,76 @@ class Collected:
 class Collector:
     """N environments, and who acts in them. A function of requests, seeds and ``state``.
 
+    A skill that has goals gets one where a call of it starts, by ``Skill.goals``, until it ends.
     A checkpoint ends no episode: ``state`` holds what is needed to play the open ones again.
 
     Args:
         engine: the environments; they are reset by ``start``, or stand where ``restore`` puts them.
+        acting: the plain agent, the skill, or the selectors that learn; None: the guide decides, or
+            only ``like`` is to act.
+        who: acts.
+        learners: by path, all others who learn: ``skill``, ``inner/skill``, ``inner/selector``;
+            ``skill_critic`` and ``inner/skill_critic`` say what skills are worth. None: one alone
+            learns, at the path ""; else a selector has the path ``selector``.
+        margins: by the paths of critics: calls end where a new decision is worth this much more.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        acting: Acting | None,
+        who: Alone | Calling,
+        learners: Mapping[str, Acting] | None = None,
+        margins: Mapping[str, float] | None = None,
+    ) -> None:
         self.engine, self.num_envs = engine, engine.num_envs
         n = self.num_envs
+        self.acting, self.who, self.skill = acting, who, who.skill
+        self.learners, self._together = learners or {}, learners is not None
+        self._goals = goals_of(self.skill)
         self.obs: Array = np.empty(0)
         """(N, *obs_shape), what to act on next."""
+        self.open: dict[str, Array] = {}
+        """What is kept of open calls, (N, …) each, whose shape is known when one begins."""
+        self.search: Search | None = None
+        """What leads to where a skill may start; None: it starts wherever episodes do."""
+        self.call_limit = None if self.skill is None else self.skill.max_steps
+        """The most steps of a call of the skill; None: any number."""
+        self.learning: OneLearner | LevelLearners
+        if isinstance(who, Alone):
+            self.learning = OneLearner(who, engine, acting)
+            self.search = who.starts.search(who.skill, engine)
+            self.call_limit = who.call_limit or self.call_limit
+        else:
+            self.learning = LevelLearners(who, engine, acting, learners, margins, self.open)
+        self.policy, self.memory = self.learning.policy, self.learning.memory
         self.kept: dict[str, Array] = {
             "age": np.zeros(n, np.int64),  # steps of the open episode
             "sums": np.zeros((n, 3)),  # of it: return, return of the task, length as the skill's
+            **flat(self.memory, "player."),
+            **self.learning.kept,
         }
         """What is kept of each environment, (N, …) each; changed in place."""
-        self.values: dict[str, range | Goals] = {}
+        self.values = prefixed("player", self.policy.values()) | self.learning.values
         """By names of these, what numbers that choose among something may be, or whose goals."""
-        self.seen_goals: dict[str, Goals] = {}
-        """By names of open calls' observations, the goals that stand in them."""
-        self.open: dict[str, Array] = {}
-        """The same of what has a shape that is known only when it begins."""
-        self.after_request = {"sums"}
+        self.after_request = {"sums", *self.learning.kept}
         """Names in ``kept`` that change when the steps of a request are judged, not in a step."""
+        if self._goals is not None:
+            self.kept["goal"] = self._goals.start(n)
+            self.values["goal"] = self._goals
+            self.kept["needs_goal"] = np.ones(n, bool)  # a call starts
+        if self.search is not None:
+            self.kept |= self.search.kept
+            self.values |= self.search.values
+        self._last_actions: Space | None = None  # of the actions, where the last one counts
+        if self.policy.holds or (self.search is not None and self.search.holds):
+            self._last_actions = space_of(engine.action_space)
+            self.kept["last_action"] = self._last_actions.start(n)
+        self.overridden = np.zeros(n, bool) if self.learning.overrides else None
+        """(N,), where reflexes acted in the latest step; None: not recorded."""
+        ends = self.skill is not None and self.skill.defines("termination")
+        self._asks = self.policy.watches or self.search is not None or ends
+        """Something is asked about each step while it is made."""
         self.begun = False
         self._all = np.arange(n)
         self.log_info: tuple[str, ...] = ()
@@ -85,6 +146,17 @@ class Collector:
         self._info_keys: set[str] = set()
         self._ended: list[tuple[int, Array, Array]] = []
         """Of episodes that ended in a request: row, environments, and numbers without sums."""
+
+    def like(self, engine: Engine, acting: Acting) -> Collector:
+        """Return a collector of the same kind over other environments."""
+        if self._together:
+            raise DeclarationError("hierarchies that learn as a whole do not evolve")
+        return Collector(engine, acting, self.who)
+
+    @property
+    def elapsed(self) -> Array:
+        """(N,) steps of the calls of the skill that acts, or of the episodes."""
+        return self.kept["age" if self.search is None else "elapsed"]
 
     def start(self, seeds: Seeds) -> None:
         """Start every environment, unless they have started."""
@@ -101,6 +173,7 @@ class Collector:
         writer = self._writer(request.rows)
         for _ in range(request.rows):
             self._step(writer)
+        self._world.trace = None  # only learners hold it from here on
         trace = writer.trace()
         judged, found = self._judge(trace)
         batches = self._views(trace, judged)
@@ -111,7 +184,9 @@ class Collector:
         limited = self.engine.time_limit is not None
         longest = 0 if limited else int(self.kept["age"].max())
         keys = frozenset(self._info_keys)
-        calls = None if self.log_calls is None else self._calls(trace, self.log_calls)
+        calls = None
+        if self.log_calls is not None and isinstance(self.learning, LevelLearners):
+            calls = self.learning.log(trace, self.log_calls)
         return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)
 
     def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
@@ -136,17 +211,14 @@ class Collector:
                 self._step(writer)
                 for _, ids, _ in self._ended[-1:]:
                     playing[ids] = False
-                playing &= ~self._given_up()
+                if self.search is not None:
+                    playing &= ~self.search.given_up
             steps += writer.row
             for _, ids, episodes in self._judge(writer.trace())[1]:
                 first = unknown[ids]
                 found[ids[first]], unknown[ids[first]] = episodes[first], False
         found[playing, :3] = self.kept["sums"][playing]
         return found
-
-    def _given_up(self) -> Array:
-        """(N,) bool, environments in which an episode cannot begin, as it seems."""
-        return np.zeros(self.num_envs, bool)
 
     def state(self) -> dict[str, Array]:
         """Return what ``restore`` needs. It changes nothing."""
@@ -168,6 +240,11 @@ class Collector:
         # Environments that draw from global generators go on otherwise than they began.
         seed_global_generators(Seeds(_checksum(state)) / "global")
         kept = unprefixed("kept", state)
+        if others := sorted(kept.keys() ^ {*self.kept, "obs"}):
+            raise RunError(
+                f"the checkpoint's open episodes differ in {others[0]!r}: it is not of this stage, "
+                "or damaged"
+            )
         for name, values in self.kept.items():
             found, own = kept[name], as_numbers(values)
             if found.shape != own.shape or found.dtype != own.dtype:
@@ -182,7 +259,7 @@ class Collector:
         space = self.engine.observation_space
         self.open.clear()
         saved = unprefixed("open", state)
-        self.open |= opened(saved, self.kept, self.obs, space, self.seen_goals)
+        self.open |= opened(saved, self.kept, self.obs, space, self.learning.seen_goals)
         other = np.flatnonzero(checksums(self.obs) != kept["obs"])
         ids = np.union1d(early, other)
         self._clear(ids)
@@ -192,21 +269,139 @@ class Collector:
         """Release the environments."""
         self.engine.close()
 
-    def like(self, engine: Engine, acting: Acting) -> Any:
-        """Return a collector of the same kind over other environments."""
-        raise NotImplementedError
+    # Steps are made -----------------------------------------------------------------------------
 
     def _prepare(self, request: Request) -> None:
         """Act by this request from now on."""
-        raise NotImplementedError
+        self.learning.begin(request, self.elapsed)
+        self._record, self._greedy = request.record, request.greedy
+        self._goal_rng = (request.seeds / "goals").numpy()
+        rng, last = (request.seeds / "skills").numpy(), self.kept.get("last_action")
+        self._world = World(rng, self.kept["age"], last, self.overridden)
 
     def _writer(self, rows: int) -> TraceWriter:
         """Return what writes the trace of ``rows`` steps."""
-        return TraceWriter(rows, self.num_envs)
+        skill = self.skill
+        reads = skill is not None and any(map(skill.defines, skill.methods))
+        reads |= any(name.startswith(INFO) for name in self._record) or self.learning.reads_infos()
+        if self.log_calls is not None and isinstance(self.who, Calling):
+            reads |= bool(self.log_calls)
+            reads |= any(s.defines("success") for s in self.who.skills.skills)
+        self._world.trace = writer = TraceWriter(rows, self.num_envs, keep_infos=reads)
+        return writer
 
     def _step(self, out: TraceWriter) -> None:
         """Step every environment, and write what happened."""
-        raise NotImplementedError
+        obs, mask, search, rows = self.obs, self.engine.mask(), self.search, self._all
+        if search is not None:
+            rows = search.playing(obs, self._world)
+        if self.overridden is not None:
+            self.overridden[:] = False
+        goal = self._goal(rows)
+        turn = Turn(self._world, mask, goal, self._greedy)
+        if len(rows) == self.num_envs:
+            waiting, action = rows[:0], self.policy.act(self.memory, rows, obs, turn)
+        else:
+            waiting = np.setdiff1d(self._all, rows)
+            action = self._found(rows, waiting, turn)
+            out.write(waiting, valid=np.zeros(len(waiting), bool))
+        whole = self.learning.whole or self.log_calls is not None
+        if whole:  # else only where a selector decides and calls end
+            out.write(obs=obs, env_action=action, mask=mask, goal=goal, overridden=self.overridden)
+        raw = self.engine.step(action)
+        self.kept["age"] += 1
+        if search is not None:
+            self.elapsed[rows] += 1
+        if self._last_actions is not None:
+            self.kept["last_action"][:] = action
+        step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
+        end = self._ends(raw, step, rows, goal)
+        self.learning.write(out, end)
+        out.write(
+            elapsed=self.elapsed,
+            end=end,
+            env_reward=raw.reward,
+            env_terminated=raw.terminated,
+            env_truncated=raw.truncated,
+            next_obs=raw.next_obs if whole else None,
+            next_mask=self.engine.mask() if whole else None,
+        )
+        if not whole:
+            over = np.flatnonzero(self.memory["end"])
+            out.write(over, next_obs=raw.next_obs[over])
+        self.obs = raw.next_obs
+        if len(over := np.flatnonzero(end)):
+            success = None if self.skill is not None else reported_success(raw.info, self.num_envs)
+            success = None if success is None else success[over]
+            self._tell(out.row, over, raw.info, success, task=self.skill is not None)
+        if search is not None and (len(over) or len(waiting)):
+            assert step is not None
+            if len(again := search.again(over[end[over] == LIMIT])):
+                self._begin_call(again, episodes=False)
+            lost = waiting[(raw.terminated | raw.truncated)[waiting]]
+            given_up = search.observe(np.setdiff1d(waiting, lost), step) if len(waiting) else lost
+            over = np.union1d(np.setdiff1d(over, again), np.union1d(lost, given_up))
+        self._begin_anew(over)
+        out.next(raw.info)
+
+    def _found(self, rows: Array, waiting: Array, turn: Turn) -> Array:
+        """Return actions (N, …): of the skill in ``rows``, else of the search for its start."""
+        assert self.search is not None
+        own = None
+        if len(rows):
+            own = self.policy.act(self.memory, rows, self.obs[rows], turn.some(rows))
+        found = self.search.act(waiting, self.obs, turn.mask, turn.world)
+        action = np.zeros((self.num_envs, *found.shape[1:]), found.dtype)
+        action[waiting] = found
+        if own is not None:
+            action[rows] = own
+        return action
+
+    def _goal(self, rows: Array) -> Array | None:
+        """Return the goals of all environments, (N, *goal_shape), after those of new calls.
+
+        Args:
+            rows: (k,) environments in which the skill acts.
+        """
+        if self._goals is None:
+            return None
+        needs, kept = self.kept["needs_goal"], self.kept["goal"]
+        if len(ids := rows[needs[rows]]):
+            kept[ids] = self._goals.draw(self.obs[ids], self._goal_rng)
+            needs[ids] = False
+        return kept.copy()
+
+    def _ends(self, raw: RawStep, step: Step | None, rows: Array, goal: Array | None) -> Array:
+        """Let the policy notice a step; return why calls or episodes ended, (N,) int8 ``CallEnd``.
+
+        Where skills that are called have ended, and none may start, the call of the whole ends,
+        too; its value goes on.
+
+        Args:
+            rows: (k,) environments in which the policy acted.
+            goal: (N, *goal_shape).
+        """
+        end, elapsed, skill = np.zeros(self.num_envs, np.int8), self.elapsed[rows], self.skill
+        if self.call_limit is not None:
+            end[rows[elapsed >= self.call_limit]] = LIMIT
+        if step is not None and len(rows):
+            own_goal = None if goal is None else goal[rows]
+            if self.policy.watches:
+                seen = step
+                if self.search is not None or goal is not None:
+                    seen = part_of(step, elapsed, rows, None, own_goal)
+                self.policy.observe(self.memory, rows, seen)
+            if skill is not None:
+                if self.policy.restricts:
+                    end[rows[self.policy.stuck(self.memory, rows, raw.next_obs[rows])]] = LIMIT
+                seen = seen_by(skill, step, elapsed, rows, own_goal)
+                end[rows[judge(skill, seen, rows).stops]] = OWN
+        over = np.zeros(self.num_envs, bool)
+        over[rows] = (raw.terminated | raw.truncated)[rows]
+        end_with_episode(end, over)
+        return end
+
+    # They are judged ----------------------------------------------------------------------------
 
     def _judge(self, trace: Trace) -> tuple[Batch, list[tuple[int, Array, Array]]]:
         """Judge the steps of a trace.
@@ -215,15 +410,20 @@ class Collector:
             The steps as those who act are judged by them, and the episodes that ended in them:
             row, environments, and numbers (k, 4 + I), as in ``Collected.episodes``.
         """
-        raise NotImplementedError
+        acts, elapsed, goal = trace.valid_rows, trace["elapsed"], trace.get("goal")
+        steps = steps_of(trace, self.skill, acts, elapsed, trace["end"], goal)
+        each = np.empty((*trace.lead, 3))
+        each[..., 0], each[..., 1], each[..., 2] = steps["reward"], trace["env_reward"] * acts, acts
+        found = self._count(each)
+        if self.skill is not None and self.skill.defines("success"):
+            success = successes_of(trace, self.skill, acts, elapsed, goal)
+            for row, ids, episodes in found:
+                episodes[:, SUCCESS] = success[row, ids]
+        return steps, found
 
     def _views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
         """Return what each learner did, by path; ``steps`` are those of ``_judge``."""
-        raise NotImplementedError
-
-    def _calls(self, trace: Trace, info: Sequence[str]) -> Batch:
-        """Return the steps with what calls did in them; ``info`` are keys that are logged."""
-        raise NotImplementedError
+        return self.learning.views(trace, steps)
 
     def _count(self, each: Array) -> list[tuple[int, Array, Array]]:
         """Add numbers (T, N, 3) to the sums of the open episodes; return those that ended."""
@@ -241,18 +441,18 @@ class Collector:
 
     def _forget(self, ids: Array) -> None:
         """Episodes of environments ``ids`` (k,) have just begun."""
-        for name, kept in self.kept.items():
-            if name not in self.after_request:
-                kept[ids] = 0
-        for name, goals in self.values.items():
-            if not isinstance(goals, range):  # zero may be no goal
-                self.kept[name][ids] = goals.start(len(ids))
+        self.kept["age"][ids] = 0
+        if self._last_actions is not None:
+            self.kept["last_action"][ids] = self._last_actions.start(len(ids))
+        self._begin_call(ids, episodes=True)
 
-    def _keep_after_request(self, prefix: str, kept: Mapping[str, Array]) -> None:
-        """Keep arrays (N, …) that change when the steps of a request are judged."""
-        named = {prefix + name: value for name, value in kept.items()}
-        self.kept |= named
-        self.after_request |= named.keys()
+    def _begin_call(self, ids: Array, *, episodes: bool) -> None:
+        """The policy begins anew in environments ``ids`` (k,), perhaps in new episodes."""
+        restart(self.policy, self.memory, ids)
+        if self._goals is not None:
+            self.kept["needs_goal"][ids] = True
+        if self.search is not None:
+            self.search.begin(ids, self.obs, episodes=episodes)
 
     def _clear(self, ids: Array) -> None:
         """Nothing of environments ``ids`` (k,) is left of the requests before."""
@@ -309,7 +509,7 @@ def _checksum(state: Mapping[str, Array]) -> int:
     return found
 
 
-_OF_LEARNERS = {"memory", "state_before", "player.selector.rnn"}
+_OF_LEARNERS = {"state_before", "player.rnn", "player.own.rnn", "player.selector.rnn"}
 """What is kept of the learners' memory: others begin without."""
 
 

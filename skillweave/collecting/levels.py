@@ -99,10 +99,15 @@ class Level:
     """What it remembers, of all environments; changed in place."""
     learners: Mapping[str, Acting]
     """By path, all who learn below the first selector."""
-    goals: Goals | None = None
-    """Its own, as a skill that has goals."""
+    skill: Skill | None = None
+    """That all of it is, in another hierarchy."""
     path: str = ""
     """Of these skills, as columns of a trace have it: empty, or ``inner/`` for example."""
+
+    @cached_property
+    def goals(self) -> Goals | None:
+        """Its own, as a skill that has goals."""
+        return goals_of(self.skill)
 
     @property
     def skills(self) -> tuple[Skill, ...]:
@@ -128,9 +133,7 @@ class Level:
             path = f"{self.path}{skill.name}/"
             if any(name.startswith(path) for name in self.learners):
                 inside, memory = within(self.hierarchy.skills[i].policy), self.memory[str(i)]
-                found[i] = Level(
-                    policy.skills, inside, memory, self.learners, goals_of(skill), path
-                )
+                found[i] = Level(policy.skills, inside, memory, self.learners, skill, path)
         return found
 
     @cached_property

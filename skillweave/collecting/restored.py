@@ -17,8 +17,9 @@ from skillweave.types import Array, Memory
 
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""
-OF_OTHERS = ("player.", "starters.", "base.", "last_action")
-"""How names begin of what others remember, who may be a user's: that may be anything."""
+OF_OTHERS = ("player.", "starters.", "last_action")
+"""How names begin of what policies remember. They may be a user's, and that may be anything, but
+for what a network remembers (``rnn``)."""
 PLAYERS = ("player", "starters")
 """What players are called whose memory is kept."""
 
@@ -46,7 +47,7 @@ def check_numbers(
     own = {
         k: x
         for k, x in kept.items()
-        if not k.startswith(OF_OTHERS) and (k not in values or k in ranges)
+        if (not k.startswith(OF_OTHERS) or k.endswith(".rnn")) and (k not in values or k in ranges)
     }
     counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
     for name, those in (counts | ranges).items():

@@ -168,12 +168,37 @@ def in_place(policy: Any, who: str = "the policy's act()") -> Policy:
     return Returns(policy, who, blame, watches=watches)
 
 
+def acting_apart(
+    policy: Any,
+    skill: Skill | None,
+    part: OwnPart | None,
+    reflexes: tuple[Reflex, ...],
+    space: gym.Space[Any],
+) -> Policy:
+    """Return the policy of a skill that acts by itself, or of a plain agent, with reflexes.
+
+    Args:
+        policy: the skill's; see ``policy_of``.
+        skill: None: a plain agent.
+        part: of the skill.
+        reflexes: in force.
+        space: of the environment's actions.
+    """
+    policy = _whole(policy, skill, part)
+    return Reflexes(policy, reflexes, space) if reflexes else policy
+
+
+def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
+    """Return a skill's policy, whose actions are whole ones."""
+    who = "" if skill is None else f"skill {path_of(skill)!r}: its policy's act()"
+    found = policy_of(policy, goals_of(skill), part, who)
+    return found if part is None else PartOf(found, part.part)
+
+
 def _skill(skills: SkillSet, i: int) -> CalledSkill:
-    skill, part = skills.skills[i], skills.part(i)
+    skill = skills.skills[i]
     path, goals = path_of(skill), goals_of(skill)
-    policy = policy_of(skills.policies[i], goals, part, f"skill {path!r}: its policy's act()")
-    if part is not None:
-        policy = PartOf(policy, part.part)
+    policy = _whole(skills.policies[i], skill, skills.part(i))
     asks = {name: getattr(skill, name) for name in ENDS if skill.defines(name)}
     return CalledSkill(
         skill.name, path, policy, skills.limit(i), skill.max_steps, goals=goals, **asks

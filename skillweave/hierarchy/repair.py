@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave.collecting.skill_collector import NAMED_SHARE
+from skillweave.collecting.search import NAMED_SHARE, Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec
 from skillweave.hierarchy.assembly import parts_of, policy_at
@@ -104,17 +104,15 @@ def repair_stage(
             # As much as if a call that ends by the event went on, and the event held.
             rest = bonus * float(np.sum(gamma ** np.arange(limit or LONG_CALL)))
             learning = replace(role, skill=eager(role.skill, holds, bonus, rest))
-        return skill_task(
-            learning,
-            level.reflexes,
+        starts = Starts(
             level.skill_set(others),
             0 if calls is None else START_CALLS,
             level.apart.search_steps,
-            start_after=(name_of(repair["after"]),),
-            # Calls are what counts, and steps beyond their limit would take steps from the starts.
-            call_limit=limit,
+            after=(name_of(repair["after"]),),
             named_share=REHEARSED_SHARE if "rehearsal" in repair else NAMED_SHARE,
         )
+        # Calls are what counts, and steps beyond their limit would take steps from the starts.
+        return skill_task(learning, level.reflexes, starts, limit)
 
     return Stage(
         entry["name"],

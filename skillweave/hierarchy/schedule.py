@@ -10,6 +10,8 @@ from dataclasses import replace
 from typing import Any
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, OnPolicy, SkillCritic
+from skillweave.collecting.learners import Calling
+from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.assembly import can_act, learning_set, policy_at
@@ -156,8 +158,8 @@ def _together(roles: Roles, level: Level, budget: int) -> Stage:
 def _joint_task(roles: Roles, level: Level, skills: SkillSet) -> JointTask:
     """Return the task in which the selector of a level calls ``skills``, which may learn, too."""
     below = {role.path: role for role in roles.below(level.path)}
-    guide = active_guide(roles, level)
-    return joint_task(level.selector_path, below, skills, guide, level.as_skill)
+    who = Calling(skills, active_guide(roles, level), level.as_skill)
+    return joint_task(level.selector_path, below, who)
 
 
 def _plays_alone(roles: Roles, level: Level) -> bool:
@@ -267,15 +269,14 @@ def _skill_stage(roles: Roles, level: Level, path: str, budget: int) -> Stage:
         others = {
             p: policy_at(roles, policies, p) for p in level.skills if can_act(roles, p, policies)
         }
-        return skill_task(
-            role,
-            level.reflexes,
+        starts = Starts(
             level.skill_set(others) if others else None,
             0 if isinstance(calls, tuple) else calls or 0,
             apart.search_steps,
             apart.episode_calls,
             calls if isinstance(calls, tuple) else (),
         )
+        return skill_task(role, level.reflexes, starts)
 
     target = check_target(level.skills[path])
     return Stage(path, "skill", role.config, budget, learning_task, target, level=level.path)
@@ -289,7 +290,7 @@ def _selector_stage(roles: Roles, level: Level, config: AlgorithmConfig, budget:
         skills = level.skill_set({p: policy_at(roles, policies, p) for p in level.skills})
         if interrupts:
             return _joint_task(roles, level, skills)
-        return selector_task(role, skills, active_guide(roles, level), level.as_skill)
+        return selector_task(role, Calling(skills, active_guide(roles, level), level.as_skill))
 
     return Stage(
         role.path,

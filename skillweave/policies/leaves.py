@@ -79,14 +79,15 @@ class Learning(Policy):
 
     Args:
         net: acts in some of N environments; by their numbers it knows which member acts.
-        path: of the learner, before the names of its columns.
+        path: of the learner, before the names of its columns; "" where there is one.
         decides: it is a selector: what it decided on is written, too.
     """
 
     def __init__(self, net: Any, path: str, *, decides: bool = False) -> None:
         self.net = net
         names = ("action", "dist_params", "decided", "obs", "allowed", "state_before")
-        self._columns = [f"{path}/{name}" for name in (names if decides else names[:2])]
+        path = f"{path}/" if path else ""
+        self._columns = [path + name for name in (names if decides else names[:2])]
 
     @property
     def action_space(self) -> Any:
@@ -105,8 +106,8 @@ class Learning(Policy):
         if acted.recurrent_state is not None:
             memory["rnn"][rows] = acted.recurrent_state
         if turn.world.trace is not None:
-            every = np.ones(len(rows), bool)
-            values = acted.action, acted.dist_params, every, obs, mask, before
+            decided = np.ones(len(rows), bool)
+            values = acted.action, acted.dist_params, decided, obs, mask, before
             turn.world.trace.write(rows, **dict(zip(self._columns, values, strict=False)))
         action: Array = self.net.to_env(acted.action)
         return action

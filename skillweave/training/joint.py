@@ -17,7 +17,6 @@ from skillweave.algorithms.policy import AgentPolicy, checked_tensor, make_algor
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import MakeCollector
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.envs.checks import longest_evaluation
 from skillweave.envs.engine import Engine
@@ -337,8 +336,8 @@ def _joint_collector(
     algorithms: Mapping[str, Algorithm],
     margins: Mapping[str, float],
     engine: Engine,
-) -> HierarchyCollector:
+) -> Collector:
     """Return a collector in which the selector and all skills act."""
     acting = {k: Acting([(a, 1)], engine.num_envs) for k, a in algorithms.items()}
     selector = acting.pop(SELECTOR, None)
-    return learning_task.joint_collector(engine, selector, acting, margins)
+    return Collector(engine, selector, learning_task.who, acting, margins)

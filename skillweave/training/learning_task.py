@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 import gymnasium as gym
 
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import NAMED_SHARE, SkillCollector
+from skillweave.collecting.learners import Alone, Calling
+from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.envs.engine import Engine, GymnasiumEngine
+from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.policies.hierarchy import ActiveGuide
-from skillweave.skills import Reflex, Skill
+from skillweave.skills import Reflex
 from skillweave.training.role import Role, agent_role
 
 C = TypeVar("C", bound=Collector)
@@ -83,56 +82,37 @@ class LearningTask:
 def skill_task(
     role: Role,
     reflexes: Sequence[Reflex] = (),
-    starters: SkillSet | None = None,
-    start_calls: int = 0,
-    search_steps: int | None = None,
-    episode_calls: int = 1,
-    start_after: tuple[str, ...] = (),
+    starts: Starts | None = None,
     call_limit: int | None = None,
-    named_share: float = NAMED_SHARE,
 ) -> LearningTask:
     """Return the learning task of a skill's stage, or of a plain agent's.
 
     Args:
-        starters: skills that can act already; they bring the environment to where the skill may
-            start.
-        start_calls: an episode starts after up to this many calls of ``starters``.
-        search_steps: reset an episode in which the skill cannot start within this many steps.
-        episode_calls: the most calls of the skill in an episode.
-        start_after: names among ``starters``; a share of the episodes start after a call of one.
+        role: who learns.
+        reflexes: in force while it acts.
+        starts: how calls of the skill start; None: wherever it may.
         call_limit: the most steps of a call; None: the skill's own limit.
-        named_share: that share.
     """
-    search = start_calls, search_steps, episode_calls, start_after, call_limit, named_share
     spec, skill = role.spec, role.skill
+    who = Alone(skill, tuple(reflexes), role.part, starts or Starts(), call_limit)
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
-        engine = make_engine(spec, num_envs, first=first)
-        return SkillCollector(
-            engine, acting, skill, tuple(reflexes), starters, *search, part=role.part
-        )
+        return Collector(make_engine(spec, num_envs, first=first), acting, who)
 
     return LearningTask(spec.name, role.observation_space, role.action_space, collector)
 
 
-def selector_task(
-    role: Role, skills: SkillSet, guide: ActiveGuide | None = None, as_skill: Skill | None = None
-) -> LearningTask:
-    """Return the learning task of a selector that calls ready skills.
-
-    Args:
-        guide: a ready selector that guides its decisions.
-        as_skill: the hierarchy as a skill of another one; None: the outermost hierarchy.
-    """
+def selector_task(role: Role, who: Calling) -> LearningTask:
+    """Return the learning task of a selector that calls ready skills."""
     spec = role.spec
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False
     ) -> Collector:
         engine = make_engine(spec, num_envs, first=first)
-        return HierarchyCollector(engine, acting, skills, shared, guide, as_skill)
+        return Collector(engine, acting, replace(who, keep_rewards=shared))
 
     return LearningTask(
         spec.name,
@@ -140,8 +120,12 @@ def selector_task(
         role.action_space,
         collector,
         role.row_steps,
-        called=Called(spec, skills) if as_skill is None else None,
+        called=_called(spec, who),
     )
+
+
+def _called(spec: EnvSpec, who: Calling) -> Called | None:
+    return Called(spec, who.skills) if who.skill is None else None
 
 
 @dataclass(frozen=True)
@@ -152,55 +136,22 @@ class JointTask(LearningTask):
     """The path of the selector."""
     roles: Mapping[str, Role] = field(kw_only=True)
     """The roles of the selector's level, and of levels below it, by path."""
-    skills: SkillSet = field(kw_only=True)
-    """The skills; learning ones have any policy, or are ``UntrainedHierarchy``."""
-    guide: ActiveGuide | None = field(kw_only=True)
-    """A ready selector that guides the selector's decisions, or decides in its place."""
-    as_skill: Skill | None = field(kw_only=True)
-    """The hierarchy as a skill of another one."""
+    who: Calling = field(kw_only=True)
+    """Who acts; its guide may decide in the selector's place."""
 
     @property
     def spec(self) -> EnvSpec:
         """The environment."""
         return self.roles[self.selector].spec
 
-    def joint_collector(
-        self,
-        engine: Engine,
-        acting: Acting | None,
-        learners: Mapping[str, Acting],
-        margins: Mapping[str, float],
-    ) -> HierarchyCollector:
-        """Return a collector of environments in ``engine``.
 
-        Args:
-            acting: the selector; None: the guide decides.
-            learners, margins: see ``HierarchyCollector``.
-        """
-        return HierarchyCollector(
-            engine,
-            acting,
-            self.skills,
-            guide=self.guide,
-            as_skill=self.as_skill,
-            learners=learners,
-            margins=margins,
-        )
-
-
-def joint_task(
-    selector: str,
-    roles: Mapping[str, Role],
-    skills: SkillSet,
-    guide: ActiveGuide | None = None,
-    as_skill: Skill | None = None,
-) -> JointTask:
+def joint_task(selector: str, roles: Mapping[str, Role], who: Calling) -> JointTask:
     """Return the learning task of a selector that calls skills, of which some learn, too.
 
     Args:
         selector: its path.
         roles: of its level, and of levels below it, by path.
-        skills, guide, as_skill: see ``JointTask``.
+        who: acts.
     """
     role = roles[selector]
     return JointTask(
@@ -209,10 +160,8 @@ def joint_task(
         role.action_space,
         skill_task(agent_role(role.spec)).collector,
         role.row_steps,
-        called=Called(role.spec, skills) if as_skill is None else None,
+        called=_called(role.spec, who),
         selector=selector,
         roles=roles,
-        skills=skills,
-        guide=guide,
-        as_skill=as_skill,
+        who=who,
     )

@@ -39,7 +39,7 @@ from skillweave.algorithms.config import (
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.collector import Collector
 from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
@@ -351,7 +351,7 @@ def test_an_end_is_not_bootstrapped(name):
     assert values(algorithm, state, np.arange(5)) == pytest.approx(finite, rel=0.06)
 
 
-class TenSteps(SkillCollector):
+class TenSteps(Collector):
     """Says of every row that it took ten steps."""
 
     def _views(self, trace, steps):

@@ -42,11 +42,12 @@ from calls.worlds import (
     made,
     world,
 )
+from toys import calling_in
 
 import skillweave as sw
 from skillweave.api.player import Player
 from skillweave.collecting.acting import Acted
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
+from skillweave.collecting.collector import Collector
 from skillweave.export.graphs import Graph, examples, mask_width
 from skillweave.export.runner import Runner
 from skillweave.export.write import Export, write_export
@@ -104,8 +105,8 @@ def trained(world: World, together: bool) -> Played:
         skills = built.learning()
         how |= {"learners": learners, "margins": built.margins()}
 
-    def make() -> HierarchyCollector:
-        return HierarchyCollector(engine_of(world), first, skills, **how)
+    def make() -> Collector:
+        return calling_in(engine_of(world), first, skills, **how)
 
     return collected(world, make, None, learners if together else {})
 

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from calls.cases import Case, LevelCase, Worth, guide_of, policy_of, ready, selector_of, skill_set
 from reference_calls import seeds_of
+from toys import alone_in, calling_in
 
 from skillweave.api.player import Player as Deployed
 from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
+from skillweave.collecting.collector import Collector
 from skillweave.collecting.levels import UntrainedHierarchy
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import acting_policy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.export import compile
@@ -200,7 +200,7 @@ def decisions(case: Case) -> Played:
     guide, selector = _first(case)
     skills = skill_set(case.level, policies_of(case.level))
     return collected(
-        case, lambda: HierarchyCollector(engine_of(case), selector, skills, True, guide), "", {}
+        case, lambda: calling_in(engine_of(case), selector, skills, True, guide), "", {}
     )  # fmt: skip
 
 
@@ -234,9 +234,9 @@ def joint(case: Case) -> Played:
     guide, selector = _first(case)
     skills = skills_of(case.level, "")
 
-    def make() -> HierarchyCollector:
+    def make() -> Collector:
         how = {"guide": guide, "learners": learners, "margins": margins}
-        return HierarchyCollector(engine_of(case), selector, skills, **how)
+        return calling_in(engine_of(case), selector, skills, **how)
 
     return collected(case, make, "selector", learners)
 
@@ -313,10 +313,10 @@ def leads_to_starts(case: Case) -> Played:
     skills = skill_set(case.level, policies_of(sampled))
     watch = Watch(seeds_of((Seeds(SEED) / "env").integer(), N))
 
-    def make() -> SkillCollector:
-        return SkillCollector(engine_of(case), Anything(), never(), starters=skills)
+    def make() -> Collector:
+        return alone_in(engine_of(case), Anything(), never(), skills=skills)
 
-    for _ in _rounds(case, watch, make, lambda collector: collector._starters._calls, {}):
+    for _ in _rounds(case, watch, make, lambda collector: collector.search.memory, {}):
         pass
     return Played(watch.episodes, missing=r"^selector\.", chooses=False)
 
@@ -328,12 +328,6 @@ class Anything:
 
     def begin(self, request: Request) -> None:
         pass
-
-    def to_env(self, action: Array) -> Array:
-        return action
-
-    def all(self, obs: Array, mask: Any, memory: Any) -> Acted:
-        return Acted(np.zeros(len(obs), np.int64), None, None)
 
 
 # The player alone -------------------------------------------------------------------------------

@@ -17,11 +17,10 @@ from reference_calls import (
     scripted,
 )
 from toy_acting import Again, Choices, Given, requests
+from toys import alone_in, calling_in
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -40,7 +39,7 @@ def skill_set(*kinds, call_steps=5, **how):
 def collector_of(skills, n=N, keep_rewards=False, env=Walk, acting=None, **spec):
     engine = make_engine(EnvSpec(env, engine="sync", **spec), n)
     acting = acting or Choices(n, len(skills.skills))
-    found = HierarchyCollector(engine, acting, skills, keep_rewards)
+    found = calling_in(engine, acting, skills, keep_rewards)
     found.start(Seeds(7))
     return found
 
@@ -88,7 +87,7 @@ def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selecto
         collector = collector_of(skill_set(*ALL), env=make)
     else:
         engine = make_engine(EnvSpec(make, engine="sync"), N)
-        collector = SkillCollector(engine, Choices(N, 3))
+        collector = alone_in(engine, Choices(N, 3))
         collector.start(Seeds(7))
     kinds = set()
     for request in itertools.islice(requests(1), 90):
@@ -111,7 +110,7 @@ def test_the_success_that_an_environment_tells_is_that_of_its_episode(of_selecto
 def test_a_skill_sees_the_same_steps_under_a_selector_as_in_training():
     shows, seen = SkillCase("right", max_steps=3, stops="recorded"), []
     engine = make_engine(EnvSpec(Walk, engine="sync"), 200)
-    alone = SkillCollector(engine, Given(200), skill_of(shows, "shows"))
+    alone = alone_in(engine, Given(200), skill_of(shows, "shows"))
     alone.start(Seeds(7))
     alone.acting.then = np.full(200, 2)
     skills = SkillSet((skill_of(shows, "shows"),), (scripted(2),))
@@ -189,7 +188,7 @@ def test_where_no_skill_may_start_the_error_names_them_all():
 
 
 def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("skillweave.collecting.hierarchy_collector.LONGEST_EPISODE", 20)
+    monkeypatch.setattr("skillweave.collecting.learners.LONGEST_EPISODE", 20)
 
     class Eternal(Left):
         max_steps = None

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
 from toy_acting import Choices, requests
+from toys import calling_in
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SMOOTHED, as_logits
 from skillweave.collecting.collector import joined_collected
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import make_engine
 from skillweave.policies.hierarchy import ActiveGuide
@@ -28,7 +28,7 @@ AUTOMATON = Automaton(
 def collector_of(guide, call_steps=2):
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
     acting = Choices(N, skills.choices)
-    found = HierarchyCollector(make_engine(SPEC, N), acting, skills, guide=guide)
+    found = calling_in(make_engine(SPEC, N), acting, skills, guide=guide)
     found.start(Seeds(2))
     return found
 
@@ -36,7 +36,7 @@ def collector_of(guide, call_steps=2):
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
     skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
     for greedy in (False, True):
-        collector = HierarchyCollector(
+        collector = calling_in(
             make_engine(SPEC, N), None, skills,
             guide=ActiveGuide(bound(AUTOMATON), decides=True),
         )  # fmt: skip

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from reference_calls import EPISODE, POSITION, Walk
 from toy_acting import Choices, requests, valid_rows
+from toys import calling_in
 
 from skillweave.collecting.acting import Acting
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.lengths import Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -82,7 +82,7 @@ def collector_of(call_steps, margin=None, n=N):
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
     learners = {"up": Learner(n), "down": Learner(n), "skill_critic": Values(n)}
     margins = {} if margin is None else {"skill_critic": margin}
-    collector = HierarchyCollector(
+    collector = calling_in(
         engine, Choices(n, found.choices), found, learners=learners, margins=margins
     )
     collector.start(Seeds(7))
@@ -106,7 +106,7 @@ def calls_of(experience, n):
 @pytest.mark.parametrize("margin", [None, 0.5])
 def test_every_row_is_the_acting_skills_judged_by_it_alone(call_steps, margin):
     collector = collector_of(call_steps, margin)
-    skills, seen = collector.skills, {0: 0, 1: 0}
+    skills, seen = collector.who.skills, {0: 0, 1: 0}
     ended, continued = 0, 0
     for request in itertools.islice(asked(40), 5):
         runs = collector.memory["end"] == CallEnd.RUNNING
@@ -187,7 +187,7 @@ def test_a_learner_of_the_library_acts_and_its_head_is_kept():
     state = algorithm.init([Seeds(0)])
     skills = SkillSet((Down(), Stay()), (None, Stay.policy), call_steps=3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), n)
-    collector = HierarchyCollector(
+    collector = calling_in(
         engine, Choices(n, 2), skills, learners={"down": Acting([(algorithm, 1)], n)}
     )
     collector.start(Seeds(1))

@@ -12,6 +12,7 @@ import torch
 from reference_calls import POSITION, TAG, T, Walk
 from test_levels import Down, Up, asked, collector_of
 from toy_acting import Choices, requests
+from toys import alone_in
 
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.dqn import DQNAlgorithm
@@ -19,7 +20,6 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.buffers.replay import ReplayStore
 from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.judge import JudgedBy, judged_by
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, TrainingError
 from skillweave.experience import Batch
@@ -88,7 +88,7 @@ class Opposite(Stops):
 
 def rows_of(skill: Skill | None, judge: JudgedBy, rows: int) -> list[Batch]:
     engine = make_engine(SPEC, N)
-    collector = SkillCollector(engine, Choices(N, 3), skill)  # type: ignore[arg-type]
+    collector = alone_in(engine, Choices(N, 3), skill)  # type: ignore[arg-type]
     collector.start(Seeds(3))
     asked = (replace(request, record=judge.raw) for request in requests(rows))
     return [collector.collect(r).batches[""] for r in itertools.islice(asked, 12)]
@@ -196,7 +196,7 @@ def test_replay_and_rollouts_carry_the_environments_own_reward_where_it_is_asked
         request = learner.request(0, 0, 0.0)
         assert request.record == kind.raw
         engine = make_engine(SPEC, N)
-        collector = SkillCollector(engine, Choices(N, 3), Forever())  # type: ignore[arg-type]
+        collector = alone_in(engine, Choices(N, 3), Forever())  # type: ignore[arg-type]
         collector.start(Seeds(3))
         for one in itertools.islice(requests(9), 4):
             batches = collector.collect(replace(one, record=request.record)).batches

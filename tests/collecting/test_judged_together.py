@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from reference_calls import POSITION, Walk, scripted
 from toy_acting import Choices, requests
+from toys import alone_in, calling_in
 
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.collector import Collector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError, SkillError
@@ -82,14 +82,14 @@ def skill_of(pays: Any, **more: Any) -> Any:
     return type("Reads", (Skill,), {"max_steps": 4, "reward": lambda _, step: pays(step)} | more)()
 
 
-def alone(skill: Any, env: Any = Tells) -> SkillCollector:
+def alone(skill: Any, env: Any = Tells) -> Collector:
     engine = make_engine(EnvSpec(env, engine="sync"), N)
-    collector = SkillCollector(engine, Choices(N, 3), skill)  # type: ignore[arg-type]
+    collector = alone_in(engine, Choices(N, 3), skill)  # type: ignore[arg-type]
     collector.start(Seeds(3))
     return collector
 
 
-def below(skill: Any) -> HierarchyCollector:
+def below(skill: Any) -> Collector:
     class Rest(Skill):
         policy = scripted(1)
 
@@ -99,7 +99,7 @@ def below(skill: Any) -> HierarchyCollector:
     learner: Any = Choices(N, 3)
     learner.stacks = acting.stacks
     skills = SkillSet((skill, Rest()), (None, Rest.policy), call_steps=3)  # type: ignore[arg-type]
-    collector = HierarchyCollector(engine, acting, skills, learners={"reads": learner})
+    collector = calling_in(engine, acting, skills, learners={"reads": learner})
     collector.start(Seeds(3))
     return collector
 

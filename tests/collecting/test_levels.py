@@ -11,8 +11,8 @@ import pytest
 from reference_calls import POSITION, T, Walk, one_step, scripted, seeds_of
 from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
+from toys import calling_in
 
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -94,7 +94,7 @@ def collector_of(node, outer_steps, inner_steps, chooser=Selector, env=Walk):
         "up": Learner(N), f"{name}/down": Learner(N), f"{name}/selector": chooser(N, 2),
         f"{name}/skill_critic": Values(N), "skill_critic": Values(N),
     }  # fmt: skip
-    collector = HierarchyCollector(engine, Choices(N, 2), whole, learners=learners)
+    collector = calling_in(engine, Choices(N, 2), whole, learners=learners)
     collector.start(Seeds(7))
     return collector
 
@@ -293,7 +293,7 @@ def test_memory_starts_with_each_episode_also_where_the_call_ended_by_itself():
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     skills = SkillSet((Ending(),), (None,), call_steps=3)
     learners = {"ending": Remembering(N, 3)}
-    collector = HierarchyCollector(engine, Choices(N, 1), skills, learners=learners)
+    collector = calling_in(engine, Choices(N, 1), skills, learners=learners)
     collector.start(Seeds(7))
     rows = collector.collect(next(asked(ROWS, collector))).batches["ending"]
     assert (rows["episode_start"] == (rows["obs"][..., T] == 0)).all()
@@ -339,7 +339,7 @@ class Early(Skill):
 def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
     skills = SkillSet((Early(),), (Early.policy,), call_steps=call_steps)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    collector = HierarchyCollector(engine, Choices(N, 1), skills, as_skill=Paid())
+    collector = calling_in(engine, Choices(N, 1), skills, as_skill=Paid())
     collector.start(Seeds(7))
     rows = collector.collect(next(requests(60, GAMMA))).batches[""]
     for n in range(N):

@@ -9,9 +9,8 @@ import pytest
 from reference_calls import POSITION, Walk
 from test_joint import Choices, Down, Learner, N, Stay, Up, Values, asked
 from toy_acting import requests
+from toys import alone_in, calling_in
 
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.hierarchy.fitting import ready_policies
@@ -37,7 +36,7 @@ class Begins(Down):
 @pytest.mark.parametrize("skill", [None, Down(), Begins()])
 def test_rows_of_a_skill_that_learns_by_itself(skill):
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    collector = SkillCollector(engine, Choices(N, 3), skill, (BACK,))
+    collector = alone_in(engine, Choices(N, 3), skill, (BACK,))
     collector.start(Seeds(0))
     for request in itertools.islice(requests(30), 2):
         found = collector.collect(request).batches[""]
@@ -50,7 +49,7 @@ def test_rows_of_a_skill_that_learns_by_itself(skill):
         )
         np.testing.assert_array_equal(moved[own], found["action"][own] - 1)
         assert found["overridden"].any()
-    without = SkillCollector(make_engine(EnvSpec(Walk, engine="sync"), N), Choices(N, 3), skill)
+    without = alone_in(make_engine(EnvSpec(Walk, engine="sync"), N), Choices(N, 3), skill)
     without.start(Seeds(0))
     assert without.collect(next(requests(5))).batches[""].get("overridden") is None
 
@@ -59,7 +58,7 @@ def test_rows_of_skills_that_learn_under_a_selector():
     skills = SkillSet((Up(), Down(), Stay()), (None, None, Stay.policy), (BACK,), 3)
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
     learners = {"up": Learner(N), "down": Learner(N), "skill_critic": Values(N)}
-    collector = HierarchyCollector(engine, Choices(N, 3), skills, learners=learners)
+    collector = calling_in(engine, Choices(N, 3), skills, learners=learners)
     collector.start(Seeds(7))
     seen = 0
     for request in itertools.islice(asked(40), 3):

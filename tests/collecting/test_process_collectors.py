@@ -17,13 +17,12 @@ import pytest
 from living import all_end
 from reference_calls import EPISODE, Counter, Left, Right, Zigzag
 from toy_acting import Again, Choices, Mortal, requests
+from toys import alone_in, calling_in
 
 from skillweave.collecting import processes, worker_process
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
 from skillweave.collecting.placement import make_collectors
 from skillweave.collecting.processes import ProcessCollectors
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -40,7 +39,7 @@ def skills():
 def deciding(env=Again):
     def make(num_envs, first):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return HierarchyCollector(engine, Choices(num_envs, 4), skills())
+        return calling_in(engine, Choices(num_envs, 4), skills())
 
     return make
 
@@ -48,7 +47,7 @@ def deciding(env=Again):
 def stepping(env=Again):
     def make(num_envs, first):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return SkillCollector(engine, Choices(num_envs, 3))
+        return alone_in(engine, Choices(num_envs, 3))
 
     return make
 
@@ -321,7 +320,7 @@ class Wide(gym.Env):
 def test_large_columns_come_whole_though_the_memory_must_grow(in_processes):
     def make(num_envs, first):
         engine = make_engine(EnvSpec(Wide, engine="sync"), num_envs, first=first)
-        return SkillCollector(engine, Choices(num_envs, 2))
+        return alone_in(engine, Choices(num_envs, 2))
 
     plain, apart = here(make), in_processes(make)
     for collectors in (plain, apart):

@@ -9,14 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from reference_calls import POSITION, Counter, Left, Right, Walk, Zigzag
 from toy_acting import Choices, requests, valid_rows
-from toys import ASKS, SHOWS
+from toys import ASKS, SHOWS, alone_in, calling_in
 
 from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import Collected, joined_collected, joined_from, parted
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.joined import JoinedEngines
 from skillweave.envs.make import EnvSpec, make_engine
@@ -116,7 +114,7 @@ def test_rows_of_skills_chain_in_every_space(shows, asks, skill):
     for algorithm in ("ppo", "off") if asks in ("Discrete", "Box") else ("ppo",):
         engine = make_engine(EnvSpec(kind, engine="sync"), 3)
         learns, params = learner(kind, algorithm)
-        collector = SkillCollector(engine, Acting([(learns, 1)], 3), skill)
+        collector = alone_in(engine, Acting([(learns, 1)], 3), skill)
         collector.start(Seeds(2))
         collected = [collector.collect(r) for r in itertools.islice(asked(params, 7), 5)]
         assert sum(c.steps for c in collected) == 105
@@ -140,7 +138,7 @@ def test_decisions_chain_in_every_space(shows):
         chooses = type("Chooses", (), {"observation_space": kind.observation_space})
         chooses.action_space = gym.spaces.Discrete(2)
         learns, params = learner(chooses, "memory")
-        collector = HierarchyCollector(engine, Acting([(learns, 1)], 3), calls)
+        collector = calling_in(engine, Acting([(learns, 1)], 3), calls)
         collector.start(Seeds(2))
         collected = [collector.collect(r) for r in itertools.islice(asked(params, 9), 5)]
         assert sum(c.steps for c in collected) == 135
@@ -167,14 +165,14 @@ class Aside(Skill):
 def skill_part(kind):
     engine = make_engine(EnvSpec(Walk, engine="sync"), 2)
     skills = {"task": None, "skill": Left(), "search": Aside()}
-    return SkillCollector(engine, Choices(2, 3), skills[kind])
+    return alone_in(engine, Choices(2, 3), skills[kind])
 
 
 def decision_part(kind):
     skills = tuple(k() for k in (Left, Right, Zigzag, Counter))
     calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=40)
     engine = make_engine(EnvSpec(Walk, engine="sync"), 2)
-    return HierarchyCollector(engine, Choices(2, 4), calls, keep_rewards=kind == "rewards")
+    return calling_in(engine, Choices(2, 4), calls, keep_rewards=kind == "rewards")
 
 
 class Slow(Skill):
@@ -195,7 +193,7 @@ class Longer(Walk):
 def long_part(kind):
     skills = SkillSet((Slow(), Slow()), (Slow.policy, Slow.policy))
     engine = make_engine(EnvSpec(Longer, engine="sync"), 2)
-    return HierarchyCollector(engine, Choices(2, 2), skills, keep_rewards=True)
+    return calling_in(engine, Choices(2, 2), skills, keep_rewards=True)
 
 
 def compare(one, two):

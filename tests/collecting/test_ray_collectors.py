@@ -19,6 +19,7 @@ import pytest
 from reference_calls import Counter, Left, Right, Zigzag
 from small_runs import interrupt_at_checkpoint
 from toy_acting import Again, Choices, requests
+from toys import alone_in, calling_in
 
 from skillweave import (
     PPO,
@@ -27,8 +28,6 @@ from skillweave import (
 )
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -86,7 +85,7 @@ def deciding(env=Again):
         kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
         skills = SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return HierarchyCollector(engine, Choices(num_envs, 4), skills)
+        return calling_in(engine, Choices(num_envs, 4), skills)
 
     return make
 
@@ -94,7 +93,7 @@ def deciding(env=Again):
 def stepping(env=Again):
     def make(num_envs, first):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return SkillCollector(engine, Choices(num_envs, 3))
+        return alone_in(engine, Choices(num_envs, 3))
 
     return make
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from reference_calls import Walk
 from toy_acting import Choices, requests
+from toys import alone_in
 
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.policy import make_algorithm
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.source import Recorded
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import RunError
@@ -32,7 +32,7 @@ CONFIG = DQN(num_envs=N, buffer_size=2_000, batch_size=16, gamma=0.0, learning_r
 def recorded(rows: int = 100) -> Batch:
     """What random actions did in walks, whose reward follows from what is seen and done."""
     engine = make_engine(EnvSpec(Walk, engine="sync"), N)
-    collector = SkillCollector(engine, Choices(N, 3))  # type: ignore[arg-type]
+    collector = alone_in(engine, Choices(N, 3))  # type: ignore[arg-type]
     collector.start(Seeds(3))
     (request,) = itertools.islice(requests(rows), 1)
     batch = collector.collect(request).batches[""]

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
 from toy_acting import Again, Choices, Counts, Given, requests, step
+from toys import alone_in, calling_in
 
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -55,7 +54,7 @@ def engine_of(env, num_envs=3, engine="sync"):
 def of_skill(env=Again, skill=None, engine="sync", actions=3, reflexes=(), acting=Counts):
     def make():
         made = engine_of(env, engine=engine)
-        return SkillCollector(made, acting(made.num_envs, actions), skill, reflexes)
+        return alone_in(made, acting(made.num_envs, actions), skill, reflexes)
 
     return make
 
@@ -64,7 +63,7 @@ def of_selector(greedy=True):
     def make():
         skills = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
         calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=5, greedy=greedy)
-        return HierarchyCollector(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
+        return calling_in(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
 
     return make
 
@@ -120,7 +119,7 @@ class Moody(gym.Env):
 
 
 def given(env, num_envs=3, skill=None):
-    collector = SkillCollector(engine_of(env, num_envs), Given(num_envs), skill)
+    collector = alone_in(engine_of(env, num_envs), Given(num_envs), skill)
     collector.start(Seeds(0))
     return collector
 
@@ -159,7 +158,7 @@ def test_an_episode_that_ends_early_when_it_is_played_again_begins_anew(monkeypa
     assert second.restore(first.state()).tolist() == [1]
     monkeypatch.setattr(Hasty, "hurry", False)
     assert step(second, [0, 0, 0]).batches[""]["terminated"].tolist() == [[False] * 3]
-    assert second.state()["kept.elapsed"].tolist() == [6, 1, 6]
+    assert second.state()["kept.age"].tolist() == [6, 1, 6]
 
 
 @pytest.mark.parametrize("saves", [(), (3, 7, 8)])
@@ -206,5 +205,5 @@ def test_a_state_changes_nothing(kind, monkeypatch):
 def test_a_state_of_another_kind_of_collector_is_refused():
     first, other = KINDS["task"](), of_skill(acting=Choices)()
     first.start(Seeds(0))
-    with pytest.raises(SkillweaveError, match=r"'memory' of open episodes is float32 \(3, 1\)"):
+    with pytest.raises(SkillweaveError, match=r"open episodes differ in 'player\.rnn'"):
         other.restore(first.state())

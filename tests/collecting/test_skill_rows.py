@@ -7,10 +7,9 @@ import pytest
 from reference_calls import POSITION, T, Walk, seeds_of, shy
 from scalar_skill import ScalarSkill
 from toy_acting import Again, Choices, Counts, Given, requests, step
-from toys import Ledger, actions, cartpole
+from toys import Ledger, actions, alone_in, cartpole
 
-from skillweave.collecting import skill_collector
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting import search
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -31,7 +30,7 @@ def collector():
         if name == "envpool":
             pytest.importorskip("envpool")
         engine = make_engine(EnvSpec(env, engine=name), num_envs, threads=1)
-        made.append(SkillCollector(engine, acting(num_envs), skill, reflexes))
+        made.append(alone_in(engine, acting(num_envs), skill, reflexes))
         made[-1].start(Seeds(seed))
         return made[-1]
 
@@ -374,7 +373,7 @@ class Nowhere(Skill):
 
 
 def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
-    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
+    monkeypatch.setattr(search, "PATIENCE", 50)
     env = collector(skill=Nowhere(), num_envs=2)
     for _ in range(49):  # many episodes: it counts on from one to the next
         step(env, np.zeros(2, np.int64))
@@ -387,7 +386,7 @@ def test_an_initiation_that_never_holds_is_an_error(collector, monkeypatch):
 def test_an_environment_in_which_an_episode_cannot_begin_is_given_up_when_one_is_played(
     collector, monkeypatch
 ):
-    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
+    monkeypatch.setattr(search, "PATIENCE", 50)
 
     class Here(Nowhere):
         """May start in the first environment, and lasts 3 steps."""
@@ -407,7 +406,7 @@ def test_an_environment_in_which_an_episode_cannot_begin_is_given_up_when_one_is
 def test_an_initiation_that_holds_somewhere_is_searched_for_ever_after_a_resume_too(
     collector, monkeypatch
 ):
-    monkeypatch.setattr(skill_collector, "PATIENCE", 50)
+    monkeypatch.setattr(search, "PATIENCE", 50)
 
     def fresh():
         return collector(env=Again, skill=Once(), num_envs=2)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from living import alive, all_end
 from toy_acting import Given, requests
+from toys import alone_in
 
 from skillweave.collecting.processes import ProcessCollectors
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -87,7 +87,7 @@ def collectors_of(env=Faulty, action=PID, late=1):
 
     def make(num_envs, first):
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return SkillCollector(engine, Plan(first, action, late))
+        return alone_in(engine, Plan(first, action, late))
 
     found = ProcessCollectors(make, 2, 2, 1, "Faulty")
     found.start(Seeds(0))

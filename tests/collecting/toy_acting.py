@@ -40,9 +40,6 @@ class Choices:
     def to_env(self, action: Array) -> Array:
         return action
 
-    def all(self, obs: Array, mask: Array | None, memory: Any) -> Acted:
-        return self.some(np.arange(self.num_envs), obs, mask, memory)
-
     def some(self, rows: Array, obs: Array, mask: Array | None, memory: Any) -> Acted:
         chosen = []
         for row in range(len(rows)):

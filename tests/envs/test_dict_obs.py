@@ -4,12 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from toys import alone_in, calling_in
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.hierarchy_collector import HierarchyCollector
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import checksums
 from skillweave.envs.envpool_engine import EnvPoolEngine
@@ -157,7 +156,7 @@ def test_a_skill_starts_after_random_actions_of_any_kind_and_reads_parts(engine,
 
     made = engine(env=lambda: Places(actions))
     acting, params = learner(made.action_space)
-    collector = SkillCollector(made, acting, Onwards())
+    collector = alone_in(made, acting, Onwards())
     collector.start(Seeds(0))
     experience = collector.collect(Request(20, (params,), np.array([0.9]), Seeds(1))).batches[""]
     assert experience["obs"].dtype == experience["next_obs"].dtype == obs_dtype(PLACES)
@@ -247,7 +246,7 @@ def test_the_next_mask_is_that_of_the_true_successor(options):
 
 def test_decisions_are_packed_arrays_with_both_masks(options):
     acting, params = learner(Discrete(2))
-    collector = HierarchyCollector(options.engine, acting, options.skills)
+    collector = calling_in(options.engine, acting, options.skills)
     collector.start(Seeds(0))
     stuck = 0
     for i in range(3):

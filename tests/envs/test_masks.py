@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from toys import alone_in
 
 from skillweave import (
     DQN,
@@ -22,7 +23,6 @@ from skillweave import (
 )
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.acting import Acting, Request
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import EnvError
@@ -223,7 +223,7 @@ def test_rows_have_the_masks_of_what_was_acted_on_and_of_true_successors(
     # Gate raises an error where the learner, or the search for a start, takes what is forbidden.
     learner = make_algorithm(algorithm, Gate.observation_space, Gate.action_space)
     params = learner.acting_params(learner.init([Seeds(0)]), 0.0)
-    collector = SkillCollector(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skill)
+    collector = alone_in(make_engine(EnvSpec(Gate), 4), Acting([(learner, 1)], 4), skill)
     collector.start(Seeds(0))
     how = {"at_random": at_random and learner.store == "replay"}
     for i in range(3):

@@ -10,6 +10,8 @@ from small_runs import assert_same, stopped_run
 from worlds import SMALL, SPACES, GoTo, Rest, aim_of, declared, go_to
 
 import skillweave as sw
+from skillweave.collecting.collector import Collector
+from skillweave.collecting.learners import Calling
 from skillweave.errors import RunError
 from skillweave.skills.goal_spaces import with_goal
 
@@ -89,21 +91,20 @@ def test_it_learns_and_goes_on_bit_for_bit(learn, space, tmp_path):
 
 def test_its_selector_learns_to_use_the_goal(tmp_path):
     """The inner selector alone can reach a goal; what it was never told, it could not."""
-    from skillweave.collecting.hierarchy_collector import HierarchyCollector
 
     rows = []
-    original = HierarchyCollector._views
+    original = Collector._views
 
     def views(self, trace, steps):
         found = original(self, trace, steps)
-        if self.as_skill is not None:
+        if self.skill is not None and isinstance(self.who, Calling):
             batch = found[""]
             rows.append((batch["obs"], batch["next_obs"], batch["terminated"], batch.valid_rows))
         return found
 
     inner = declared([Walk(), Rest()], selector=SELECTOR, name="inner", call_steps=3, steps=400)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(HierarchyCollector, "_views", views)
+        patch.setattr(Collector, "_views", views)
         declared([far(inner), Rest()], selector=outer_goals, steps=None, call_steps=9).train(
             tmp_path / "run", quiet=True
         )

@@ -7,10 +7,10 @@ import functools
 import numpy as np
 import pytest
 from small_runs import assert_same, reports_every, stopped_run
+from toys import alone_in
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
-from skillweave.collecting.skill_collector import SkillCollector
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.seeding import Seeds
 
@@ -90,7 +90,7 @@ def test_goals_of_other_spaces_are_resumed(space, tmp_path):
 
 def test_goals_of_a_damaged_checkpoint_are_refused():
     acting = None
-    collector = SkillCollector(make_engine(EnvSpec(Point, engine="sync"), 2), acting, go_to())
+    collector = alone_in(make_engine(EnvSpec(Point, engine="sync"), 2), acting, go_to())
     collector.start(Seeds(0))
     state = collector.state()
     state["kept.goal"][1, 0] = 7.0

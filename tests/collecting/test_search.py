@@ -1,17 +1,20 @@
 """Skills that can act already lead to where the one that is trained may start."""
 
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from toy_acting import Choices, requests
+from toys import alone_in
 
-from skillweave.collecting.skill_collector import SkillCollector
+from skillweave.collecting.search import Search, Starts
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.collecting.start_policy import StartPolicy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
+from skillweave.policies.core import World
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -84,7 +87,7 @@ def collector_of(
     starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
     engine = make_engine(EnvSpec(env, engine="sync"), N)
     how = start_calls, search_steps, episode_calls
-    found = SkillCollector(engine, Choices(N, 5), skill(), (), starters, *how)
+    found = alone_in(engine, Choices(N, 5), skill(), (), starters, *how)
     found.start(Seeds(0))
     return found
 
@@ -217,16 +220,17 @@ def test_chance_is_asked_only_where_no_starter_acts(monkeypatch):
         drawn.append((n, None if mask is None else mask.tolist()))
         return np.full(n, 4)
 
-    monkeypatch.setattr("skillweave.collecting.start_policy.random_actions", watched)
+    monkeypatch.setattr("skillweave.collecting.search.random_actions", watched)
     skills = Forward(), OnlyFar()
     policies = tuple(skill.policy for skill in skills)
-    space = Corridor.action_space
 
     def acted(kinds, xs, ids):
-        starters = StartPolicy(SkillSet(skills[kinds], policies[kinds]), len(xs), space)
+        starts = Starts(SkillSet(skills[kinds], policies[kinds]))
+        engine: Any = SimpleNamespace(num_envs=len(xs), action_space=Corridor.action_space)
         obs = np.array([[x, 0] for x in xs], np.float32)
         mask = np.eye(5, dtype=bool)[[1, 2, 1, 3]] | np.eye(5, dtype=bool)[1]
-        return starters.act(np.array(ids), obs, mask, np.random.default_rng(0)).tolist()
+        world = World(np.random.default_rng(0))
+        return Search(Far(), starts, engine).act(np.array(ids), obs, mask, world).tolist()
 
     far_only, both = slice(1, 2), slice(0, 2)
     assert acted(both, [0, 0, 950, 0], [0, 2, 3]) == [1, 1, 1]
@@ -336,9 +340,7 @@ def named(start_calls=0, kinds=(Five, Back), after=("five",), skill=Anywhere):
     skills = tuple(kind() for kind in kinds)
     starters = SkillSet(skills, tuple(s.policy for s in skills))
     engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
-    found = SkillCollector(
-        engine, Choices(N, 5), skill(), (), starters, start_calls, start_after=after
-    )
+    found = alone_in(engine, Choices(N, 5), skill(), (), starters, start_calls, after=after)
     found.start(Seeds(0))
     return found
 
