@@ -66,8 +66,7 @@ class Outcome:
         return self._asked(self._skill, "success") if self._skill.defines("success") else None
 
     def _asked(self, skill: Skill, method: str) -> Array:
-        step = self._step
-        return asked(skill, method, step, len(step.reward), step.elapsed, self._ids)
+        return asked(skill, method, self._step, self._ids)
 
 
 def judge(skill: Skill | None, step: Step, ids: Array | None = None) -> Outcome:

@@ -450,7 +450,7 @@ class SkillCollector(Collector):
         assert self.skill is not None
         holds = np.ones(len(ids), bool)
         if self._restricted:
-            holds = asked(self.skill, "initiation", self.obs[ids], len(ids), ids=ids)
+            holds = asked(self.skill, "initiation", self.obs[ids], ids)
         found = ids[holds & (self.kept["calls_left"][ids] == 0)]
         waiting = ids[~holds]
         self.kept["searching"][found] = False

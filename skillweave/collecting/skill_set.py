@@ -17,10 +17,9 @@ from skillweave.policies.leaves import Ready
 from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, path_of
-from skillweave.skills.answers import ask
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.skills.outputs import blame
+from skillweave.skills.outputs import ask, blame
 from skillweave.skills.own_part import OwnPart
 from skillweave.types import Memoryless
 

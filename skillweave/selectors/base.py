@@ -19,10 +19,9 @@ from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import Rule
 from skillweave.policies.selectors import function_name as function_name
 from skillweave.policies.spaces import space_of
-from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import repeated
-from skillweave.skills.outputs import called
+from skillweave.skills.outputs import answer, called
 from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step
 
@@ -174,13 +173,7 @@ def checked_function(
     function: Callable[[Any], Any], who: str, name: str, dtype: type = bool
 ) -> Wrapped:
     """Return a function of observations or of steps to (n,), whose answers are checked."""
-    return Wrapped(function, partial(_checked, function, who, name, dtype))
-
-
-def _checked(function: Callable[[Any], Any], who: str, name: str, dtype: type, about: Any) -> Array:
-    step = isinstance(about, Step)
-    n, elapsed = (len(about.reward), about.elapsed) if step else (len(about), None)
-    return answer(function, about, n, dtype, who, name, elapsed)
+    return Wrapped(function, partial(answer, function, dtype=dtype, who=f"{who}: {name}()"))
 
 
 def goal_as_json(goal: Any) -> Any:

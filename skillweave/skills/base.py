@@ -21,10 +21,9 @@ from skillweave.notebooks import facts, joined
 from skillweave.policies.spaces import Space as Data
 from skillweave.policies.spaces import space_of
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
-from skillweave.skills.answers import answer
 from skillweave.skills.goal_spaces import draw_from, repeated
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.outputs import as_array, called
+from skillweave.skills.outputs import answer, as_array, called
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
 from skillweave.skills.residual import Residual
@@ -381,7 +380,7 @@ class Reflex:
         Raises:
             SkillError: the condition returned a wrong result; the message names it.
         """
-        return answer(self.condition, obs, len(obs), bool, self._label, "condition")
+        return answer(self.condition, obs, bool, f"{self._label}: condition()")
 
     def fixed(self, space: Space[Any]) -> Array:
         """Return a fixed action as an element of ``space``, (...)."""
@@ -421,17 +420,17 @@ def asked(
     skill: Skill,
     method: str,
     about: Step | Array,
-    n: int,
-    elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
     """Call a method of a skill with a step or observations; return (n,) float32 or bool.
+
+    Args:
+        ids: environments of the rows, (n,), for messages; None: all n.
 
     Raises:
         SkillError: see ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
-    who = f"skill {path_of(skill)!r}"
+    who = f"skill {path_of(skill)!r}: {method}()"
     may_change = method == "reward" and skill.reward_changes
-    function = getattr(skill, method)
-    return answer(function, about, n, dtype, who, method, elapsed, ids, may_change=may_change)
+    return answer(getattr(skill, method), about, dtype, who, ids, may_change=may_change)

@@ -53,7 +53,7 @@ def declared_sees(sees: Any, who: str) -> PolicyMapping:
     Raises:
         DeclarationError: it is no ``sees`` of a skill; ``who`` begins the message.
     """
-    if isinstance(sees, MethodType) and required_arguments(sees.__func__) == 1:
+    if isinstance(sees, MethodType) and required_arguments(sees.__func__) <= 1:
         sees = sees.__func__  # a function in a class's body becomes a method when it is looked up
     try:
         return PolicyMapping(sees=checked_sees(sees, of_skill=True))

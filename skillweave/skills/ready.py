@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from types import MethodType
 from typing import Any
@@ -16,7 +15,7 @@ from skillweave.skills.base import Skill, is_trained
 from skillweave.skills.foreign_policy import checked_fit, fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.outputs import required_arguments
+from skillweave.skills.outputs import parameters_of, required_arguments
 from skillweave.skills.own_part import OwnPart
 from skillweave.skills.residual import Correction, Residual, check_corrected, refuse_skill
 from skillweave.skills.scripted import from_function
@@ -152,10 +151,7 @@ def _is_method(function: Any, skill: Skill) -> bool:
     required = required_arguments(function)
     if skill.goal_space is None:
         return required >= 2
-    try:
-        names = list(inspect.signature(function).parameters)
-    except (TypeError, ValueError):  # of some functions written in C
-        return False
+    names = [p.name for p in parameters_of(function)]
     if names[:1] == ["self"] or required >= 3:
         return True
     if required == 2 and GOAL not in names:

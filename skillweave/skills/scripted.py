@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called, required_arguments
+from skillweave.skills.outputs import as_array, called, parameters_of, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.types import Array, read_only
 
@@ -125,22 +124,16 @@ def _takes_goal(function: Any) -> Literal["goal", "second", ""]:
 
     A second parameter with a default, and of another name, is no goal: ``scale=2.0``.
     """
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of some functions written in C
-        return ""
-    kinds = {p.kind for p in parameters}
-    if any(p.name == GOAL and p.kind in _BY_NAME for p in parameters):
+    parameters = parameters_of(function)
+    if any(
+        p.name == GOAL and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in parameters
+    ):
         return "goal"
-    if required_arguments(function) > 1 or inspect.Parameter.VAR_POSITIONAL in kinds:
+    # It may be given by its place alone.
+    second = [p.name for p in parameters[1:2]] == [GOAL] or required_arguments(function) > 1
+    if second or any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return "second"
-    second = list(parameters)[1:2]
-    if second and second[0].name == GOAL:  # to be given by its place alone
-        return "second"
-    return "goal" if inspect.Parameter.VAR_KEYWORD in kinds else ""
-
-
-_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return "goal" if any(p.kind is p.VAR_KEYWORD for p in parameters) else ""
 
 
 @checked_names

@@ -88,7 +88,7 @@ def test_a_key_that_was_not_recorded_is_named() -> None:
     with pytest.raises(
         SkillError, match=r"'paid': reward\(\).*parts.*recorded: 'speed'.*needs_inf"
     ):
-        asked(Paid(), "reward", stored, 4)
+        asked(Paid(), "reward", stored)
 
 
 @pytest.mark.parametrize("keys", ["speed", ("speed", 3), 7])

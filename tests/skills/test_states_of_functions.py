@@ -20,11 +20,10 @@ from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.skills import Reflex, Skill, asked, from_function
-from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import check_spaces
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
-from skillweave.skills.outputs import called
+from skillweave.skills.outputs import answer, called
 from skillweave.skills.probing import watch
 from skillweave.types import Memoryless
 
@@ -95,7 +94,7 @@ def method(name: str) -> Any:
         "goals": lambda: goals.draw(OBS, np.random.default_rng(0)),
         "clip_goal": lambda: goals.fitted(OBS, OBS, "it"),
     }
-    return ways.get(name, lambda: asked(goals.skill, name, about, 4))
+    return ways.get(name, lambda: asked(goals.skill, name, about))
 
 
 def places() -> dict[str, list[Callable[[], Any]]]:
@@ -139,7 +138,7 @@ def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
 
 
 def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
-    others = ("outputs", "answers", "probing", "info_read", "goal_read")  # of all, or before them
+    others = ("outputs", "probing", "info_read", "goal_read")  # of all, or before them
     calls = {
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()
