@@ -17,8 +17,8 @@ from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
 from skillweave.skills.goals import goals_of
-from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
+from skillweave.skills.reads import info_keys_read
 from skillweave.types import Array, Step
 
 

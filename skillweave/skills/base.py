@@ -412,7 +412,7 @@ class Reflex:
             return np.repeat(self.fixed(space)[None], n, axis=0)
         result = called(self.action, obs, label)
         actions = self._data(space).actions(result, n, label, SkillError)
-        probe(self.action, obs, n, label, space)
+        probe(self.action, obs, label, space)
         return actions
 
 

@@ -26,7 +26,6 @@ def called(
     function: Any,
     argument: Any,
     who: str,
-    elapsed: Any = None,
     ids: Array | None = None,
     kind: type[SkillweaveError] = SkillError,
     more: tuple[Any, ...] = (),
@@ -38,7 +37,6 @@ def called(
         function: takes one argument, and ``more``.
         argument: a step, or observations; a dict: arguments by name.
         who: the function's name in messages.
-        elapsed: the step of the episode, if known.
         ids: the environments of the rows.
         kind: the type of the error: PolicyError if the function is a policy.
         more: further arguments.
@@ -53,10 +51,10 @@ def called(
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:
-        about = getattr(argument, "shape", None)
+        about, when = getattr(argument, "shape", None), at_step(getattr(argument, "elapsed", None))
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
-        raise kind(f"{who} raised {error_text(error)}{at_step(elapsed)}{given}{advice}") from error
+        raise kind(f"{who} raised {error_text(error)}{when}{given}{advice}") from error
 
 
 class Asked:
@@ -97,12 +95,12 @@ def answer(
         n, elapsed = len(about.reward), about.elapsed
     else:
         n, about = len(about), read_only(about)
-    value = called(function, about, who, elapsed, ids, judges=None if may_change else True)
+    value = called(function, about, who, ids, judges=None if may_change else True)
     objects = isinstance(value, np.ndarray) and value.dtype == object
     if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
         raise SkillError(f"{who}{at_step(elapsed)}: {odd}")
     array = checked(value, n, dtype, who, elapsed, ids)
-    probe(function, about, n, who)
+    probe(function, about, who)
     return array
 
 
@@ -151,7 +149,7 @@ def checked(
         kind = f"{array.dtype} ({short(first[0])})" if first else array.dtype
         raise SkillError(f"{who} returned {kind}{when}, but {needed}")
     if flags:
-        row = next(iter(np.flatnonzero((array != 0) & (array != 1))), None)
+        row: Any = next(iter(np.flatnonzero((array != 0) & (array != 1))), None)
         needed = f", but {needed}: return a comparison"
     else:
         with np.errstate(over="ignore"):  # an overflow is an infinity

@@ -103,7 +103,7 @@ class _Asked:
         plain = mapping.acts is None and mapping.chunk is None
         alone = len(given) == 1 and not named
         if space is not None and plain and alone and action.shape == (n, *(space.shape or ())):
-            probe(function, given[0], n, who, space, PolicyError)
+            probe(function, given[0], who, space, PolicyError)
         return action
 
 

@@ -11,8 +11,8 @@ from test_asked_twice import step
 
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.skills import Skill, asked
-from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
+from skillweave.skills.reads import info_keys_read
 
 INFO: dict[str, Any] = {
     "speed": np.arange(4.0),

@@ -138,7 +138,7 @@ def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
 
 
 def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
-    others = ("outputs", "probing", "info_read", "goal_read")  # of all, or before them
+    others = ("outputs", "probing", "reads")  # of all, or before them
     calls = {
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()
