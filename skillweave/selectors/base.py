@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -21,6 +20,7 @@ from skillweave.policies.selectors import function_name as function_name
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import repeated
+from skillweave.skills.outputs import Wrapped as Wrapped
 from skillweave.skills.outputs import answer, called
 from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step
@@ -152,21 +152,6 @@ class ReadySelector(Foreign):
         data = space_of(space)
         goals = data.goals(repeated(space, goal, 1), 1, self._who, f"skill {name!r}")
         return goals.reshape(data.shape)
-
-
-@dataclass(frozen=True)
-class Wrapped:
-    """A function of the user, ``bare``, that is asked with this library's messages.
-
-    Exports name it.
-    """
-
-    bare: Callable[..., Any]
-    ask: Callable[..., Any]
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Return the answer of the function."""
-        return self.ask(*arguments)
 
 
 def checked_function(

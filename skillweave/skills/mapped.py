@@ -108,14 +108,18 @@ class MappedPolicy(Functional, Foreign, Model):
         Raises:
             PolicyError: the goal is no input of it, or its mapping does not fit.
         """
-        bound = super().bind(observation_space, action_space, who)
         if not self.takes_goal:
-            raise PolicyError(f"{bound._who} takes no goal, but its skill has goals: {self.advice}")
-        check_range(goals, self.mapping.goal_places, bound._who)
-        bound._goals, bound.joins = goals, True
-        bound.observation_space = with_goal(bound.observation_space, goals.space)
-        _ = bound.in_place
-        return bound
+            raise PolicyError(
+                f"{who}: {self.name} takes no goal, but its skill has goals: {self.advice}"
+            )
+        check_range(goals, self.mapping.goal_places, f"{who}: {self.name}")
+        aimed, seen = (
+            copy.copy(self),
+            observation_space if self._open[0] else self.observation_space,
+        )
+        aimed._goals, aimed.joins = goals, True
+        aimed.observation_space = with_goal(seen, goals.space)
+        return aimed.bind(aimed.observation_space, action_space, who)
 
     @property
     def given(self) -> str:
@@ -138,12 +142,8 @@ class MappedPolicy(Functional, Foreign, Model):
 
     def source(self) -> dict[str, Any]:
         """Return its source as JSON, with its mapping."""
-        found = super().source()
-        return (
-            found
-            if self.mapping == PolicyMapping()
-            else found | {"mapping": self.mapping.to_json()}
-        )
+        mapping = self.mapping.to_json()
+        return super().source() | ({"mapping": mapping} if mapping else {})
 
     def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
         """Return a copy with the recorded mapping ``data``.

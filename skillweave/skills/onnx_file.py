@@ -17,7 +17,6 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunEr
 from skillweave.messages import short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
-from skillweave.policies.files import checksum
 from skillweave.policies.mapped import OnnxFile, fits_shape, open_session
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import SEES
@@ -50,7 +49,6 @@ class OnnxPolicy(MappedPolicy):
     ) -> None:
         super().__init__(str(file), observation_space, action_space, mapping)
         self.data = data
-        self.file = file
         inputs, states = self._session.get_inputs(), dict(self.mapping.state)
         free = [i for i in inputs if i.name not in states]
         several = self.mapping.sees is not None and "" not in self.mapping.sees
@@ -79,7 +77,7 @@ class OnnxPolicy(MappedPolicy):
     @cached_property
     def _session(self) -> Any:
         try:
-            return open_session(self.data, str(self.file))
+            return open_session(self.data, self.name)
         except ImportError as error:
             raise MissingExtra("an ONNX file", "onnx") from error
 
@@ -144,8 +142,7 @@ class OnnxPolicy(MappedPolicy):
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""
-        found = {k: v for k, v in super().source().items() if k != "name"}
-        return found | {"file": str(self.file), "sha256": checksum(self.data)}
+        return super().source() | {"file": self.name}
 
     def content(self) -> bytes:
         """Return the whole model."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -57,20 +58,28 @@ def called(
         raise kind(f"{who} raised {error_text(error)}{when}{given}{advice}") from error
 
 
-class Asked:
-    """A function of the user that makes numbers, asked by ``called``.
+@dataclass(frozen=True)
+class Wrapped:
+    """A function of the user, ``bare``, that is asked with this library's messages.
 
-    Args:
-        bare: the function.
-        who: its name in messages.
+    Exports name it.
     """
 
-    def __init__(self, bare: Any, who: str) -> None:
-        self.bare, self.who = bare, who
+    bare: Callable[..., Any]
+    ask: Callable[..., Any]
 
-    def __call__(self, obs: Array) -> Array:
-        """Return an array that it makes of observations."""
-        return as_array(called(self.bare, obs, self.who, kind=PolicyError), self.who, PolicyError)
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Return the answer of the function."""
+        return self.ask(*arguments, **named)
+
+
+def of_numbers(function: Any, who: str) -> Wrapped:
+    """Return a function of observations that makes numbers, asked by ``called``."""
+    return Wrapped(function, partial(_numbers, function, who))
+
+
+def _numbers(function: Any, who: str, obs: Array) -> Array:
+    return as_array(called(function, obs, who, kind=PolicyError), who, PolicyError)
 
 
 def answer(

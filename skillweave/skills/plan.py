@@ -30,7 +30,7 @@ from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
-from skillweave.skills.outputs import Asked
+from skillweave.skills.outputs import of_numbers
 from skillweave.types import Array
 
 
@@ -58,7 +58,7 @@ def fitted_mapping(
     goal: Array | Callable[..., Any] | None = None
     if goal_space is None and mapping.goal is not None:
         fixed = isinstance(mapping.goal, tuple)
-        goal = np.array(mapping.goal) if fixed else Asked(mapping.goal, f"{who}: goal()")
+        goal = np.array(mapping.goal) if fixed else of_numbers(mapping.goal, f"{who}: goal()")
     inputs: dict[str, Input] | None = None
     if mapping.sees is not None:
         if not isinstance(space, Box) and any(isinstance(s, LastAction) for s in mapping.sources()):
@@ -159,7 +159,7 @@ class _Reader:
         if isinstance(source, LastAction):
             return [Take("last_action", self.own["last_action"])]
         who = f"{where}, a function,"
-        function = Asked(source.function, who)
+        function = of_numbers(source.function, who)
         shape = numbers_of(function, made_up(self.space, 2), who).shape[1:]
         if len(shape) > 1 and not alone:
             raise PolicyError(

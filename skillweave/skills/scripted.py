@@ -18,7 +18,7 @@ from skillweave.policies.parts import GOAL
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called, parameters_of, required_arguments
+from skillweave.skills.outputs import Wrapped, as_array, called, parameters_of, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.types import Array, read_only
 
@@ -50,13 +50,13 @@ class ScriptedPolicy(MappedPolicy):
         mapping = self.mapping
         takes_goal = self._with_goal if self.joins else ""
         how = mapping.state, mapping.single_state, takes_goal, self._who
-        return Function(_Asked(self), *how)
+        return Function(Wrapped(self.function, self._ask), *how)
 
     @cached_property
     def in_place(self) -> InPlace:  # type: ignore[override]
         """The policy that acts: the function alone, while its action space is not known."""
         if self.action_space is None and self.mapping == PolicyMapping():
-            return _Alone(self)
+            return _Alone(self._ask)
         return super().in_place
 
     @property
@@ -73,21 +73,13 @@ class ScriptedPolicy(MappedPolicy):
         """Return the function's name, and the mapping."""
         return super().source() | {"name": qualified(self.function)}
 
-
-class _Asked:
-    """The function of a policy, which is asked by ``called``."""
-
-    def __init__(self, policy: ScriptedPolicy) -> None:
-        self.bare, self.policy = policy.function, policy
-
-    def __call__(self, *given: Any, **named: Any) -> Any:
-        """Return what it makes of its inputs, and perhaps of a goal or a state."""
-        policy, who = self.policy, self.policy._who
+    def _ask(self, *given: Any, **named: Any) -> Any:
+        """Return what the function makes of its inputs, and perhaps of a goal or a state."""
+        who, mapping, space = self._who, self.mapping, self.action_space
         if not given:
-            return called(self.bare, named, who, kind=PolicyError)
-        function = partial(self.bare, **named) if named else self.bare
+            return called(self.function, named, who, kind=PolicyError)
+        function = partial(self.function, **named) if named else self.function
         value = called(function, given[0], who, kind=PolicyError, more=given[1:])
-        mapping, space = policy.mapping, policy.action_space
         if mapping.state and isinstance(value, tuple | list) and len(value) == 2:
             output, after = value
             several = not mapping.single_state and isinstance(after, tuple | list)
@@ -98,7 +90,7 @@ class _Asked:
         if mapping.state or isinstance(space, Dict | Tuple):
             return value
         if isinstance(value, Mapping):
-            policy.must_be_bound()
+            self.must_be_bound()
         action, n = as_array(value, who, PolicyError), len(given[0])
         plain = mapping.acts is None and mapping.chunk is None
         alone = len(given) == 1 and not named
@@ -110,8 +102,8 @@ class _Asked:
 class _Alone(InPlace):
     """A function whose action space is not known."""
 
-    def __init__(self, policy: ScriptedPolicy) -> None:
-        self._function = _Asked(policy)
+    def __init__(self, function: Callable[[Array], Any]) -> None:
+        self._function = function
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return what the function returns."""
