@@ -68,11 +68,6 @@ def choice_space(
     return ChoiceSpace(choices, goal_spaces, owners)
 
 
-def number_of(choice: Array) -> Array:
-    """Return the numbers (k,) of choices (k,) with or without goals."""
-    return choice if choice.dtype.fields is None else choice[SKILL]
-
-
 def blank_choices(space: gym.Space[Any], number: Array) -> Array:
     """Return choices of a ``choice_space`` with these numbers (k,), and some goals, to be set."""
     if isinstance(space, gym.spaces.Discrete):
@@ -119,18 +114,11 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
     return batch
 
 
-def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
-    """Return the named parts of a Dict or Tuple; None for any other space."""
-    from skillweave.spaces.packing import parts  # needs torch, which declaring does not
-
-    return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
-
-
-def leaf_at(space: gym.Space[Any], path: tuple[str, ...]) -> gym.Space[Any]:
+def leaf_at(space: Any, path: tuple[str, ...]) -> gym.Space[Any]:
     """Return the part of a space to which these names lead."""
     for name in path:
-        space = (parts_of(space) or {})[name]
-    return space
+        space = space[int(name) if isinstance(space, gym.spaces.Tuple) else name]
+    return space  # type: ignore[no-any-return]
 
 
 def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
@@ -150,8 +138,3 @@ def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
     except ValueError:  # of parts of unequal lengths
         return goal
     return np.repeat(fixed[None], n, axis=0)
-
-
-def from_numbers(space: gym.Space[Any], numbers: Array) -> Array:
-    """Return goals (n, *goal_shape) of a space from their numbers (n, G); see ``Goals.flat``."""
-    return space_of(space).of_numbers(numbers)

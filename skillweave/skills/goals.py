@@ -18,9 +18,7 @@ from skillweave.policies.hierarchy import TRIES, goals_hold
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
-from skillweave.skills.goal_spaces import (
-    repeated,
-)
+from skillweave.skills.goal_spaces import repeated
 from skillweave.skills.outputs import called
 from skillweave.types import Array, read_only
 
@@ -66,10 +64,6 @@ class Goals:
     def start(self, n: int) -> Array:
         """Return goals of n environments without a call, (n, *goal_shape)."""
         return self.data.start(n)
-
-    def contains(self, goal: Array) -> bool:
-        """Return whether all goals (n, *goal_shape) are in the space."""
-        return bool(self.data.holds(goal).all())
 
     def join(self, obs: Array, goal: Array) -> Array:
         """Return what the skill's networks see: one array (…) of observations and goals.
@@ -151,10 +145,6 @@ class Goals:
             )
         goals = self.data.goals(batch, 1, who, self._who).copy()
         return goals if self.skill.defines("clip_goal") else self._inside(goals, who, SkillError)
-
-    def flat(self, goal: Array) -> Array:
-        """Return goals as numbers (n, G), for policies that take them so."""
-        return self.data.flat(goal)
 
 
 ADVICE = "give one in it, or let the skill move goals into it: clip_goal(obs, goal)"

@@ -20,13 +20,15 @@ from skillweave.notices import notice
 from skillweave.policies.core import Memory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.functional import Functional
-from skillweave.policies.mapped import Model
-from skillweave.skills.foreign_policy import SEES, Foreign
+from skillweave.policies.mapped import Input, Mapped, Model, numbers_of
+from skillweave.policies.spaces import Space as Data
+from skillweave.skills.foreign_policy import SEES, Foreign, made_up
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
-from skillweave.skills.mapping import PolicyMapping
-from skillweave.skills.plan import described, fitted_mapping
-from skillweave.types import Memoryless
+from skillweave.skills.mapping import LastAction, PolicyMapping
+from skillweave.skills.outputs import Wrapped, of_numbers
+from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
+from skillweave.types import Array, Memoryless
 
 
 class MappedPolicy(Functional, Foreign, Model):
@@ -67,11 +69,36 @@ class MappedPolicy(Functional, Foreign, Model):
             PolicyError: these are not known, or it does not fit; the message names the field.
         """
         self.must_be_bound()
-        seen, goals = self.observation_space, None
+        who, mapping, model, seen = self._who, self.mapping, self.model, self.observation_space
+        goal_space: Data | None = None
+        goal: Array | Wrapped | None = None
         if self._goals is not None:
-            seen, goals = without_goal(seen), self._goals.data
-        spaces = seen, self.action_space
-        return fitted_mapping(self.mapping, self.model, spaces, self._who, goals, self.logits)
+            seen, goal_space = without_goal(seen), self._goals.data
+        elif callable(mapping.goal):
+            goal = of_numbers(mapping.goal, f"{who}: goal()")
+        elif mapping.goal is not None:
+            goal = np.array(mapping.goal)
+        outputs = fitted_outputs(mapping.acts, self.action_space, who, self.logits)
+        inputs: dict[str, Input] | None = None
+        if mapping.sees is not None:
+            last = any(isinstance(source, LastAction) for source in mapping.sources())
+            if last and outputs.space.kind != "Box":
+                raise PolicyError(
+                    f"{who}: sees has LastAction(), which needs actions of a Box, not "
+                    f"{self.action_space}"
+                )
+            own = {"last_action": (outputs.count,)}
+            if goal_space is not None:
+                own["goal"] = (goal_space.size,)
+            elif isinstance(goal, Wrapped):
+                own["goal"] = numbers_of(goal, made_up(seen, 2), f"{who}: goal()").shape[1:]
+                if len(own["goal"]) != 1:
+                    raise PolicyError(f"{who}: goal() must return (n, numbers)")
+            elif goal is not None:
+                own["goal"] = goal.shape
+            inputs = for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
+        every, chunk = mapping.every, mapping.chunk
+        return Mapped(model, outputs, inputs, every, chunk, goal, goal_space, who)
 
     def must_be_bound(self) -> None:
         """Raise a PolicyError if it has not the spaces that it needs yet."""
