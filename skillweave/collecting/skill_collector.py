@@ -295,7 +295,7 @@ class SkillCollector(Collector):
         if len(rows):
             turn = Turn(World(self._rng), None, None if goal is None else goal[rows])
             base[rows] = self._base.act(self._base_memory, rows, own[rows], turn)
-        return self._part.correction.added.apply(base, action)
+        return self._part.correction.apply(base, action)
 
     def _search(self, step: Step, searching: Array) -> None:
         """Let environments ``searching`` (k,) go on until the skill may start in them."""

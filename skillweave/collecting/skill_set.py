@@ -213,7 +213,7 @@ def policy_of(
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside
-    return Corrects(inside, base_of(part, goals), part.correction.added)
+    return Corrects(inside, base_of(part, goals), part.correction)
 
 
 def base_of(part: OwnPart, goals: Goals | None) -> Policy:

@@ -65,6 +65,10 @@ class Goals:
         """Return goals of n environments without a call, (n, *goal_shape)."""
         return self.data.start(n)
 
+    def contains(self, goal: Array) -> bool:
+        """Return whether all goals (n, *goal_shape) are in the space."""
+        return bool(self.data.holds(goal).all())
+
     def join(self, obs: Array, goal: Array) -> Array:
         """Return what the skill's networks see: one array (…) of observations and goals.
 

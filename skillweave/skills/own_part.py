@@ -23,7 +23,7 @@ from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short, shortened
 from skillweave.policies.mapped import Input
-from skillweave.policies.parts import Part
+from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data
 from skillweave.policies.spaces import at, space_of
 from skillweave.skills.foreign_policy import source_of
@@ -37,7 +37,7 @@ from skillweave.skills.mapping import (
 )
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.plan import fitted_inputs, places_in
-from skillweave.skills.residual import Correction
+from skillweave.skills.residual import Residual
 from skillweave.types import Array, Policy
 
 HOLD, ZERO = "hold", "zero"
@@ -105,15 +105,18 @@ def declared_acts(acts: Any, who: str) -> Any:
     )
 
 
-def part_to_json(sees: Any, acts: Any, who: str) -> dict[str, Any]:
-    """Return the ``sees`` and ``acts`` of a skill as JSON for runs; {}: it has none."""
+def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
+    """Return the part of a skill as JSON for runs, see ``OwnPart``; {}: it has none."""
     content: dict[str, Any] = {}
-    if sees is not None:
-        content["sees"] = declared_sees(sees, who).to_json()["sees"]
-    if acts is not None:
-        written = declared_acts(acts, who)
+    if skill.sees is not None:
+        content["sees"] = declared_sees(skill.sees, who).to_json()["sees"]
+    if skill.acts is not None:
+        written = declared_acts(skill.acts, who)
         named = isinstance(written, tuple) and isinstance(written[0], str)
         content["acts"] = list(written) if named else places_to_json(written)
+        content["rest"] = _rest_to_json(rest)
+    if isinstance(skill.policy, Residual):
+        content["residual"] = skill.policy.scale
     return content
 
 
@@ -147,12 +150,12 @@ def checked_rest(rest: Any) -> None:
         raise DeclarationError(f"rest is {short(rest)}; {_REST}")
 
 
-def rest_to_json(rest: Any) -> Any:
+def _rest_to_json(rest: Any) -> Any:
     """Return ``Hierarchy.rest`` as JSON."""
     if isinstance(rest, Mapping):
-        return {key: rest_to_json(value) for key, value in rest.items()}
+        return {key: _rest_to_json(value) for key, value in rest.items()}
     if isinstance(rest, Sequence) and not isinstance(rest, str):
-        return [rest_to_json(value) for value in rest]
+        return [_rest_to_json(value) for value in rest]
     return rest.tolist() if isinstance(rest, np.ndarray | np.generic) else rest
 
 
@@ -297,9 +300,8 @@ class OwnPart:
     """The part of observations that a skill sees, and of actions that it writes.
 
     Args:
-        sees: the skill's; None: it sees all.
-        acts: the skill's; None: it writes all.
-        rest: the hierarchy's, for the other numbers of the action.
+        skill: sees all without ``sees``, and writes all without ``acts``.
+        rest: its hierarchy's, for the other numbers of the action.
         observation_space: of the environment.
         action_space: of the environment.
         who: begins messages: "skill 'arm'".
@@ -310,8 +312,7 @@ class OwnPart:
 
     def __init__(
         self,
-        sees: Any,
-        acts: Any,
+        skill: Any,
         rest: Any,
         observation_space: Space[Any],
         action_space: Space[Any],
@@ -320,14 +321,16 @@ class OwnPart:
         from skillweave.spaces.saving import gym_space  # needs torch, which declaring does not
 
         self.who = who
-        self._declared = sees, acts, rest
+        self._skill, self._rest = skill, rest
+        sees, acts = skill.sees, skill.acts
         self.whole_observation_space = observation_space
         self.whole_action_space = self.written_space = action_space
         self.observation_space = observation_space
         """Of what its policy sees, without a goal."""
-        self.correction: Correction | None = None
+        self.base: Policy | None = None
         """The ready policy to whose actions its own are added; None: there is none."""
-        self._rests = acts is not None and not isinstance(action_space, Discrete)
+        self.correction: Correction | None = None
+        """What adds them."""
         how: dict[str, Any] = {}
         try:
             if sees is not None:
@@ -339,7 +342,7 @@ class OwnPart:
                 self.written_space = gym_space(written)
         except PolicyError as error:
             raise DeclarationError(str(error)) from None
-        if self._rests:
+        if acts is not None and not isinstance(action_space, Discrete):
             how["fixed"], how["held"] = rest_of(rest, action_space)
         elif acts is not None and not (isinstance(rest, str) and rest == ZERO):
             raise DeclarationError(
@@ -354,14 +357,8 @@ class OwnPart:
 
     def to_json(self) -> dict[str, Any]:
         """Return what was declared as JSON."""
-        sees, acts, rest = self._declared
-        content = part_to_json(sees, acts, self.who)
-        if self._rests:
-            content["rest"] = rest_to_json(rest)
-        if self.correction is not None:
-            content["residual"] = self.correction.scale
-            content["policy"] = source_of(self.correction.base)
-        return content
+        content = part_to_json(self._skill, self._rest, self.who)
+        return content if self.base is None else content | {"policy": source_of(self.base)}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
         """Return what it sees, as of ``Part``."""
@@ -387,21 +384,10 @@ class OwnPart:
             return read[0]
         return Box(-np.inf, np.inf, given.shape or (1,), np.float32)
 
-    def corrected(self, correction: Correction) -> OwnPart:
-        """Return the part of a skill whose actions correct those of a ready policy."""
-        part = copy.copy(self)
-        part.correction, part.action_space = correction, correction.space
-        return part
-
-    @property
-    def inputs(self) -> dict[str, Input] | None:
-        """Its inputs, by name; None: it sees all."""
-        return self.part.inputs
-
-    @property
-    def base(self) -> Policy | None:
-        """The ready policy that it corrects; None: there is none."""
-        return None if self.correction is None else self.correction.base
+    def correct(self, base: Policy, added: Correction) -> None:
+        """Let its actions correct those of a ready policy, which is fitted to its spaces."""
+        self.base, self.correction = base, added
+        self.action_space = Box(-1.0, 1.0, self.written_space.shape, np.float32)
 
     def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:
         """Return the part of larger observations, of which ``view`` returns the environment's."""

@@ -17,7 +17,7 @@ from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, wit
 from skillweave.skills.goals import goals_of
 from skillweave.skills.outputs import parameters_of, required_arguments
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.residual import Correction, Residual, check_corrected, refuse_skill
+from skillweave.skills.residual import Residual, correction, refuse_skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -126,17 +126,18 @@ def own_part(
         DeclarationError: the part does not fit the environment's spaces.
         PolicyError: the ready policy that it corrects does not.
     """
-    part = OwnPart(skill.sees, skill.acts, rest, *spaces, who)
+    part = OwnPart(skill, rest, *spaces, who)
     residual, seen = skill.policy, part.observation_space
     if not isinstance(residual, Residual):
         return part
-    check_corrected(part.action_space, who)
+    added = correction(residual.scale, part.action_space, who)
     base = _as_policy(residual.policy, skill)
     if skill.goal_space is not None:
         seen = with_goal(seen, skill.goal_space)
     env += "" if skill.sees is None and skill.acts is None else PART
     fit = fitted_to_skill(base, skill, seen, part.action_space, who, env)
-    return part.corrected(Correction(residual, fit, part.action_space, who))
+    part.correct(fit, added)
+    return part
 
 
 def _is_method(function: Any, skill: Skill) -> bool:
