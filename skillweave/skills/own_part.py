@@ -9,7 +9,7 @@ actions.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from math import prod
 from types import MethodType
@@ -25,7 +25,7 @@ from skillweave.messages import short, shortened
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data
-from skillweave.policies.spaces import at, space_of
+from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import (
@@ -33,7 +33,7 @@ from skillweave.skills.mapping import (
     PolicyMapping,
     checked_sees,
     is_places,
-    places_to_json,
+    to_json,
 )
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.plan import fitted_inputs, places_in
@@ -111,10 +111,8 @@ def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
     if skill.sees is not None:
         content["sees"] = declared_sees(skill.sees, who).to_json()["sees"]
     if skill.acts is not None:
-        written = declared_acts(skill.acts, who)
-        named = isinstance(written, tuple) and isinstance(written[0], str)
-        content["acts"] = list(written) if named else places_to_json(written)
-        content["rest"] = _rest_to_json(rest)
+        content["acts"] = to_json(declared_acts(skill.acts, who))
+        content["rest"] = to_json(rest)
     if isinstance(skill.policy, Residual):
         content["residual"] = skill.policy.scale
     return content
@@ -141,22 +139,11 @@ def part_from_json(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def checked_rest(rest: Any) -> None:
     """Raise a DeclarationError where ``Hierarchy.rest`` is none for any action space."""
-    if isinstance(rest, str) and rest not in (HOLD, ZERO):
+    word = isinstance(rest, str)
+    if rest is None or isinstance(rest, bool) or (word and rest not in (HOLD, ZERO)):
         raise DeclarationError(f"rest is {short(rest)}; {_REST}")
-    values = rest.values() if isinstance(rest, Mapping) else ()
-    for value in values:
+    for value in rest.values() if isinstance(rest, Mapping) else ():
         checked_rest(value)
-    if rest is None or isinstance(rest, bool):
-        raise DeclarationError(f"rest is {short(rest)}; {_REST}")
-
-
-def _rest_to_json(rest: Any) -> Any:
-    """Return ``Hierarchy.rest`` as JSON."""
-    if isinstance(rest, Mapping):
-        return {key: _rest_to_json(value) for key, value in rest.items()}
-    if isinstance(rest, Sequence) and not isinstance(rest, str):
-        return [_rest_to_json(value) for value in rest]
-    return rest.tolist() if isinstance(rest, np.ndarray | np.generic) else rest
 
 
 _REST = (
@@ -182,36 +169,33 @@ def rest_of(rest: Any, space: Space[Any]) -> tuple[Array, Held]:
     """
     checked_rest(rest)
     data = space_of(space)
-    fixed, found = data.start(1), []
-    for path, given, where in _leaves(rest, data, "rest"):
-        held = _fill(at(fixed, path)[0, ...], given, data.leaves[path], where)
-        if held.any():
-            found.append((path, held))
-    return fixed, tuple(found)
+    fixed = data.start(1)
+    return fixed, tuple(_filled(fixed[0, ...], rest, data, "rest"))
 
 
-def _leaves(
-    rest: Any, space: Data, where: str, path: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Any, str]]:
-    """Yield the names that lead to each leaf of an action, its rest, and its name in messages."""
-    if space.parts is None:
-        yield path, rest, where
+def _filled(
+    zero: Array, rest: Any, space: Data, where: str, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Array]]:
+    """Write the numbers of a rest over the zeros (…) of an action, or of its part at a ``path``.
+
+    Yields:
+        The path of each leaf, and (…) bool, which of its numbers are held, where some are.
+    """
+    if space.parts is not None:
+        if not isinstance(rest, str | Mapping):
+            raise DeclarationError(
+                f"{where} is {short(rest)}, but the action is {_shown(space)}: give a dict by its "
+                "keys"
+            )
+        given = dict.fromkeys(space.parts, rest) if isinstance(rest, str) else rest
+        for key in given:
+            if key not in space.parts:
+                hint = meant(str(key), list(space.parts), "it has")
+                raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
+        for key, part in space.parts.items():
+            inside = zero[key], given.get(key, ZERO), part, f"{where}[{key!r}]"
+            yield from _filled(*inside, (*path, key))
         return
-    if not isinstance(rest, str | Mapping):
-        raise DeclarationError(
-            f"{where} is {short(rest)}, but the action is {_shown(space)}: give a dict by its keys"
-        )
-    for key in rest if isinstance(rest, Mapping) else ():
-        if key not in space.parts:
-            hint = meant(str(key), list(space.parts), "it has")
-            raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
-    for name, part in space.parts.items():
-        given = rest if isinstance(rest, str) else rest.get(name, ZERO)
-        yield from _leaves(given, part, f"{where}[{name!r}]", (*path, name))
-
-
-def _fill(zero: Array, rest: Any, space: Data, where: str) -> Array:
-    """Write the numbers of a rest over zeros (…) of a leaf; return which are held, (…) bool."""
     entries = np.asarray(rest, object).reshape(-1)
     words = np.array([x if isinstance(x, str) else "" for x in entries])
     plain = ~np.isin(words, (HOLD, ZERO))
@@ -228,7 +212,9 @@ def _fill(zero: Array, rest: Any, space: Data, where: str) -> Array:
         raise DeclarationError(f"{where} is {short(rest)}, but {_shown(space)} has whole numbers")
     if not space.holds(zero[None]).all():
         raise DeclarationError(f"{where} is {short(rest)}, which is out of {_shown(space)}")
-    return np.broadcast_to(words == HOLD, zero.size).reshape(zero.shape)
+    held = np.broadcast_to(words == HOLD, zero.size).reshape(zero.shape)
+    if held.any():
+        yield path, held
 
 
 def _shown(space: Data) -> str:
