@@ -312,7 +312,7 @@ def rehearsed_obs(
     goals = goals_of(skill)
     if goals is None:
         return obs
-    return goals.join(obs, goals.data.of_numbers(log.goals[skill.name])[log.owner[steps]])
+    return goals.join(obs, goals.space.of_numbers(log.goals[skill.name])[log.owner[steps]])
 
 
 def matrix_to_json(matrix: HandOver) -> dict[str, Any]:

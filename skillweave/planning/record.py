@@ -25,7 +25,6 @@ from skillweave.policies.core import Around, CallEnd, Turn, World, restart
 from skillweave.policies.core import Memory as InPlaceMemory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.parts import GOAL
-from skillweave.policies.spaces import space_of
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.skills.goal_spaces import blank_choices
@@ -201,7 +200,7 @@ class WithDrawnGoals(Around):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
         spaces = {goals.skill.name: goals.space for _, goals in self._goals.values()}
         for name, (at, numbers) in again.items():
-            choice[GOAL][name][at] = space_of(spaces[name]).of_numbers(numbers)
+            choice[GOAL][name][at] = spaces[name].of_numbers(numbers)
         return choice
 
 

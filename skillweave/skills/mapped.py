@@ -73,7 +73,7 @@ class MappedPolicy(Functional, Foreign, Model):
         goal_space: Data | None = None
         goal: Array | Wrapped | None = None
         if self._goals is not None:
-            seen, goal_space = without_goal(seen), self._goals.data
+            seen, goal_space = without_goal(seen), self._goals.space
         elif callable(mapping.goal):
             goal = of_numbers(mapping.goal, f"{who}: goal()")
         elif mapping.goal is not None:
@@ -145,7 +145,7 @@ class MappedPolicy(Functional, Foreign, Model):
             observation_space if self._open[0] else self.observation_space,
         )
         aimed._goals, aimed.joins = goals, True
-        aimed.observation_space = with_goal(seen, goals.space)
+        aimed.observation_space = with_goal(seen, goals.goal_space)
         return aimed.bind(aimed.observation_space, action_space, who)
 
     @property
@@ -197,16 +197,16 @@ def check_range(goals: Goals, places: Sequence[Any], who: str) -> None:
         places: of the goal among the policy's inputs.
         who: begins the message.
     """
-    if not isinstance(goals.space, Box):
+    if not isinstance(goals.goal_space, Box):
         return
-    lowest, highest = goals.space.low.reshape(-1), goals.space.high.reshape(-1)
+    lowest, highest = goals.goal_space.low.reshape(-1), goals.goal_space.high.reshape(-1)
     for place in places:
         low = -np.inf if place.low is None else np.array(place.low)
         high = np.inf if place.high is None else np.array(place.high)
         fits = {np.size(low), np.size(high)} <= {1, len(lowest)}  # else refused later
         if fits and ((lowest < low - 1e-6).any() or (highest > high + 1e-6).any()):
             notice(
-                f"{who}: goal_space is {short(goals.space, 200)}, but Goal.low is "
+                f"{who}: goal_space is {short(goals.goal_space, 200)}, but Goal.low is "
                 f"{short(place.low)} and Goal.high {short(place.high)}, the range for which the "
                 "policy was made. It gets other goals clipped, and step.goal has them as they are: "
                 "give goal_space that range"

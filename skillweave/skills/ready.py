@@ -92,7 +92,7 @@ def fitted_to_skill(
     if goals is None:
         return fitted(policy, *spaces, who, env)
     if seen is not None and same_space(seen, spaces[0]):  # as saved here, for example
-        if says := other_goals(goal_part(seen), goals.space):
+        if says := other_goals(goal_part(seen), goals.goal_space):
             raise PolicyError(f"{who}: its policy {says}")
         return fitted(policy, *spaces, who, env)
     if not hasattr(policy, "bind_with_goals"):

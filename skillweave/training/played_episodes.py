@@ -99,7 +99,7 @@ class PlayedEpisodes:
                 continue
             judged = bool(self.skills) and not isinstance(skill, RecordedSkill)
             goals = recorder.goals.get(skill.name)
-            aims = None if goals is None else goals.data.of_numbers(log.goals[skill.name])
+            aims = None if goals is None else goals.space.of_numbers(log.goals[skill.name])
             for row in np.flatnonzero(skills == i).tolist():
                 won = bool(log.succeeded[row]) if skill.defines("success") else None
                 call = Call(

@@ -49,7 +49,7 @@ def skills_of(env: Point, *skills: sw.Skill, config: Any = PPO, **how: Any) -> S
         goals = goals_of(skill)
         seen: Any = env.observation_space
         if goals is not None:
-            seen = with_goal(seen, goals.space)
+            seen = with_goal(seen, goals.goal_space)
         declared = getattr(skill, "policy", None)
         if declared is None:
             policies.append(mild(config, seen, env.action_space, seed=i))

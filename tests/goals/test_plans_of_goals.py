@@ -198,9 +198,9 @@ def test_goals_from_their_numbers(space: str) -> None:
     """Goals of every space are their numbers, and back."""
     goals: Any = goals_of(go_to(space))
     drawn = draw_from(SPACES[space], 5, np.random.default_rng(0))
-    numbers = goals.data.flat(drawn)
+    numbers = goals.space.flat(drawn)
     assert numbers.shape == (5, space_of(SPACES[space]).size)
-    back = goals.data.of_numbers(numbers)
+    back = goals.space.of_numbers(numbers)
     assert back.dtype == drawn.dtype
     assert back.tobytes() == drawn.tobytes()
 

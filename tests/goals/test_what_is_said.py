@@ -414,8 +414,8 @@ def test_goals_are_drawn_and_joined(name):
     assert joint.dtype == obs_dtype(with_goal(Point.observation_space, skill.goal_space))
     assert np.array_equal(joint["observation"], obs)
     assert np.array_equal(joint["goal"], drawn)
-    assert goals.data.flat(drawn).shape == (50, goals.size)
-    assert np.array_equal(goals.data.of_numbers(goals.data.flat(drawn)), drawn)
+    assert goals.space.flat(drawn).shape == (50, goals.space.size)
+    assert np.array_equal(goals.space.of_numbers(goals.space.flat(drawn)), drawn)
     assert np.array_equal(
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),

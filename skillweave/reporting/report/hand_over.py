@@ -275,9 +275,9 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
     """Return the goal of a call in words; empty: it has none, or its space is not known."""
     name = log.skills[int(log.skill[row])]
     goals, numbers = goals_of(with_goals.get(name)), log.goals.get(name)
-    if goals is None or numbers is None or numbers.shape[1] != goals.size:
+    if goals is None or numbers is None or numbers.shape[1] != goals.space.size:
         return ""
-    return shown_goal(goals.data.of_numbers(numbers[[row]])[0])
+    return shown_goal(goals.space.of_numbers(numbers[[row]])[0])
 
 
 # The film
