@@ -120,13 +120,6 @@ def fitted(
     """
     if isinstance(policy, Foreign):
         policy = policy.bind(observation_space, action_space, who)
-    return checked_fit(policy, observation_space, action_space, who, env)
-
-
-def checked_fit(
-    policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
-) -> Policy:
-    """Return a bound policy, after it was tried out; see ``fitted``."""
     check_spaces(policy, observation_space, action_space, f"{who}: its policy", env)
     if isinstance(policy, Foreign):
         policy.try_out()

@@ -16,7 +16,6 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short
 from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.types import Array
 
@@ -253,28 +252,3 @@ def array_of(tensor: Any) -> Array:
     """Return a tensor's numbers, float64."""
     array: Array = tensor.detach().cpu().double().numpy()
     return array
-
-
-def of_module(module: Any, who: str, observation_space: Any, action_space: Any) -> Learnable:
-    """Return a ``Sequential`` of linear layers as a policy that a skill learns on with.
-
-    It is the network of PPO's actor; the critic starts afresh.
-
-    Raises:
-        PolicyError: it is no such module.
-    """
-    if type(module).__name__ not in ("Sequential", "Linear"):
-        raise PolicyError(
-            f"{who} cannot learn on: it is a {short(type(module).__name__)}, and only a Sequential "
-            "of linear layers is known. Let it act as it is (without learn=True), or use its first "
-            "layers as an encoder: Network(encoder=function)"
-        )
-    return Learnable(
-        who,
-        "PPO",
-        {"actor": layers_of([module], who)},
-        env_units=True,
-        observation_space=observation_space,
-        action_space=action_space,
-        settings=PLAIN_PPO,
-    )

@@ -12,7 +12,7 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
-from skillweave.skills.foreign_policy import checked_fit, fitted
+from skillweave.skills.foreign_policy import fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
 from skillweave.skills.outputs import parameters_of, required_arguments
@@ -87,22 +87,21 @@ def fitted_to_skill(
     """
     from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
 
-    spaces = observation_space, action_space
     goals, seen = goals_of(skill), policy.observation_space
-    if goals is None:
-        return fitted(policy, *spaces, who, env)
-    if seen is not None and same_space(seen, spaces[0]):  # as saved here, for example
-        if says := other_goals(goal_part(seen), goals.goal_space):
-            raise PolicyError(f"{who}: its policy {says}")
-        return fitted(policy, *spaces, who, env)
-    if not hasattr(policy, "bind_with_goals"):
-        raise PolicyError(
-            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
-            f"as {spaces[0]}; or give a function, policy(self, obs, goal), or a policy from "
-            "elsewhere with Goal() at its place in sees"
-        )
-    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
-    return checked_fit(bound, *spaces, who, env)
+    if goals is not None:
+        if seen is not None and same_space(seen, observation_space):  # as saved here, for example
+            if says := other_goals(goal_part(seen), goals.goal_space):
+                raise PolicyError(f"{who}: its policy {says}")
+        elif hasattr(policy, "bind_with_goals"):
+            plain = without_goal(observation_space)
+            policy = policy.bind_with_goals(plain, action_space, who, goals)
+        else:
+            raise PolicyError(
+                f"{who} has goals, but its policy observes {seen}: one for it observes the goal, "
+                f"too, as {observation_space}; or give a function, policy(self, obs, goal), or a "
+                "policy from elsewhere with Goal() at its place in sees"
+            )
+    return fitted(policy, observation_space, action_space, who, env)
 
 
 def has_part(skill: Skill) -> bool:

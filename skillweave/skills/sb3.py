@@ -28,7 +28,8 @@ from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
 from skillweave.skills.torch_module import TorchPolicy
 from skillweave.types import Array
 
-ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
+ALGORITHMS = {"PPO": "PPO", "A2C": "PPO", "DQN": "DQN", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3"}
+"""The algorithms of Stable-Baselines3, with those of this library by which a model learns on."""
 
 
 class SB3Policy(TorchPolicy):
@@ -242,12 +243,12 @@ def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     kind: Any = algorithm
-    if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
+    if isinstance(algorithm, str) and algorithm.upper() in ALGORITHMS:
         kind = getattr(stable_baselines3, algorithm.upper())
     if not (isinstance(kind, type) and hasattr(kind, "load")):
         raise DeclarationError(
             f"{file}: algorithm is {algorithm!r}; it must be the class that saved the file, or one "
-            f"of {', '.join(ALGORITHMS)}"
+            f"of {', '.join(ALGORITHMS).lower()}"
         )
     content = read_file(file)
     # A replay buffer is for training only, and may take gigabytes.
@@ -293,11 +294,11 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
     given = [k for k, v in options.items() if v is not None and v != 1]
     if given:
         raise DeclarationError(no_mapping(f"from_sb3(learn=True): {name}", " and ".join(given)))
-    kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
-    if kind not in kinds or hasattr(policy, "lstm_actor") or _has_gsde(policy):
+    learns_by = ALGORITHMS.get(kind)
+    if learns_by is None or hasattr(policy, "lstm_actor") or _has_gsde(policy):
         raise PolicyError(
-            f"{name} cannot learn on: only the networks of {', '.join(kinds)} without memory and "
-            "without gSDE are known. Let it act as it is (without learn=True)"
+            f"{name} cannot learn on: only the networks of {', '.join(ALGORITHMS)} without memory "
+            "and without gSDE are known. Let it act as it is (without learn=True)"
         )
     if isinstance(model.action_space, MultiBinary):
         raise PolicyError(
@@ -306,10 +307,16 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
         )
     modules = (policy, *policy.children())
     extractors = (getattr(module, "features_extractor", None) for module in modules)
-    _check_features(next(x for x in extractors if x is not None), name)
+    extractor = next(x for x in extractors if x is not None)
+    parts = getattr(extractor, "extractors", {"": extractor}).values()
+    if other := {type(part).__name__ for part in parts} - {"FlattenExtractor", "Flatten"}:
+        raise PolicyError(
+            f"{name} cannot learn on: its observations pass through {', '.join(sorted(other))}, "
+            "and only networks of linear layers are known. Let it act as it is (without learn=True)"
+        )
     settings: dict[str, Any] = {}
     log_std = None
-    if kinds[kind] == "PPO":
+    if learns_by == "PPO":
         hidden = policy.mlp_extractor
         networks = {
             "actor": layers_of([hidden.policy_net, policy.action_net], name),
@@ -330,26 +337,15 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
     space = model.observation_space
     return Learnable(
         name,
-        kinds[kind],
+        learns_by,
         networks,
         None if log_std is None else array_of(log_std),
-        env_units=kinds[kind] == "PPO",
+        env_units=learns_by == "PPO",
         scaling=None if normalize is None else _moments(normalize, space),
         observation_space=space,
         action_space=model.action_space,
         settings=settings,
     )
-
-
-def _check_features(extractor: Any, name: str) -> None:
-    """Raise a PolicyError where observations pass through more than flattening and joining."""
-    parts = getattr(extractor, "extractors", {"": extractor})
-    kinds = {type(part).__name__ for part in parts.values()}
-    if kinds - {"FlattenExtractor", "Flatten"}:
-        raise PolicyError(
-            f"{name} cannot learn on: its observations pass through {', '.join(sorted(kinds))}, "
-            "and only networks of linear layers are known. Let it act as it is (without learn=True)"
-        )
 
 
 def _moments(normalize: Any, space: Space[Any]) -> tuple[Array, Array, float]:

@@ -19,7 +19,7 @@ from skillweave.policies.files import checksum
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import qualified
-from skillweave.skills.learnable import Learnable, no_mapping, of_module
+from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.types import Array
@@ -269,7 +269,16 @@ def from_torch(
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
     if learn:
-        return of_module(module, f"module {type(module).__name__}", observation_space, action_space)
+        who = f"module {type(module).__name__}"
+        return Learnable(
+            who,
+            "PPO",
+            {"actor": layers_of([module], who)},
+            env_units=True,
+            observation_space=observation_space,
+            action_space=action_space,
+            settings=PLAIN_PPO,
+        )
     return TorchPolicy(module, observation_space, action_space, mapping)
 
 
