@@ -96,7 +96,7 @@ class SkillCollector(Collector):
         if acting is not None:
             self.acting = acting
         self.skill, self.reflexes = skill, reflexes
-        self._reflexes = Reflexes(Policy(), reflexes, engine.action_space)
+        self._reflexes = Reflexes(Policy(), reflexes, space_of(engine.action_space))
         self._start_calls = 0 if starters is None else start_calls
         self._search_steps, self._episode_calls = search_steps, episode_calls
         self._named_share = named_share

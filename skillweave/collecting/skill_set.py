@@ -182,7 +182,7 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
 def _around(policy: Policy, skills: SkillSet, *, remembers: bool) -> Policy:
     """Return a policy with reflexes, which remembers the last action where that counts."""
     if skills.reflexes:
-        policy = Reflexes(policy, skills.reflexes, skills.action_space)
+        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
     if not (remembers and policy.holds):
         return policy
     return Remembers(policy, space_of(skills.action_space))

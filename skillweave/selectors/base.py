@@ -19,7 +19,7 @@ from skillweave.policies.selectors import Rule
 from skillweave.policies.selectors import function_name as function_name
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goal_spaces import repeated
+from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped as Wrapped
 from skillweave.skills.outputs import answer, called
 from skillweave.terminal import one_line
@@ -150,7 +150,7 @@ class ReadySelector(Foreign):
         if (space := self.goal_spaces.get(name)) is None:
             return goal
         data = space_of(space)
-        goals = data.goals(repeated(space, goal, 1), 1, self._who, f"skill {name!r}")
+        goals = data.goals(alone(data, goal), 1, self._who, f"skill {name!r}")
         return goals.reshape(data.shape)
 
 

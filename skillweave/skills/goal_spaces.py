@@ -14,6 +14,7 @@ import numpy as np
 from skillweave.messages import short
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL, OBSERVATION
+from skillweave.policies.spaces import Space as Data
 from skillweave.policies.spaces import at, space_of
 from skillweave.types import Array
 
@@ -121,20 +122,16 @@ def leaf_at(space: Any, path: tuple[str, ...]) -> gym.Space[Any]:
     return space  # type: ignore[no-any-return]
 
 
-def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
-    """Return one goal as a batch of n, of a Dict or Tuple in dicts and tuples; it is not checked.
+def alone(space: Data, goal: Any) -> Any:
+    """Return one element of a space as a batch of one, parts in a dict; it is not checked.
 
-    A value that is no goal of the space is returned as it is, or repeated, so that the check of
-    the batch can show it.
+    A value that is no element is returned as it is, or as a batch, so that the check of the batch
+    can show it.
     """
-    if isinstance(space, gym.spaces.Dict) and isinstance(goal, Mapping):
-        return {k: repeated(space[k], v, n) if k in space.spaces else v for k, v in goal.items()}
-    if isinstance(space, gym.spaces.Tuple) and isinstance(goal, tuple | list):
-        if len(goal) != len(space.spaces):
-            return goal
-        return tuple(repeated(part, v, n) for part, v in zip(space.spaces, goal, strict=True))
+    parts = space.parts or {}
+    if parts and (given := space.by_name(goal)) is not None:
+        return {k: alone(parts[k], v) if k in parts else v for k, v in given.items()}
     try:
-        fixed = np.asarray(goal)
+        return np.asarray(goal)[None]
     except ValueError:  # of parts of unequal lengths
         return goal
-    return np.repeat(fixed[None], n, axis=0)

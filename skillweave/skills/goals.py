@@ -18,7 +18,7 @@ from skillweave.policies.hierarchy import TRIES, CallGoals
 from skillweave.policies.parts import joined
 from skillweave.policies.spaces import space_of
 from skillweave.skills.base import Skill, path_of
-from skillweave.skills.goal_spaces import repeated
+from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import called
 from skillweave.types import Array, read_only
 
@@ -100,7 +100,7 @@ class Goals(CallGoals):
         Raises:
             SkillError: it is none of the space; the message names ``who``.
         """
-        space, batch = self.space, repeated(self.goal_space, goal, 1)
+        space, batch = self.space, alone(self.space, goal)
         wrong = isinstance(batch, np.ndarray) and batch.shape != (1, *space.shape)
         if space.parts is None and wrong:
             raise SkillError(

@@ -26,13 +26,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from gymnasium import Space
-from gymnasium.spaces import Discrete
 
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import error_text
 from skillweave.notices import notice
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import Space, discrete
 from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Step, read_only
 
@@ -190,7 +188,7 @@ def probe(
     function: Callable[..., Any],
     given: Step | Array | tuple[Any, ...],
     who: str,
-    space: Space[Any] | None = None,
+    space: Space | None = None,
     kind: type[SkillweaveError] = SkillError,
 ) -> None:
     """Call a function for other numbers of environments than n, at its first call.
@@ -213,7 +211,7 @@ def probe(
     sizes = _other_sizes(arguments, n)
     certain = all(_has_rows(a, n) for a in arguments)
     fault = (_notes_of(owner) or {}).get(name)
-    leaves = space_of(space or Discrete(2)).leaves
+    leaves = (space or discrete(2)).leaves
     with untouched(function):
         for m in sizes:
             rows = np.arange(m) % n

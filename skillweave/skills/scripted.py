@@ -15,6 +15,7 @@ from skillweave.policies.core import Memory, Turn
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
+from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
@@ -95,7 +96,7 @@ class ScriptedPolicy(MappedPolicy):
         plain = mapping.acts is None and mapping.chunk is None
         alone = len(given) == 1 and not named
         if space is not None and plain and alone and action.shape == (n, *(space.shape or ())):
-            probe(function, given[0], who, space, PolicyError)
+            probe(function, given[0], who, space_of(space), PolicyError)
         return action
 
 

@@ -8,6 +8,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.policies.core import Policy
 from skillweave.policies.parts import Reflexes
+from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.outputs import checked
 from skillweave.types import Step
@@ -81,20 +82,24 @@ OBS = np.array([[0.0], [1.0], [2.0]])
 
 def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_alone():
     action = np.array([5, 5, 5])
-    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action, Discrete(6))
+    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(
+        OBS, action, space_of(Discrete(6))
+    )
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
 
 
 def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds():
     reflex = Reflex(lambda obs: obs[:, 0] > 0, lambda obs: 10 * obs)
-    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), Box(-50, 50, (1,)))
+    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), space_of(Box(-50, 50, (1,))))
     assert overridden.tolist() == [[5], [10], [20]]
 
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    action, overridden = Reflexes(Policy(), reflexes, Discrete(3)).over(OBS, np.zeros(3, int))
+    action, overridden = Reflexes(Policy(), reflexes, space_of(Discrete(3))).over(
+        OBS, np.zeros(3, int)
+    )
     assert action.tolist() == [0, 1, 2]
     assert overridden.tolist() == [False, True, True]
 
@@ -109,7 +114,7 @@ def test_a_reflex_is_named_after_its_condition():
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        reflex.apply(OBS, np.zeros(3, int), Discrete(2))
+        reflex.apply(OBS, np.zeros(3, int), space_of(Discrete(2)))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -244,7 +249,9 @@ def test_observations_cannot_be_changed_either(function):
     skill = type("Writes", (Skill,), {"initiation": lambda self, obs: write(obs)})()
     call = {
         "initiation": lambda obs: asked(skill, "initiation", obs),
-        "condition": lambda obs: Reflex(write, 0).apply(obs, np.zeros(3, int), Discrete(2)),
+        "condition": lambda obs: Reflex(write, 0).apply(
+            obs, np.zeros(3, int), space_of(Discrete(2))
+        ),
         "policy": lambda obs: from_function(write).act({}, obs),
     }[function]
     obs = OBS.copy()
@@ -274,10 +281,10 @@ def test_observations_cannot_be_changed_either(function):
 def test_a_wrong_action_of_a_reflex_is_told(action, space, says):
     reflex = Reflex(lambda obs: obs[:, 0] > 0, action, "tilted")
     with pytest.raises(SkillweaveError, match=f"reflex 'tilted': .*{says}|{says}"):
-        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space)
+        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space_of(space))
     if not callable(action):
         with pytest.raises(SkillweaveError, match="reflex 'tilted'"):
-            reflex.check(space)
+            reflex.check(space_of(space))
 
 
 @pytest.mark.parametrize(

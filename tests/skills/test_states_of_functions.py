@@ -18,6 +18,7 @@ from skillweave.errors import PolicyError
 from skillweave.notices import collected_notices
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall
+from skillweave.policies.spaces import space_of
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.foreign_policy import check_spaces
@@ -119,7 +120,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
         "selectors.ready": [chooses(Best()), chooses(Two())],
         "skills.base": [
             lambda: condition.holds(OBS),
-            lambda: reflex.apply(OBS, np.zeros(4, int), SPACES[1]),
+            lambda: reflex.apply(OBS, np.zeros(4, int), space_of(SPACES[1])),
             *map(method, Skill.methods),
         ],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
