@@ -18,6 +18,7 @@ from skillweave.messages import short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.mapped import OnnxFile, fits_shape, open_session
+from skillweave.policies.spaces import space_of
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.mapped import MappedPolicy
@@ -108,15 +109,11 @@ class OnnxPolicy(MappedPolicy):
 
         Where names do not decide, shapes do.
         """
-        if self._chooses and self.action_space is not None:
-            self._choose_output()
-        return super().in_place
-
-    def _choose_output(self) -> None:
-        from skillweave.spaces import choice_counts, obs_shape
-
-        size = math.prod(obs_shape(self.action_space))
-        choices = sum(choice_counts(self.action_space))
+        self.must_be_bound()
+        if not self._chooses:
+            return super().in_place
+        space = space_of(self.action_space)
+        size, choices = space.size, sum(space.counts)
         after = dict(self.mapping.state).values()
         ranks: dict[tuple[bool, ...], list[str]] = {}
         for output in self._session.get_outputs():
@@ -139,6 +136,7 @@ class OnnxPolicy(MappedPolicy):
                 f"{self._who}: any of its outputs {', '.join(best)} could be the action, and "
                 f"{self.output!r} is used: name the right one, output={self.output!r}"
             )
+        return super().in_place
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""
