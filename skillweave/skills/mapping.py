@@ -291,7 +291,6 @@ class PolicyMapping:
 
 def mapping_of(
     who: str,
-    *,
     sees: Any = None,
     goal: Any = None,
     acts: Any = None,

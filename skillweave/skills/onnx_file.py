@@ -206,9 +206,7 @@ def from_onnx(
         DeclarationError: an argument is wrong; the message names it.
         MissingExtra: the extra 'onnx' is not installed.
     """
-    mapping = mapping_of(
-        "from_onnx()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_onnx()", sees, goal, acts, every, chunk, state)
     if mapping.state and not isinstance(state, dict):
         raise DeclarationError(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "

@@ -177,7 +177,5 @@ def from_function(
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    mapping = mapping_of(
-        "from_function()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_function()", sees, goal, acts, every, chunk, state)
     return ScriptedPolicy(function, observation_space, action_space, mapping)

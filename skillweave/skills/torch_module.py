@@ -245,9 +245,7 @@ def from_torch(
         PolicyError: the file is not trusted, or holds no module; or the module cannot learn on.
         RunError: the file does not exist.
     """
-    mapping = mapping_of(
-        "from_torch()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state)
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_torch(): learn is {short(learn)}; it must be True or False")
     if learn and mapping != PolicyMapping():
