@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -227,17 +228,13 @@ class PolicyMapping:
 
     def functions(self) -> dict[str, Callable[[Any], Any]]:
         """Return the user's functions in it, by the names under which ``to_json`` has them."""
-        found = [s.function for s in self.sources() if isinstance(s, Computed)]
+        found: list[Any] = [s.function for s in self.sources() if isinstance(s, Computed)]
         found += [self.goal] if callable(self.goal) else []
         named: dict[str, Callable[[Any], Any]] = {}
         for function in found:
-            if function is not None and not any(function is other for other in named.values()):
-                name = function_name(function)
-                number = 2
-                while name in named:
-                    name = f"{function_name(function)}#{number}"
-                    number += 1
-                named[name] = function
+            first = function_name(function)
+            names = (first if i == 1 else f"{first}#{i}" for i in count(1))
+            named[next(x for x in names if named.get(x, function) is function)] = function
         return named
 
     def to_json(self) -> dict[str, Any]:

@@ -61,11 +61,6 @@ def declared_sees(sees: Any, who: str) -> PolicyMapping:
         raise DeclarationError(f"{who}: {error}") from None
 
 
-def computed(sees: Any, who: str) -> bool:
-    """Return whether functions of the user are in a skill's ``sees``."""
-    return bool(declared_sees(sees, who).functions())
-
-
 def declared_acts(acts: Any, who: str) -> Any:
     """Return a skill's ``acts``: names of parts of a Dict action, or places of another one.
 
