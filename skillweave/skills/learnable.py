@@ -218,7 +218,9 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     flat = [m for module in modules for m in _unpacked(module)]
     names = [type(m).__name__ for m in flat]
     wrong = next((n for n in names if n != "Linear" and n not in ACTIVATIONS), None)
-    wrong = wrong or next((repr(m) for m in flat if _has_settings(m)), None)
+    usual = {"alpha": 1.0, "approximate": "none"}  # as networks here have them
+    other = (repr(m) for m in flat if any(getattr(m, k, v) != v for k, v in usual.items()))
+    wrong = wrong or next(other, None)
     kinds = set(names[1::2])
     alternates = set(names[::2]) == {"Linear"} and "Linear" not in kinds and len(names) % 2 == 1
     if wrong or not alternates or len(kinds) > 1:
@@ -234,11 +236,6 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     if not all(np.isfinite(x).all() for x in (*weights, *biases)):
         raise PolicyError(f"{who} cannot learn on: its weights hold NaN or infinity")
     return Layers(weights, biases, ACTIVATIONS[kinds.pop()] if kinds else "tanh")
-
-
-def _has_settings(module: Any) -> bool:
-    """Return whether a nonlinearity has other settings than in networks here."""
-    return getattr(module, "alpha", 1.0) != 1.0 or getattr(module, "approximate", "none") != "none"
 
 
 def _unpacked(module: nn.Module) -> list[nn.Module]:

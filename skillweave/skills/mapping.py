@@ -456,9 +456,7 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
 
 def _is_shape(shape: tuple[Any, ...]) -> bool:
     sizes = [n for n in shape if n is not None]
-    return len(sizes) == len(shape) - 1 and all(
-        isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in sizes
-    )
+    return len(sizes) == len(shape) - 1 and all(_is_whole(n) and n >= 1 for n in sizes)
 
 
 # Values of fields
