@@ -154,7 +154,7 @@ def within(**how: Any) -> Any:
     whole = type("Far", (GoTo,), {"max_steps": 7})()
     own = goals_of(whole)
     assert own is not None
-    seen = with_goal(env.observation_space, own.space)
+    seen = with_goal(env.observation_space, own.goal_space)
     spaces = {"go_to": GoTo.goal_space, "other": GoTo.goal_space}
     if how.get("cut"):
         config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)
