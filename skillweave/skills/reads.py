@@ -1,4 +1,4 @@
-"""What the methods of a skill read of a step: keys of ``info``, and the goal.
+"""Search for what the methods of a skill read of a step: keys of ``info``, and the goal.
 
 Stands alone because a skill is declared without it; only what records and judges steps needs it.
 """
