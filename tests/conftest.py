@@ -115,7 +115,7 @@ def forget_registered() -> Iterator[None]:
 @pytest.fixture
 def unprobed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Call functions once, for the environments alone: for tests that record calls."""
-    monkeypatch.setattr("skillweave.skills.probing._seen.first_time", lambda *_: False)
+    monkeypatch.setattr("skillweave.skills.probing.first_time", lambda *_: False)
 
 
 @pytest.fixture

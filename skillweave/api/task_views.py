@@ -64,7 +64,7 @@ class OwnPolicy(Functional):
         inside = policy_of(policy, goals, part, "the policy's act()")
         super().__init__(Viewed(inside, seen), joins=goals is not None)
         self.policy = policy
-        self.observation_space = space if goals is None else with_goal(space, goals.space)
+        self.observation_space = space if goals is None else with_goal(space, goals.goal_space)
         self.action_space = policy.action_space if part is None else part.written_space
         self.labels = policy.labels
 

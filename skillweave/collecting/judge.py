@@ -17,8 +17,8 @@ from skillweave.policies.parts import GOAL, OBSERVATION
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill, asked, path_of
 from skillweave.skills.goals import goals_of
-from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
+from skillweave.skills.reads import info_keys_read
 from skillweave.types import Array, Step
 
 
@@ -66,8 +66,7 @@ class Outcome:
         return self._asked(self._skill, "success") if self._skill.defines("success") else None
 
     def _asked(self, skill: Skill, method: str) -> Array:
-        step = self._step
-        return asked(skill, method, step, len(step.reward), step.elapsed, self._ids)
+        return asked(skill, method, self._step, self._ids)
 
 
 def judge(skill: Skill | None, step: Step, ids: Array | None = None) -> Outcome:

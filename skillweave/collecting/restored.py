@@ -89,7 +89,7 @@ def opened(
             like, codec = obs, plain
             if (own := (goals or {}).get(name)) is not None:
                 like = own.join(obs, own.start(len(obs)))
-                codec = obs_codec(with_goal(observation_space, own.space))
+                codec = obs_codec(with_goal(observation_space, own.goal_space))
             found[name] = value.copy().view(like.dtype).reshape(like.shape)
             # What calls that are over were decided on is not kept.
             is_open = kept[join(level_of(name), "open")]

@@ -258,7 +258,7 @@ class Search:
             return ids
         holds = np.ones(len(ids), bool)
         if self._restricted:
-            holds = asked(self.skill, "initiation", obs[ids], len(ids), ids=ids)
+            holds = asked(self.skill, "initiation", obs[ids], ids)
         found, waiting = ids[holds & (self.kept["calls_left"][ids] == 0)], ids[~holds]
         self.kept["searching"][found] = False
         self.kept["searched"][found] = 0

@@ -17,10 +17,9 @@ from skillweave.policies.leaves import Ready
 from skillweave.policies.parts import Corrects, Given, Joined, PartOf, Reflexes, Remembers
 from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex, Skill, path_of
-from skillweave.skills.answers import ask
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals, goals_of
-from skillweave.skills.outputs import blame
+from skillweave.skills.outputs import ask, blame
 from skillweave.skills.own_part import OwnPart
 from skillweave.types import Memoryless
 
@@ -185,7 +184,7 @@ def acting_apart(
         space: of the environment's actions.
     """
     policy = _whole(policy, skill, part)
-    return Reflexes(policy, reflexes, space) if reflexes else policy
+    return Reflexes(policy, reflexes, space_of(space)) if reflexes else policy
 
 
 def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
@@ -208,7 +207,7 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
 def _around(policy: Policy, skills: SkillSet, *, remembers: bool) -> Policy:
     """Return a policy with reflexes, which remembers the last action where that counts."""
     if skills.reflexes:
-        policy = Reflexes(policy, skills.reflexes, skills.action_space)
+        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
     if not (remembers and policy.holds):
         return policy
     return Remembers(policy, space_of(skills.action_space))
@@ -239,7 +238,7 @@ def policy_of(
     inside = Joined(inside) if joins and goals is not None else inside
     if part is None or part.correction is None:
         return inside
-    return Corrects(inside, base_of(part, goals), part.correction.added)
+    return Corrects(inside, base_of(part, goals), part.correction)
 
 
 def base_of(part: OwnPart, goals: Goals | None) -> Policy:

@@ -17,10 +17,10 @@ from skillweave.experience import INFO, Batch, Trace
 from skillweave.messages import short
 from skillweave.policies.core import OWN, RUNNING
 from skillweave.skills import Skill
-from skillweave.skills.goal_read import check_reads_goal, is_unchecked
 from skillweave.skills.goals import Goals
 from skillweave.skills.info_words import missing_key
 from skillweave.skills.own_part import OwnPart
+from skillweave.skills.reads import check_reads_goal, is_unchecked
 from skillweave.types import Array, Step
 
 AT_ONCE = 1 << 26

@@ -64,11 +64,9 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
         case PartOf() if policy.part.view is not None:
             raise PolicyError(f"{where} {_OF_A_TASK}")
         case Reflexes():
-            if isinstance(space := policy.space, Space):  # of a policy that was read
-                return replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
-            rules = tuple(_rule(reflex, space) for reflex in policy.reflexes)
+            rules = tuple(_rule(reflex, policy.space) for reflex in policy.reflexes)
             inside = _compiled(policy.policy, name, sampled=sampled)
-            return Reflexes(inside, rules, space_of(space))
+            return Reflexes(inside, rules, policy.space)
         case Corrects():
             inside = _compiled(policy.policy, name, sampled=sampled)
             base = _compiled(policy.base, f"{name}.base", sampled=False)
@@ -144,7 +142,7 @@ def _skill(skill: CalledSkill, prefix: str, knows: bool, *, sampled: bool) -> Ca
     goals = skill.goals
     if isinstance(goals, Goals):
         clip = goals.skill.clip_goal if goals.skill.defines("clip_goal") else None
-        goals = CallGoals(skill.path, space_of(goals.space), clip, skill.termination)
+        goals = CallGoals(skill.path, goals.space, clip, skill.termination)
     inside = _compiled(skill.policy, prefix + skill.name, sampled=sampled)
     success = skill.success if knows else None
     return replace(skill, policy=inside, goals=goals, success=success)
@@ -162,6 +160,8 @@ def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
     return Interruption(Critic(Network(content, sees, worth)), how.margin)
 
 
-def _rule(reflex: Any, space: Any) -> Override:
+def _rule(reflex: Any, space: Space) -> Override:
+    if isinstance(reflex, Override):  # of a policy that was read
+        return reflex
     action = reflex.action if callable(reflex.action) else reflex.fixed(space)[None]
     return Override(reflex.name, reflex.condition, action)

@@ -47,8 +47,6 @@ def as_file(policy: Mapped, where: str, *, sampled: bool) -> Mapped:
     match policy.model:
         case OnnxFile() | Function():
             return policy
-        case TorchPolicy() as own:
-            return _module_model(policy, own, where)
         case SB3Policy() as own if not sampled:
             return _sb3_model(policy, own, where)
         case SB3Policy():
@@ -56,6 +54,8 @@ def as_file(policy: Mapped, where: str, *, sampled: bool) -> Mapped:
                 f"{where} samples by Stable-Baselines3's own code, which the runner does not have: "
                 "train with selection=Selection(greedy_skills=True)"
             )
+        case TorchPolicy() as own:
+            return _module_model(policy, own, where)
     kind = type(policy.model).__name__
     raise PolicyError(f"{where} is a {kind}, which cannot be written as ONNX")
 
@@ -134,7 +134,7 @@ class _Predicting(nn.Module):
 
     def __init__(self, policy: SB3Policy, names: list[str]) -> None:
         super().__init__()
-        self.policy = policy.policy
+        self.policy: Any = policy.module
         self.names = names
         self.space = policy.model_space
 

@@ -27,7 +27,6 @@ from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import CalledSkill, Hierarchy
 from skillweave.policies.mapped import Mapped, Take
 from skillweave.policies.parts import Reflexes
-from skillweave.policies.spaces import space_of
 from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import Foreign
@@ -119,8 +118,8 @@ class Exported(Functional, Foreign):
         """Return a copy as the policy of a skill that has goals; see ``MappedPolicy``."""
         bound = self.bind(observation_space, action_space, who)
         check_range(goals, self._goal_places, bound._who)
-        bound = bound._aiming(goal=None, goal_space=space_of(goals.space))
-        bound.joins, bound.observation_space = True, with_goal(observation_space, goals.space)
+        bound = bound._aiming(goal=None, goal_space=goals.space)
+        bound.joins, bound.observation_space = True, with_goal(observation_space, goals.goal_space)
         return bound
 
     def _aiming(self, **goal: Any) -> Self:

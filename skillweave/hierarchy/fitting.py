@@ -19,6 +19,7 @@ from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.paths import join
 from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.spaces import space_of
 from skillweave.selectors import ReadySelector
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted
@@ -49,7 +50,7 @@ def check_settings(roles: Roles) -> None:
             if isinstance(config, AlgorithmConfig):
                 check_rollout(config, spaces.observation)
         for reflex in level.reflexes:
-            reflex.check(spaces.action)
+            reflex.check(space_of(spaces.action))
         if level.guide is not None:
             learning_guide(roles, level)
 

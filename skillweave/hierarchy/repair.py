@@ -23,7 +23,6 @@ from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.policies.core import Memory, Turn
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
-from skillweave.skills.goal_spaces import from_numbers
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
 from skillweave.training.learning_task import LearningTask, skill_task
@@ -311,7 +310,7 @@ def rehearsed_obs(
     goals = goals_of(skill)
     if goals is None:
         return obs
-    return goals.join(obs, from_numbers(goals.space, log.goals[skill.name])[log.owner[steps]])
+    return goals.join(obs, goals.space.of_numbers(log.goals[skill.name])[log.owner[steps]])
 
 
 def matrix_to_json(matrix: HandOver) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.selectors.ready import ReadyValue
 from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.own_part import OwnPart, computed
+from skillweave.skills.own_part import OwnPart, declared_sees
 from skillweave.skills.residual import Residual
 from skillweave.training.role import Role
 from skillweave.training.stage import Together
@@ -156,7 +156,8 @@ class Level:
         if self.reflexes or self.guide is not None or self.ready_selector is not None:
             return False
         skills = self.skills.values()
-        computes = any(s.sees is not None and computed(s.sees, s.name) for s in skills)
+        seen = (declared_sees(s.sees, s.name) for s in skills if s.sees is not None)
+        computes = any(mapping.functions() for mapping in seen)
         asks = any(s.defines("termination") or s.defines("initiation") for s in skills)
         return not (asks or computes)
 

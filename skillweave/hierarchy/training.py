@@ -26,7 +26,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.skills.goals import goals_of
-from skillweave.skills.own_part import part_to_json, rest_to_json
+from skillweave.skills.own_part import part_to_json
 from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
 from skillweave.training.defaults import TrainDefaults
@@ -239,12 +239,9 @@ def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
     if skill.goal_space is not None:
         goals_of(skill)  # a space that is not supported is named with its skill
         entry["goal_space"] = space_to_json(skill.goal_space)
-    entry |= part_to_json(skill.sees, skill.acts, f"skill {path!r}")
-    if skill.acts is not None:
-        entry["rest"] = rest_to_json(roles[path].rest)
+    entry |= part_to_json(skill, roles[path].rest, f"skill {path!r}")
     if isinstance(skill.policy, Residual) and (part := roles[path].part) is not None:
         assert part.base is not None
-        entry["residual"] = skill.policy.scale
         entry["policy"] = source_of(part.base)
     if inner is not None:
         entry["hierarchy"] = _level_entry(roles, inner)

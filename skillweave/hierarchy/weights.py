@@ -28,8 +28,7 @@ from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.settings import AtLeastOne, NonNegative
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
-from skillweave.skills.own_part import part_to_json, rest_to_json
-from skillweave.skills.residual import Residual
+from skillweave.skills.own_part import part_to_json
 from skillweave.spaces import same_space
 from skillweave.types import Policy
 
@@ -262,12 +261,7 @@ def check_same_part(roles: Roles, path: str, recorded: Mapping[str, Any], who: s
     Args:
         recorded: its ``sees``, ``acts`` and ``rest``, where it had some.
     """
-    skill, rest = roles.skills[path], roles[path].rest
-    declared = part_to_json(skill.sees, skill.acts, f"skill {path!r}")
-    if skill.acts is not None and "rest" in recorded:
-        declared["rest"] = rest_to_json(rest)
-    if isinstance(skill.policy, Residual):
-        declared["residual"] = skill.policy.scale
+    declared = part_to_json(roles.skills[path], roles[path].rest, f"skill {path!r}")
     for field in ("sees", "acts", "rest", "residual"):
         then, now = recorded.get(field), declared.get(field)
         if then != now:

@@ -329,7 +329,7 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
     found: list[tuple[int, ...] | None] = []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
         part, places = skills.part(i), getattr(policy, "seen_places", None)
-        sees_else = part is not None and (part.inputs is not None or part.base is not None)
+        sees_else = part is not None and (part.part.inputs is not None or part.base is not None)
         if places is None or sees_else:
             found.append(None)
             continue

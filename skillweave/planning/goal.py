@@ -13,8 +13,7 @@ from skillweave.messages import short
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.predicates import Predicate
 from skillweave.selectors.base import function_name
-from skillweave.skills.answers import checked
-from skillweave.skills.outputs import called
+from skillweave.skills.outputs import called, checked
 from skillweave.types import Array, Step, read_only
 
 
@@ -93,9 +92,9 @@ class GoalTask:
 
     def holds(self, obs: Array, goal: Array) -> Array:
         """Return where ``goal``, (G,) or (n, G), is reached in ``obs`` (n, …), (n,) bool."""
-        who, name = "goal", function_name(self.reached)
-        value = called(self.reached, read_only(obs), f"{who}: {name}()", more=(goal,))
-        return checked(value, len(obs), bool, who, name)
+        who = f"goal: {function_name(self.reached)}()"
+        value = called(self.reached, read_only(obs), who, more=(goal,))
+        return checked(value, len(obs), bool, who)
 
     def at(self, goal: Array | None) -> RewardMachine:
         """Return the task of one goal (G,), or None: of that which each observation holds."""

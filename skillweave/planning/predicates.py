@@ -16,7 +16,7 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short, whole_number
 from skillweave.selectors.base import function_name
 from skillweave.skills import Skill
-from skillweave.skills.answers import answer
+from skillweave.skills.outputs import answer
 from skillweave.types import Array, Step
 
 Reads = Literal["obs", "step"]
@@ -81,7 +81,7 @@ class Predicate:
         """
         if self.reads == "obs":
             return self.at(step.next_obs)
-        return answer(self.function, step, len(step.reward), bool, "task", self.name, step.elapsed)
+        return answer(self.function, step, bool, f"task: {self.name}()")
 
     def at(self, obs: Array) -> Array:
         """Return where a predicate of observations is true, (n,) bool, for ``obs`` (n, …).
@@ -95,7 +95,7 @@ class Predicate:
                 f"the predicate {self.name!r} reads a step, but only an observation is known here"
             )
         try:
-            return answer(self.function, obs, len(obs), bool, "task", self.name)
+            return answer(self.function, obs, bool, f"task: {self.name}()")
         except SkillError as error:
             if (hint := _hint(error)) is None:
                 raise

@@ -27,7 +27,7 @@ from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.parts import GOAL
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.skills.goal_spaces import blank_choices, from_numbers
+from skillweave.skills.goal_spaces import blank_choices
 from skillweave.spaces import same_space
 from skillweave.types import Array
 
@@ -200,7 +200,7 @@ class WithDrawnGoals(Around):
                 choice[GOAL][name][mine] = goals.draw(obs[mine], rng)
         spaces = {goals.skill.name: goals.space for _, goals in self._goals.values()}
         for name, (at, numbers) in again.items():
-            choice[GOAL][name][at] = from_numbers(spaces[name], numbers)
+            choice[GOAL][name][at] = spaces[name].of_numbers(numbers)
         return choice
 
 

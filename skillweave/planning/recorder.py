@@ -165,7 +165,7 @@ class Recorder:
             order[starts],
             trace["elapsed"][starts] - 1,
             *(
-                goals.flat(trace[f"{self._columns}{name}/goal"][starts])
+                goals.space.flat(trace[f"{self._columns}{name}/goal"][starts])
                 for name, goals in self.goals.items()
             ),
         )
@@ -364,7 +364,7 @@ class Recorder:
         return _Part(
             (
                 *(whole, obs, whole, whole, whole, whole),
-                *(goals.flat(goals.start(0)) for goals in self.goals.values()),
+                *(goals.space.flat(goals.start(0)) for goals in self.goals.values()),
             ),
             steps if first is None else tuple(column[:0] for column in first),
             [

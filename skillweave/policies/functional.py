@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -25,7 +26,10 @@ class Functional:
     def __init__(self, in_place: Policy, *, joins: bool = False) -> None:
         self.in_place = in_place
         self.joins = joins
-        self._like = in_place.start(1)
+
+    @cached_property
+    def _like(self) -> Memory:
+        return self.in_place.start(1)
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""

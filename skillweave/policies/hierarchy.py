@@ -55,6 +55,9 @@ TRIES = 16
 """The most goals that are chosen for a call, where those before hold already."""
 
 
+ADVICE = "; give one in it, or let the skill move goals into it: clip_goal(obs, goal)"
+
+
 @dataclass(eq=False)
 class CallGoals:
     """The goals of a skill's calls."""
@@ -76,16 +79,29 @@ class CallGoals:
     def fitted(self, obs: Array, goal: Any, who: str) -> Array:
         """Return goals (n, …) for calls that start in ``obs`` (n, …), clipped and checked.
 
+        Args:
+            goal: of each of the n environments.
+            who: whose goals they are, for messages.
+
         Raises:
-            SkillError: one is out of the space; ``who`` gave it.
+            SkillError: they have another shape or type, or are out of the space.
         """
         n, skill = len(obs), f"skill {self.name!r}"
         goals = self.space.goals(goal, n, who, skill)
         if self.clip is not None:
             who = f"{skill}: clip_goal()"
             goals = self.space.goals(self.clip(obs, goals), n, who, skill)
+        return self.inside(goals, who)
+
+    def inside(self, goals: Array, who: str) -> Array:
+        """Return goals (n, …) that are in the space.
+
+        Raises:
+            SkillError: one is not; ``who`` gave it.
+        """
         if not (inside := self.space.holds(goals)).all():
-            raise SkillError(self.space.is_out(goals[~inside][0], who, skill))
+            says = self.space.is_out(goals[~inside][0], who, f"skill {self.name!r}")
+            raise SkillError(says + ADVICE * (self.clip is None))
         return goals
 
     def hold(self, obs: Array, goal: Array) -> Array:

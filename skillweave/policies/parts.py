@@ -416,8 +416,8 @@ class Reflexes(Around):
 
     reflexes: tuple[Any, ...] = field(metadata={"kind": tuple[Override, ...]})
     """``Override``, or what else has ``apply``."""
-    space: Any = field(metadata={"kind": Space})
-    """Of the actions, as ``apply`` takes it."""
+    space: Space
+    """Of the actions."""
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return the policy's actions, or those of a reflex."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
 
@@ -19,10 +18,10 @@ from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import Rule
 from skillweave.policies.selectors import function_name as function_name
 from skillweave.policies.spaces import space_of
-from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import Foreign
-from skillweave.skills.goal_spaces import repeated
-from skillweave.skills.outputs import called
+from skillweave.skills.goal_spaces import alone
+from skillweave.skills.outputs import Wrapped as Wrapped
+from skillweave.skills.outputs import answer, called
 from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step
 
@@ -151,36 +150,15 @@ class ReadySelector(Foreign):
         if (space := self.goal_spaces.get(name)) is None:
             return goal
         data = space_of(space)
-        goals = data.goals(repeated(space, goal, 1), 1, self._who, f"skill {name!r}")
+        goals = data.goals(alone(data, goal), 1, self._who, f"skill {name!r}")
         return goals.reshape(data.shape)
-
-
-@dataclass(frozen=True)
-class Wrapped:
-    """A function of the user, ``bare``, that is asked with this library's messages.
-
-    Exports name it.
-    """
-
-    bare: Callable[..., Any]
-    ask: Callable[..., Any]
-
-    def __call__(self, *arguments: Any) -> Any:
-        """Return the answer of the function."""
-        return self.ask(*arguments)
 
 
 def checked_function(
     function: Callable[[Any], Any], who: str, name: str, dtype: type = bool
 ) -> Wrapped:
     """Return a function of observations or of steps to (n,), whose answers are checked."""
-    return Wrapped(function, partial(_checked, function, who, name, dtype))
-
-
-def _checked(function: Callable[[Any], Any], who: str, name: str, dtype: type, about: Any) -> Array:
-    step = isinstance(about, Step)
-    n, elapsed = (len(about.reward), about.elapsed) if step else (len(about), None)
-    return answer(function, about, n, dtype, who, name, elapsed)
+    return Wrapped(function, partial(answer, function, dtype=dtype, who=f"{who}: {name}()"))
 
 
 def goal_as_json(goal: Any) -> Any:

@@ -65,7 +65,7 @@ class FunctionSelector(ReadySelector):
     def _ask(self, obs: Array, *last: LastCall) -> Any:
         value = called(self.function, obs, self._who, more=last)
         if self.in_place.parted(value, len(obs))[1] is None:
-            probe(self.function, (obs, *last), len(obs), self._who)
+            probe(self.function, (obs, *last), self._who)
         return value
 
     def source(self) -> dict[str, Any]:

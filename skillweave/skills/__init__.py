@@ -1,6 +1,5 @@
 """Skills and reflexes, which users declare."""
 
-from skillweave.skills.answers import checked
 from skillweave.skills.base import Reflex, Skill, asked, is_trained, path_of
 from skillweave.skills.onnx_file import from_onnx
 from skillweave.skills.ready import ready_policy
@@ -14,7 +13,6 @@ __all__ = [
     "Residual",
     "Skill",
     "asked",
-    "checked",
     "from_function",
     "from_onnx",
     "from_sb3",

@@ -8,23 +8,20 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Dict, Tuple
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.policies.spaces import Space as Data
-from skillweave.policies.spaces import space_of
 from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
-from skillweave.skills.answers import answer
-from skillweave.skills.goal_spaces import draw_from, repeated
+from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
-from skillweave.skills.outputs import as_array, called
+from skillweave.skills.outputs import answer, as_array, called
 from skillweave.skills.own_part import declared_acts, declared_sees
 from skillweave.skills.probing import probe
 from skillweave.skills.residual import Residual
@@ -354,14 +351,13 @@ class Reflex:
             raise DeclarationError(f"a Reflex's name is {short(name)}; it must be text")
         self.condition, self.action = condition, action
         self.name = name or getattr(condition, "__name__", "reflex")
-        self._known: tuple[Any, Any] = (None, None)
 
-    def check(self, space: Space[Any]) -> None:
+    def check(self, space: Data) -> None:
         """Raise a DeclarationError where a fixed action is not in ``space``."""
         if not callable(self.action):
-            self._actions(np.empty((1, 0)), space)
+            self.fixed(space)
 
-    def apply(self, obs: Array, action: Array, space: Space[Any]) -> tuple[Array, Array]:
+    def apply(self, obs: Array, action: Array, space: Data) -> tuple[Array, Array]:
         """Return actions (N, ...) of ``space`` with this reflex; (N,) bool: where it acted.
 
         ``obs`` (N, *obs_shape) is the observation, ``action`` (N, ...) what a skill does there.
@@ -381,39 +377,31 @@ class Reflex:
         Raises:
             SkillError: the condition returned a wrong result; the message names it.
         """
-        return answer(self.condition, obs, len(obs), bool, self._label, "condition")
+        return answer(self.condition, obs, bool, f"{self._label}: condition()")
 
-    def fixed(self, space: Space[Any]) -> Array:
+    def fixed(self, space: Data) -> Array:
         """Return a fixed action as an element of ``space``, (...)."""
-        label, shape = f"{self._label}: action", space.shape or ()
-        if isinstance(space, Dict | Tuple):
-            batch = repeated(space, self.action, 1)
-            return cast(Array, self._data(space).actions(batch, 1, label, DeclarationError)[0])
-        value = as_array(self.action, label, DeclarationError)
-        # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
-        row = np.full(shape, value) if value.shape == () else value
-        action: Array = self._data(space).actions(row[None], 1, label, DeclarationError)[0]
+        label = f"{self._label}: action"
+        if space.parts is not None:
+            batch = alone(space, self.action)
+        else:
+            value = as_array(self.action, label, DeclarationError)
+            # A number fills a row: Reflex(leaning, 0.5) in a Box of one dimension.
+            batch = (np.full(space.shape, value) if value.shape == () else value)[None]
+        action: Array = space.actions(batch, 1, label, DeclarationError)[0]
         return action
 
     @property
     def _label(self) -> str:
         return f"reflex {self.name!r}"
 
-    def _data(self, space: Space[Any]) -> Data:
-        """Return a space as data, which is made once."""
-        if self._known[0] is not space:
-            self._known = space, space_of(space)
-        data: Data = self._known[1]
-        return data
-
-    def _actions(self, obs: Array, space: Space[Any]) -> Array:
+    def _actions(self, obs: Array, space: Data) -> Array:
         """Return its actions for observations (n, ...)."""
         n, label = len(obs), f"{self._label}: action()"
         if not callable(self.action):
             return np.repeat(self.fixed(space)[None], n, axis=0)
-        result = called(self.action, obs, label)
-        actions = self._data(space).actions(result, n, label, SkillError)
-        probe(self.action, obs, n, label, space)
+        actions = space.actions(called(self.action, obs, label), n, label, SkillError)
+        probe(self.action, obs, label, space)
         return actions
 
 
@@ -421,17 +409,17 @@ def asked(
     skill: Skill,
     method: str,
     about: Step | Array,
-    n: int,
-    elapsed: Array | int | None = None,
     ids: Array | None = None,
 ) -> Array:
     """Call a method of a skill with a step or observations; return (n,) float32 or bool.
+
+    Args:
+        ids: environments of the rows, (n,), for messages; None: all n.
 
     Raises:
         SkillError: see ``answer``.
     """
     dtype = np.float32 if method == "reward" else bool
-    who = f"skill {path_of(skill)!r}"
+    who = f"skill {path_of(skill)!r}: {method}()"
     may_change = method == "reward" and skill.reward_changes
-    function = getattr(skill, method)
-    return answer(function, about, n, dtype, who, method, elapsed, ids, may_change=may_change)
+    return answer(getattr(skill, method), about, dtype, who, ids, may_change=may_change)

@@ -18,7 +18,7 @@ from skillweave.policies.spaces import at, space_of
 from skillweave.skills.goal_spaces import draw_from
 from skillweave.skills.probing import untouched, watch
 from skillweave.tracebacks import is_own_code
-from skillweave.types import Array, Memory, Memoryless, Policy
+from skillweave.types import Array, Memoryless, Policy
 
 SEES = "let sees= give the parts that it takes"
 ACTS = "let acts= say what its outputs mean"
@@ -36,6 +36,8 @@ class Foreign(Memoryless):
     """The name of its kind in ``run.json``."""
     suffix: str = ""
     """The suffix of the file of its ``content``."""
+    act: Callable[..., Any]
+    """Acts, as ``types.Policy`` says."""
 
     def __init__(self, name: str, observation_space: Any = None, action_space: Any = None) -> None:
         self.name = self._who = name
@@ -54,18 +56,6 @@ class Foreign(Memoryless):
         if self._open[1]:
             bound.action_space = action_space
         return bound
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return actions for a batch of observations."""
-        raise NotImplementedError
 
     def source(self) -> dict[str, Any]:
         """Return its source as JSON for ``run.json``: at least its kind."""
@@ -120,13 +110,6 @@ def fitted(
     """
     if isinstance(policy, Foreign):
         policy = policy.bind(observation_space, action_space, who)
-    return checked_fit(policy, observation_space, action_space, who, env)
-
-
-def checked_fit(
-    policy: Policy, observation_space: Space[Any], action_space: Space[Any], who: str, env: str
-) -> Policy:
-    """Return a bound policy, after it was tried out; see ``fitted``."""
     check_spaces(policy, observation_space, action_space, f"{who}: its policy", env)
     if isinstance(policy, Foreign):
         policy.try_out()

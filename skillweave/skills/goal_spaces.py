@@ -14,6 +14,7 @@ import numpy as np
 from skillweave.messages import short
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL, OBSERVATION
+from skillweave.policies.spaces import Space as Data
 from skillweave.policies.spaces import at, space_of
 from skillweave.types import Array
 
@@ -68,11 +69,6 @@ def choice_space(
     return ChoiceSpace(choices, goal_spaces, owners)
 
 
-def number_of(choice: Array) -> Array:
-    """Return the numbers (k,) of choices (k,) with or without goals."""
-    return choice if choice.dtype.fields is None else choice[SKILL]
-
-
 def blank_choices(space: gym.Space[Any], number: Array) -> Array:
     """Return choices of a ``choice_space`` with these numbers (k,), and some goals, to be set."""
     if isinstance(space, gym.spaces.Discrete):
@@ -119,39 +115,23 @@ def draw_from(space: gym.Space[Any], n: int, rng: np.random.Generator) -> Array:
     return batch
 
 
-def parts_of(space: gym.Space[Any]) -> dict[str, gym.Space[Any]] | None:
-    """Return the named parts of a Dict or Tuple; None for any other space."""
-    from skillweave.spaces.packing import parts  # needs torch, which declaring does not
-
-    return parts(space) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else None
-
-
-def leaf_at(space: gym.Space[Any], path: tuple[str, ...]) -> gym.Space[Any]:
+def leaf_at(space: Any, path: tuple[str, ...]) -> gym.Space[Any]:
     """Return the part of a space to which these names lead."""
     for name in path:
-        space = (parts_of(space) or {})[name]
-    return space
+        space = space[int(name) if isinstance(space, gym.spaces.Tuple) else name]
+    return space  # type: ignore[no-any-return]
 
 
-def repeated(space: gym.Space[Any], goal: Any, n: int) -> Any:
-    """Return one goal as a batch of n, of a Dict or Tuple in dicts and tuples; it is not checked.
+def alone(space: Data, goal: Any) -> Any:
+    """Return one element of a space as a batch of one, parts in a dict; it is not checked.
 
-    A value that is no goal of the space is returned as it is, or repeated, so that the check of
-    the batch can show it.
+    A value that is no element is returned as it is, or as a batch, so that the check of the batch
+    can show it.
     """
-    if isinstance(space, gym.spaces.Dict) and isinstance(goal, Mapping):
-        return {k: repeated(space[k], v, n) if k in space.spaces else v for k, v in goal.items()}
-    if isinstance(space, gym.spaces.Tuple) and isinstance(goal, tuple | list):
-        if len(goal) != len(space.spaces):
-            return goal
-        return tuple(repeated(part, v, n) for part, v in zip(space.spaces, goal, strict=True))
+    parts = space.parts or {}
+    if parts and (given := space.by_name(goal)) is not None:
+        return {k: alone(parts[k], v) if k in parts else v for k, v in given.items()}
     try:
-        fixed = np.asarray(goal)
+        return np.asarray(goal)[None]
     except ValueError:  # of parts of unequal lengths
         return goal
-    return np.repeat(fixed[None], n, axis=0)
-
-
-def from_numbers(space: gym.Space[Any], numbers: Array) -> Array:
-    """Return goals (n, *goal_shape) of a space from their numbers (n, G); see ``Goals.flat``."""
-    return space_of(space).of_numbers(numbers)

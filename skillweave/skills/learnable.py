@@ -16,7 +16,6 @@ from gymnasium import Space
 from gymnasium.spaces import Box
 
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short
 from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.types import Array
 
@@ -219,7 +218,9 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     flat = [m for module in modules for m in _unpacked(module)]
     names = [type(m).__name__ for m in flat]
     wrong = next((n for n in names if n != "Linear" and n not in ACTIVATIONS), None)
-    wrong = wrong or next((repr(m) for m in flat if _has_settings(m)), None)
+    usual = {"alpha": 1.0, "approximate": "none"}  # as networks here have them
+    other = (repr(m) for m in flat if any(getattr(m, k, v) != v for k, v in usual.items()))
+    wrong = wrong or next(other, None)
     kinds = set(names[1::2])
     alternates = set(names[::2]) == {"Linear"} and "Linear" not in kinds and len(names) % 2 == 1
     if wrong or not alternates or len(kinds) > 1:
@@ -237,11 +238,6 @@ def layers_of(modules: Sequence[nn.Module], who: str) -> Layers:
     return Layers(weights, biases, ACTIVATIONS[kinds.pop()] if kinds else "tanh")
 
 
-def _has_settings(module: Any) -> bool:
-    """Return whether a nonlinearity has other settings than in networks here."""
-    return getattr(module, "alpha", 1.0) != 1.0 or getattr(module, "approximate", "none") != "none"
-
-
 def _unpacked(module: nn.Module) -> list[nn.Module]:
     name = type(module).__name__
     if name == "Sequential":
@@ -253,28 +249,3 @@ def array_of(tensor: Any) -> Array:
     """Return a tensor's numbers, float64."""
     array: Array = tensor.detach().cpu().double().numpy()
     return array
-
-
-def of_module(module: Any, who: str, observation_space: Any, action_space: Any) -> Learnable:
-    """Return a ``Sequential`` of linear layers as a policy that a skill learns on with.
-
-    It is the network of PPO's actor; the critic starts afresh.
-
-    Raises:
-        PolicyError: it is no such module.
-    """
-    if type(module).__name__ not in ("Sequential", "Linear"):
-        raise PolicyError(
-            f"{who} cannot learn on: it is a {short(type(module).__name__)}, and only a Sequential "
-            "of linear layers is known. Let it act as it is (without learn=True), or use its first "
-            "layers as an encoder: Network(encoder=function)"
-        )
-    return Learnable(
-        who,
-        "PPO",
-        {"actor": layers_of([module], who)},
-        env_units=True,
-        observation_space=observation_space,
-        action_space=action_space,
-        settings=PLAIN_PPO,
-    )

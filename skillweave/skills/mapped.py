@@ -17,16 +17,17 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short
 from skillweave.notices import notice
-from skillweave.policies.core import Memory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.functional import Functional
-from skillweave.policies.mapped import Model
-from skillweave.skills.foreign_policy import SEES, Foreign
+from skillweave.policies.mapped import Input, Mapped, Model, numbers_of
+from skillweave.policies.spaces import Space as Data
+from skillweave.skills.foreign_policy import SEES, Foreign, made_up
 from skillweave.skills.goal_spaces import with_goal, without_goal
 from skillweave.skills.goals import Goals
-from skillweave.skills.mapping import PolicyMapping
-from skillweave.skills.plan import described, fitted_mapping
-from skillweave.types import Memoryless
+from skillweave.skills.mapping import LastAction, PolicyMapping
+from skillweave.skills.outputs import Wrapped, of_numbers
+from skillweave.skills.plan import described, fitted_inputs, fitted_outputs, for_model
+from skillweave.types import Array, Memoryless
 
 
 class MappedPolicy(Functional, Foreign, Model):
@@ -67,21 +68,42 @@ class MappedPolicy(Functional, Foreign, Model):
             PolicyError: these are not known, or it does not fit; the message names the field.
         """
         self.must_be_bound()
-        seen, goals = self.observation_space, None
+        who, mapping, model, seen = self._who, self.mapping, self.model, self.observation_space
+        goal_space: Data | None = None
+        goal: Array | Wrapped | None = None
         if self._goals is not None:
-            seen, goals = without_goal(seen), self._goals.data
-        spaces = seen, self.action_space
-        return fitted_mapping(self.mapping, self.model, spaces, self._who, goals, self.logits)
+            seen, goal_space = without_goal(seen), self._goals.space
+        elif callable(mapping.goal):
+            goal = of_numbers(mapping.goal, f"{who}: goal()")
+        elif mapping.goal is not None:
+            goal = np.array(mapping.goal)
+        outputs = fitted_outputs(mapping.acts, self.action_space, who, self.logits)
+        inputs: dict[str, Input] | None = None
+        if mapping.sees is not None:
+            last = any(isinstance(source, LastAction) for source in mapping.sources())
+            if last and outputs.space.kind != "Box":
+                raise PolicyError(
+                    f"{who}: sees has LastAction(), which needs actions of a Box, not "
+                    f"{self.action_space}"
+                )
+            own = {"last_action": (outputs.count,)}
+            if goal_space is not None:
+                own["goal"] = (goal_space.size,)
+            elif isinstance(goal, Wrapped):
+                own["goal"] = numbers_of(goal, made_up(seen, 2), f"{who}: goal()").shape[1:]
+                if len(own["goal"]) != 1:
+                    raise PolicyError(f"{who}: goal() must return (n, numbers)")
+            elif goal is not None:
+                own["goal"] = goal.shape
+            inputs = for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
+        every, chunk = mapping.every, mapping.chunk
+        return Mapped(model, outputs, inputs, every, chunk, goal, goal_space, who)
 
     def must_be_bound(self) -> None:
         """Raise a PolicyError if it has not the spaces that it needs yet."""
         unseen = self.mapping.sees is not None and self.observation_space is None
         if unseen or self.action_space is None:
             raise PolicyError(f"{self._who} has no spaces yet: bind() it to an environment's")
-
-    @cached_property
-    def _like(self) -> Memory:  # type: ignore[override]
-        return self.in_place.start(1)
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy for these spaces, with its mapping fitted to them.
@@ -108,14 +130,18 @@ class MappedPolicy(Functional, Foreign, Model):
         Raises:
             PolicyError: the goal is no input of it, or its mapping does not fit.
         """
-        bound = super().bind(observation_space, action_space, who)
         if not self.takes_goal:
-            raise PolicyError(f"{bound._who} takes no goal, but its skill has goals: {self.advice}")
-        check_range(goals, self.mapping.goal_places, bound._who)
-        bound._goals, bound.joins = goals, True
-        bound.observation_space = with_goal(bound.observation_space, goals.space)
-        _ = bound.in_place
-        return bound
+            raise PolicyError(
+                f"{who}: {self.name} takes no goal, but its skill has goals: {self.advice}"
+            )
+        check_range(goals, self.mapping.goal_places, f"{who}: {self.name}")
+        aimed, seen = (
+            copy.copy(self),
+            observation_space if self._open[0] else self.observation_space,
+        )
+        aimed._goals, aimed.joins = goals, True
+        aimed.observation_space = with_goal(seen, goals.goal_space)
+        return aimed.bind(aimed.observation_space, action_space, who)
 
     @property
     def given(self) -> str:
@@ -138,12 +164,8 @@ class MappedPolicy(Functional, Foreign, Model):
 
     def source(self) -> dict[str, Any]:
         """Return its source as JSON, with its mapping."""
-        found = super().source()
-        return (
-            found
-            if self.mapping == PolicyMapping()
-            else found | {"mapping": self.mapping.to_json()}
-        )
+        mapping = self.mapping.to_json()
+        return super().source() | ({"mapping": mapping} if mapping else {})
 
     def remapped(self, data: dict[str, Any] | None, where: str) -> Self:
         """Return a copy with the recorded mapping ``data``.
@@ -170,16 +192,16 @@ def check_range(goals: Goals, places: Sequence[Any], who: str) -> None:
         places: of the goal among the policy's inputs.
         who: begins the message.
     """
-    if not isinstance(goals.space, Box):
+    if not isinstance(goals.goal_space, Box):
         return
-    lowest, highest = goals.space.low.reshape(-1), goals.space.high.reshape(-1)
+    lowest, highest = goals.goal_space.low.reshape(-1), goals.goal_space.high.reshape(-1)
     for place in places:
         low = -np.inf if place.low is None else np.array(place.low)
         high = np.inf if place.high is None else np.array(place.high)
         fits = {np.size(low), np.size(high)} <= {1, len(lowest)}  # else refused later
         if fits and ((lowest < low - 1e-6).any() or (highest > high + 1e-6).any()):
             notice(
-                f"{who}: goal_space is {short(goals.space, 200)}, but Goal.low is "
+                f"{who}: goal_space is {short(goals.goal_space, 200)}, but Goal.low is "
                 f"{short(place.low)} and Goal.high {short(place.high)}, the range for which the "
                 "policy was made. It gets other goals clipped, and step.goal has them as they are: "
                 "give goal_space that range"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -227,23 +228,19 @@ class PolicyMapping:
 
     def functions(self) -> dict[str, Callable[[Any], Any]]:
         """Return the user's functions in it, by the names under which ``to_json`` has them."""
-        found = [s.function for s in self.sources() if isinstance(s, Computed)]
+        found: list[Any] = [s.function for s in self.sources() if isinstance(s, Computed)]
         found += [self.goal] if callable(self.goal) else []
         named: dict[str, Callable[[Any], Any]] = {}
         for function in found:
-            if function is not None and not any(function is other for other in named.values()):
-                name = function_name(function)
-                number = 2
-                while name in named:
-                    name = f"{function_name(function)}#{number}"
-                    number += 1
-                named[name] = function
+            first = function_name(function)
+            names = (first if i == 1 else f"{first}#{i}" for i in count(1))
+            named[next(x for x in names if named.get(x, function) is function)] = function
         return named
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON; settings that have their defaults are left out."""
         names = {id(function): name for name, function in self.functions().items()}
-        content: dict[str, Any] = _to_json(self, names)
+        content: dict[str, Any] = to_json(self, names)
         return content
 
     @classmethod
@@ -259,35 +256,38 @@ class PolicyMapping:
         Raises:
             DeclarationError: a field has a wrong value; the message names it.
         """
-        code, given = code or {}, _given(cls, data, "the mapping")
+        code = code or {}
+        if not isinstance(data, Mapping):
+            raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
         for name in ("sees", "scaling"):
-            if not isinstance(value := given.get(name, {}), Mapping):
+            if not isinstance(value := data.get(name, {}), Mapping):
                 raise DeclarationError(f"{name} is {short(value)}; it must be an object of inputs")
-        if "sees" in given:
-            given["sees"] = {
+        sees, goal, acts = (data.get(name) for name in ("sees", "goal", "acts"))
+        if sees is not None:
+            sees = {
                 name: tuple(
-                    _source_from_json(part, code, f"sees[{name!r}][{i}]")
+                    _from_json(None, part, code, f"sees[{name!r}][{i}]")
                     for i, part in enumerate(_list(parts, f"sees[{name!r}]"))
                 )
-                for name, parts in given["sees"].items()
+                for name, parts in sees.items()
             }
-        goal = given.get("goal")
         if isinstance(goal, Mapping):
-            given["goal"] = _function(goal.get("function"), code, "goal")
-        if "acts" in given:
-            given["acts"] = _from_json(Acts, given["acts"], "acts")
-        entries = _list(given.get("state", []), "state")
-        given["state"] = tuple(tuple(_list(entry, "state")) for entry in entries)
-        given["scaling"] = {
-            k: _from_json(Scaling, v, f"scaling[{k!r}]")
-            for k, v in given.get("scaling", {}).items()
+            goal = _function(goal.get("function"), code, "goal")
+        if acts is not None:
+            acts = _from_json(Acts, acts, code, "acts")
+        scaling = {
+            k: _from_json(Scaling, v, code, f"scaling[{k!r}]")
+            for k, v in data.get("scaling", {}).items()
         }
-        return cls(**given)
+        states = _list(data.get("state", []), "state")
+        state = tuple(tuple(_list(entry, "state")) for entry in states)
+        single = data.get("single_state", False)
+        every, chunk = data.get("every", 1), data.get("chunk")
+        return cls(sees, goal, acts, every, chunk, state, single, scaling)
 
 
 def mapping_of(
     who: str,
-    *,
     sees: Any = None,
     goal: Any = None,
     acts: Any = None,
@@ -456,9 +456,7 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
 
 def _is_shape(shape: tuple[Any, ...]) -> bool:
     sizes = [n for n in shape if n is not None]
-    return len(sizes) == len(shape) - 1 and all(
-        isinstance(n, int | np.integer) and not isinstance(n, bool) and n >= 1 for n in sizes
-    )
+    return len(sizes) == len(shape) - 1 and all(_is_whole(n) and n >= 1 for n in sizes)
 
 
 # Values of fields
@@ -530,16 +528,8 @@ def _is_whole(value: Any) -> bool:
 # Files
 
 
-def places_to_json(places: slice | tuple[int, ...] | None) -> Any:
-    """Return places as JSON: a slice as text, ``0:45``."""
-    if not isinstance(places, slice):
-        return None if places is None else list(places)
-    bounds = [places.start, places.stop, *([] if places.step is None else [places.step])]
-    return ":".join("" if x is None else str(int(x)) for x in bounds)
-
-
 def _slice_of(text: str) -> slice | None:
-    """Return the slice that ``places_to_json`` wrote; None: it is no slice."""
+    """Return the slice that ``to_json`` wrote; None: it is no slice."""
     bounds = text.split(":")
     try:
         values = [int(x) if x else None for x in bounds]
@@ -548,20 +538,22 @@ def _slice_of(text: str) -> slice | None:
     return slice(*values) if len(bounds) in (2, 3) else None
 
 
-def _to_json(value: Any, names: Mapping[int, str]) -> Any:
+def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:
     """Return settings as JSON; those that have their defaults are left out.
 
     Args:
-        names: of the user's functions, by ``id``.
+        value: a slice becomes a text, ``0:45``.
+        names: of the user's functions in it, by ``id``; None: there are none.
     """
     if isinstance(value, slice):
-        return places_to_json(value)
-    if isinstance(value, tuple):
-        return [_to_json(x, names) for x in value]
-    if isinstance(value, dict):
-        return {k: _to_json(x, names) for k, x in value.items()}
+        bounds = [value.start, value.stop, *([] if value.step is None else [value.step])]
+        return ":".join("" if x is None else str(int(x)) for x in bounds)
+    if isinstance(value, tuple | list):
+        return [to_json(x, names) for x in value]
+    if isinstance(value, Mapping):
+        return {k: to_json(x, names) for k, x in value.items()}
     if not is_dataclass(value):
-        return value
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     kinds = [("source", name) for name, kind in KINDS.items() if isinstance(value, kind)]
     content: dict[str, Any] = dict(kinds)
     for entry in fields(value):
@@ -569,38 +561,36 @@ def _to_json(value: Any, names: Mapping[int, str]) -> Any:
         if setting in (entry.default, {}):
             continue
         if callable(setting):
-            name = names[id(setting)]
+            name = (names or {})[id(setting)]
             content[entry.name] = {"function": name} if entry.name == "goal" else name
         else:
-            content[entry.name] = _to_json(setting, names)
+            content[entry.name] = to_json(setting, names)
     return content
 
 
-def _source_from_json(data: Any, code: Mapping[str, Any], where: str) -> Source:
-    kind = data.get("source") if isinstance(data, Mapping) else None
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise DeclarationError(
-            f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
-        )
-    if KINDS[kind] is Computed:
-        data = {**data, "function": _function(data.get("function"), code, where)}
-    source: Source = _from_json(KINDS[kind], data, where)
-    return source
+def _from_json(kind: type[Any] | None, data: Any, code: Mapping[str, Any], where: str) -> Any:
+    """Return the settings that an object has; further fields are ignored.
 
-
-def _from_json(kind: type[Any], data: Any, where: str) -> Any:
-    given = _given(kind, data, where)
+    Args:
+        kind: None: the one of ``KINDS`` that its field ``source`` names.
+        code: the user's functions, by name.
+    """
+    if kind is None:
+        name = data.get("source") if isinstance(data, Mapping) else None
+        kind = KINDS.get(name) if isinstance(name, str) else None
+        if kind is None:
+            raise DeclarationError(
+                f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
+            )
+    if not isinstance(data, Mapping):
+        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
+    given = {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
+    if kind is Computed:
+        given["function"] = _function(data.get("function"), code, where)
     try:
         return kind(**given)
     except DeclarationError as error:
         raise DeclarationError(f"{where}: {error}") from None
-
-
-def _given(kind: type[Any], data: Any, where: str) -> dict[str, Any]:
-    """Return the fields of a kind that an object has; further ones are ignored."""
-    if not isinstance(data, Mapping):
-        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
-    return {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
 
 
 def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any], Any]:

@@ -17,8 +17,8 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunEr
 from skillweave.messages import short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
-from skillweave.policies.files import checksum
 from skillweave.policies.mapped import OnnxFile, fits_shape, open_session
+from skillweave.policies.spaces import space_of
 from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.mapped import MappedPolicy
@@ -50,7 +50,6 @@ class OnnxPolicy(MappedPolicy):
     ) -> None:
         super().__init__(str(file), observation_space, action_space, mapping)
         self.data = data
-        self.file = file
         inputs, states = self._session.get_inputs(), dict(self.mapping.state)
         free = [i for i in inputs if i.name not in states]
         several = self.mapping.sees is not None and "" not in self.mapping.sees
@@ -79,7 +78,7 @@ class OnnxPolicy(MappedPolicy):
     @cached_property
     def _session(self) -> Any:
         try:
-            return open_session(self.data, str(self.file))
+            return open_session(self.data, self.name)
         except ImportError as error:
             raise MissingExtra("an ONNX file", "onnx") from error
 
@@ -110,15 +109,11 @@ class OnnxPolicy(MappedPolicy):
 
         Where names do not decide, shapes do.
         """
-        if self._chooses and self.action_space is not None:
-            self._choose_output()
-        return super().in_place
-
-    def _choose_output(self) -> None:
-        from skillweave.spaces import choice_counts, obs_shape
-
-        size = math.prod(obs_shape(self.action_space))
-        choices = sum(choice_counts(self.action_space))
+        self.must_be_bound()
+        if not self._chooses:
+            return super().in_place
+        space = space_of(self.action_space)
+        size, choices = space.size, sum(space.counts)
         after = dict(self.mapping.state).values()
         ranks: dict[tuple[bool, ...], list[str]] = {}
         for output in self._session.get_outputs():
@@ -141,11 +136,11 @@ class OnnxPolicy(MappedPolicy):
                 f"{self._who}: any of its outputs {', '.join(best)} could be the action, and "
                 f"{self.output!r} is used: name the right one, output={self.output!r}"
             )
+        return super().in_place
 
     def source(self) -> dict[str, Any]:
         """Return the file, the checksum of the copy that the run keeps, and the mapping."""
-        found = {k: v for k, v in super().source().items() if k != "name"}
-        return found | {"file": str(self.file), "sha256": checksum(self.data)}
+        return super().source() | {"file": self.name}
 
     def content(self) -> bytes:
         """Return the whole model."""
@@ -211,9 +206,7 @@ def from_onnx(
         DeclarationError: an argument is wrong; the message names it.
         MissingExtra: the extra 'onnx' is not installed.
     """
-    mapping = mapping_of(
-        "from_onnx()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_onnx()", sees, goal, acts, every, chunk, state)
     if mapping.state and not isinstance(state, dict):
         raise DeclarationError(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "

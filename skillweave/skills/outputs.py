@@ -1,9 +1,11 @@
-"""Checks of results of the user's functions and policies, and decoding of logits to actions."""
+"""Calls of the user's functions, and checks of what they return."""
 
 from __future__ import annotations
 
 import inspect
-from dataclasses import fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
@@ -11,10 +13,11 @@ import numpy as np
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
 from skillweave.messages import error_text, short
+from skillweave.policies.infos import NUMBERS
 from skillweave.skills.info_words import missing_key, odd_key
-from skillweave.skills.probing import watch
+from skillweave.skills.probing import probe, watch
 from skillweave.tracebacks import is_users
-from skillweave.types import Array, Step
+from skillweave.types import LARGEST_REWARD, Array, Step, read_only, wrong_reward
 
 OF_DICTS = ("no field of name", "dtype([", "VoidDType", "numpy.void")
 """Parts of errors of NumPy about an array of a Dict or Tuple, which is not a plain array."""
@@ -24,7 +27,6 @@ def called(
     function: Any,
     argument: Any,
     who: str,
-    elapsed: Any = None,
     ids: Array | None = None,
     kind: type[SkillweaveError] = SkillError,
     more: tuple[Any, ...] = (),
@@ -36,7 +38,6 @@ def called(
         function: takes one argument, and ``more``.
         argument: a step, or observations; a dict: arguments by name.
         who: the function's name in messages.
-        elapsed: the step of the episode, if known.
         ids: the environments of the rows.
         kind: the type of the error: PolicyError if the function is a policy.
         more: further arguments.
@@ -51,36 +52,140 @@ def called(
     except SkillweaveError:
         raise
     except (Exception, SystemExit) as error:
-        about = getattr(argument, "shape", None)
+        about, when = getattr(argument, "shape", None), at_step(getattr(argument, "elapsed", None))
         given = "" if about is None else f" for observations of shape {about}"
         advice = _advice(error, function, argument, ids)
-        raise kind(f"{who} raised {error_text(error)}{at_step(elapsed)}{given}{advice}") from error
+        raise kind(f"{who} raised {error_text(error)}{when}{given}{advice}") from error
 
 
-class Asked:
-    """A function of the user that makes numbers, asked by ``called``.
+@dataclass(frozen=True)
+class Wrapped:
+    """A function of the user, ``bare``, that is asked with this library's messages.
 
-    Args:
-        bare: the function.
-        who: its name in messages.
+    Exports name it.
     """
 
-    def __init__(self, bare: Any, who: str) -> None:
-        self.bare, self.who = bare, who
+    bare: Callable[..., Any]
+    ask: Callable[..., Any]
 
-    def __call__(self, obs: Array) -> Array:
-        """Return an array that it makes of observations."""
-        return as_array(called(self.bare, obs, self.who, kind=PolicyError), self.who, PolicyError)
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Return the answer of the function."""
+        return self.ask(*arguments, **named)
+
+
+def of_numbers(function: Any, who: str) -> Wrapped:
+    """Return a function of observations that makes numbers, asked by ``called``."""
+    return Wrapped(function, partial(_numbers, function, who))
+
+
+def _numbers(function: Any, who: str, obs: Array) -> Array:
+    return as_array(called(function, obs, who, kind=PolicyError), who, PolicyError)
+
+
+def answer(
+    function: Callable[[Any], Any],
+    about: Step | Array,
+    dtype: type,
+    who: str,
+    ids: Array | None = None,
+    *,
+    may_change: bool = False,
+) -> Array:
+    """Call a function of the user and return its ``checked`` result.
+
+    Args:
+        may_change: its answer to the same may change from call to call.
+
+    Raises:
+        SkillError: the function failed, or returned a result of a wrong shape or type.
+    """
+    elapsed = None
+    if isinstance(about, Step):
+        n, elapsed = len(about.reward), about.elapsed
+    else:
+        n, about = len(about), read_only(about)
+    value = called(function, about, who, ids, judges=None if may_change else True)
+    objects = isinstance(value, np.ndarray) and value.dtype == object
+    if objects and isinstance(about, Step) and (odd := odd_key(function, about.info, ids)):
+        raise SkillError(f"{who}{at_step(elapsed)}: {odd}")
+    array = checked(value, n, dtype, who, elapsed, ids)
+    probe(function, about, who)
+    return array
+
+
+def ask(function: Callable[[Any], Any], about: Any, rows: Array, path: str, name: str) -> Array:
+    """Ask a function of a user; see ``policies.core.Asks`` and ``answer``."""
+    return answer(function, about, bool, f"skill {path!r}: {name}()", rows)
+
+
+def checked(
+    value: Any,
+    n: int,
+    dtype: type,
+    who: str,
+    elapsed: Array | int | None = None,
+    ids: Array | None = None,
+) -> Array:
+    """Convert ``value`` to an array (n,) of ``dtype``: bool, or the type of rewards.
+
+    Args:
+        elapsed: steps of the rows, (n,) or (), for messages.
+        ids: environments of the rows, (n,), for messages; None: all n.
+
+    Raises:
+        SkillError: the value has another shape or type, or a NaN or an infinity; the message
+            names the function ``who`` and the step.
+    """
+    flags, when = dtype is bool, at_step(elapsed)
+    if value is None:
+        raise SkillError(
+            f"{who} returned None{when}, but shape ({n},) was expected: does it lack a return?"
+        )
+    array = as_array(value, who)
+    if array.shape != (n,):
+        raise SkillError(
+            f"{who} returned shape {array.shape}{when}, but ({n},) was expected: one "
+            f"{'yes or no' if flags else 'number'} for each of the {n} environments, the first "
+            "axis of every array"
+        )
+    if flags and array.dtype == bool:
+        return array
+    if not flags and array.dtype == object and all(isinstance(x, NUMBERS) for x in array):
+        array = array.astype(np.float64)
+    needed = "yes or no (bool) is needed" if flags else "rewards are real numbers"
+    if array.dtype.kind not in "fiub":
+        first = array[:1].tolist()  # Python's numbers, which are easier to read
+        kind = f"{array.dtype} ({short(first[0])})" if first else array.dtype
+        raise SkillError(f"{who} returned {kind}{when}, but {needed}")
+    if flags:
+        row: Any = next(iter(np.flatnonzero((array != 0) & (array != 1))), None)
+        needed = f", but {needed}: return a comparison"
+    else:
+        with np.errstate(over="ignore"):  # an overflow is an infinity
+            array = array.astype(dtype, copy=False)
+        row = wrong_reward(array)
+        needed = f": rewards must be finite, and at most {LARGEST_REWARD:g} in size"
+    if row is not None:
+        when = "" if elapsed is None else at_step(np.broadcast_to(elapsed, n)[row])
+        place = row if ids is None else ids[row]
+        raise SkillError(f"{who} returned {array[row]}{when} for environment {place}{needed}")
+    return array.astype(dtype, copy=False)
+
+
+def parameters_of(function: Any) -> list[inspect.Parameter]:
+    """Return the parameters of a function; none if Python has no signature of it."""
+    try:
+        return list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # of some functions written in C
+        return []
 
 
 def required_arguments(function: Any) -> int:
-    """Return the number of required arguments of a function; 1 if Python has no signature."""
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of some functions written in C
-        return 1
-    return sum(p.kind in positional and p.default is p.empty for p in parameters)
+    """Return the number of required arguments of a function, as far as they are known."""
+    return sum(
+        p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty
+        for p in parameters_of(function)
+    )
 
 
 def _advice(error: BaseException, function: Any, argument: Any, ids: Array | None) -> str:

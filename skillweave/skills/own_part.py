@@ -9,7 +9,7 @@ actions.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from math import prod
 from types import MethodType
@@ -23,9 +23,9 @@ from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short, shortened
 from skillweave.policies.mapped import Input
-from skillweave.policies.parts import Part
+from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data
-from skillweave.policies.spaces import at, space_of
+from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import (
@@ -33,11 +33,11 @@ from skillweave.skills.mapping import (
     PolicyMapping,
     checked_sees,
     is_places,
-    places_to_json,
+    to_json,
 )
 from skillweave.skills.outputs import required_arguments
 from skillweave.skills.plan import fitted_inputs, places_in
-from skillweave.skills.residual import Correction
+from skillweave.skills.residual import Residual
 from skillweave.types import Array, Policy
 
 HOLD, ZERO = "hold", "zero"
@@ -53,17 +53,12 @@ def declared_sees(sees: Any, who: str) -> PolicyMapping:
     Raises:
         DeclarationError: it is no ``sees`` of a skill; ``who`` begins the message.
     """
-    if isinstance(sees, MethodType) and required_arguments(sees.__func__) == 1:
+    if isinstance(sees, MethodType) and required_arguments(sees.__func__) <= 1:
         sees = sees.__func__  # a function in a class's body becomes a method when it is looked up
     try:
         return PolicyMapping(sees=checked_sees(sees, of_skill=True))
     except DeclarationError as error:
         raise DeclarationError(f"{who}: {error}") from None
-
-
-def computed(sees: Any, who: str) -> bool:
-    """Return whether functions of the user are in a skill's ``sees``."""
-    return bool(declared_sees(sees, who).functions())
 
 
 def declared_acts(acts: Any, who: str) -> Any:
@@ -105,15 +100,16 @@ def declared_acts(acts: Any, who: str) -> Any:
     )
 
 
-def part_to_json(sees: Any, acts: Any, who: str) -> dict[str, Any]:
-    """Return the ``sees`` and ``acts`` of a skill as JSON for runs; {}: it has none."""
+def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
+    """Return the part of a skill as JSON for runs, see ``OwnPart``; {}: it has none."""
     content: dict[str, Any] = {}
-    if sees is not None:
-        content["sees"] = declared_sees(sees, who).to_json()["sees"]
-    if acts is not None:
-        written = declared_acts(acts, who)
-        named = isinstance(written, tuple) and isinstance(written[0], str)
-        content["acts"] = list(written) if named else places_to_json(written)
+    if skill.sees is not None:
+        content["sees"] = declared_sees(skill.sees, who).to_json()["sees"]
+    if skill.acts is not None:
+        content["acts"] = to_json(declared_acts(skill.acts, who))
+        content["rest"] = to_json(rest)
+    if isinstance(skill.policy, Residual):
+        content["residual"] = skill.policy.scale
     return content
 
 
@@ -138,22 +134,11 @@ def part_from_json(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def checked_rest(rest: Any) -> None:
     """Raise a DeclarationError where ``Hierarchy.rest`` is none for any action space."""
-    if isinstance(rest, str) and rest not in (HOLD, ZERO):
+    word = isinstance(rest, str)
+    if rest is None or isinstance(rest, bool) or (word and rest not in (HOLD, ZERO)):
         raise DeclarationError(f"rest is {short(rest)}; {_REST}")
-    values = rest.values() if isinstance(rest, Mapping) else ()
-    for value in values:
+    for value in rest.values() if isinstance(rest, Mapping) else ():
         checked_rest(value)
-    if rest is None or isinstance(rest, bool):
-        raise DeclarationError(f"rest is {short(rest)}; {_REST}")
-
-
-def rest_to_json(rest: Any) -> Any:
-    """Return ``Hierarchy.rest`` as JSON."""
-    if isinstance(rest, Mapping):
-        return {key: rest_to_json(value) for key, value in rest.items()}
-    if isinstance(rest, Sequence) and not isinstance(rest, str):
-        return [rest_to_json(value) for value in rest]
-    return rest.tolist() if isinstance(rest, np.ndarray | np.generic) else rest
 
 
 _REST = (
@@ -179,36 +164,33 @@ def rest_of(rest: Any, space: Space[Any]) -> tuple[Array, Held]:
     """
     checked_rest(rest)
     data = space_of(space)
-    fixed, found = data.start(1), []
-    for path, given, where in _leaves(rest, data, "rest"):
-        held = _fill(at(fixed, path)[0, ...], given, data.leaves[path], where)
-        if held.any():
-            found.append((path, held))
-    return fixed, tuple(found)
+    fixed = data.start(1)
+    return fixed, tuple(_filled(fixed[0, ...], rest, data, "rest"))
 
 
-def _leaves(
-    rest: Any, space: Data, where: str, path: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Any, str]]:
-    """Yield the names that lead to each leaf of an action, its rest, and its name in messages."""
-    if space.parts is None:
-        yield path, rest, where
+def _filled(
+    zero: Array, rest: Any, space: Data, where: str, path: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Array]]:
+    """Write the numbers of a rest over the zeros (…) of an action, or of its part at a ``path``.
+
+    Yields:
+        The path of each leaf, and (…) bool, which of its numbers are held, where some are.
+    """
+    if space.parts is not None:
+        if not isinstance(rest, str | Mapping):
+            raise DeclarationError(
+                f"{where} is {short(rest)}, but the action is {_shown(space)}: give a dict by its "
+                "keys"
+            )
+        given = dict.fromkeys(space.parts, rest) if isinstance(rest, str) else rest
+        for key in given:
+            if key not in space.parts:
+                hint = meant(str(key), list(space.parts), "it has")
+                raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
+        for key, part in space.parts.items():
+            inside = zero[key], given.get(key, ZERO), part, f"{where}[{key!r}]"
+            yield from _filled(*inside, (*path, key))
         return
-    if not isinstance(rest, str | Mapping):
-        raise DeclarationError(
-            f"{where} is {short(rest)}, but the action is {_shown(space)}: give a dict by its keys"
-        )
-    for key in rest if isinstance(rest, Mapping) else ():
-        if key not in space.parts:
-            hint = meant(str(key), list(space.parts), "it has")
-            raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
-    for name, part in space.parts.items():
-        given = rest if isinstance(rest, str) else rest.get(name, ZERO)
-        yield from _leaves(given, part, f"{where}[{name!r}]", (*path, name))
-
-
-def _fill(zero: Array, rest: Any, space: Data, where: str) -> Array:
-    """Write the numbers of a rest over zeros (…) of a leaf; return which are held, (…) bool."""
     entries = np.asarray(rest, object).reshape(-1)
     words = np.array([x if isinstance(x, str) else "" for x in entries])
     plain = ~np.isin(words, (HOLD, ZERO))
@@ -225,7 +207,9 @@ def _fill(zero: Array, rest: Any, space: Data, where: str) -> Array:
         raise DeclarationError(f"{where} is {short(rest)}, but {_shown(space)} has whole numbers")
     if not space.holds(zero[None]).all():
         raise DeclarationError(f"{where} is {short(rest)}, which is out of {_shown(space)}")
-    return np.broadcast_to(words == HOLD, zero.size).reshape(zero.shape)
+    held = np.broadcast_to(words == HOLD, zero.size).reshape(zero.shape)
+    if held.any():
+        yield path, held
 
 
 def _shown(space: Data) -> str:
@@ -297,9 +281,8 @@ class OwnPart:
     """The part of observations that a skill sees, and of actions that it writes.
 
     Args:
-        sees: the skill's; None: it sees all.
-        acts: the skill's; None: it writes all.
-        rest: the hierarchy's, for the other numbers of the action.
+        skill: sees all without ``sees``, and writes all without ``acts``.
+        rest: its hierarchy's, for the other numbers of the action.
         observation_space: of the environment.
         action_space: of the environment.
         who: begins messages: "skill 'arm'".
@@ -310,8 +293,7 @@ class OwnPart:
 
     def __init__(
         self,
-        sees: Any,
-        acts: Any,
+        skill: Any,
         rest: Any,
         observation_space: Space[Any],
         action_space: Space[Any],
@@ -320,14 +302,16 @@ class OwnPart:
         from skillweave.spaces.saving import gym_space  # needs torch, which declaring does not
 
         self.who = who
-        self._declared = sees, acts, rest
+        self._skill, self._rest = skill, rest
+        sees, acts = skill.sees, skill.acts
         self.whole_observation_space = observation_space
         self.whole_action_space = self.written_space = action_space
         self.observation_space = observation_space
         """Of what its policy sees, without a goal."""
-        self.correction: Correction | None = None
+        self.base: Policy | None = None
         """The ready policy to whose actions its own are added; None: there is none."""
-        self._rests = acts is not None and not isinstance(action_space, Discrete)
+        self.correction: Correction | None = None
+        """What adds them."""
         how: dict[str, Any] = {}
         try:
             if sees is not None:
@@ -339,7 +323,7 @@ class OwnPart:
                 self.written_space = gym_space(written)
         except PolicyError as error:
             raise DeclarationError(str(error)) from None
-        if self._rests:
+        if acts is not None and not isinstance(action_space, Discrete):
             how["fixed"], how["held"] = rest_of(rest, action_space)
         elif acts is not None and not (isinstance(rest, str) and rest == ZERO):
             raise DeclarationError(
@@ -354,14 +338,8 @@ class OwnPart:
 
     def to_json(self) -> dict[str, Any]:
         """Return what was declared as JSON."""
-        sees, acts, rest = self._declared
-        content = part_to_json(sees, acts, self.who)
-        if self._rests:
-            content["rest"] = rest_to_json(rest)
-        if self.correction is not None:
-            content["residual"] = self.correction.scale
-            content["policy"] = source_of(self.correction.base)
-        return content
+        content = part_to_json(self._skill, self._rest, self.who)
+        return content if self.base is None else content | {"policy": source_of(self.base)}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
         """Return what it sees, as of ``Part``."""
@@ -387,21 +365,10 @@ class OwnPart:
             return read[0]
         return Box(-np.inf, np.inf, given.shape or (1,), np.float32)
 
-    def corrected(self, correction: Correction) -> OwnPart:
-        """Return the part of a skill whose actions correct those of a ready policy."""
-        part = copy.copy(self)
-        part.correction, part.action_space = correction, correction.space
-        return part
-
-    @property
-    def inputs(self) -> dict[str, Input] | None:
-        """Its inputs, by name; None: it sees all."""
-        return self.part.inputs
-
-    @property
-    def base(self) -> Policy | None:
-        """The ready policy that it corrects; None: there is none."""
-        return None if self.correction is None else self.correction.base
+    def correct(self, base: Policy, added: Correction) -> None:
+        """Let its actions correct those of a ready policy, which is fitted to its spaces."""
+        self.base, self.correction = base, added
+        self.action_space = Box(-1.0, 1.0, self.written_space.shape, np.float32)
 
     def within(self, view: Callable[[Array], Array], observation_space: Space[Any]) -> OwnPart:
         """Return the part of larger observations, of which ``view`` returns the environment's."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import prod
 from typing import Any
 
 import numpy as np
 from gymnasium import Space
-from gymnasium.spaces import Box
 
 from skillweave.arguments import meant
 from skillweave.errors import PolicyError
@@ -17,66 +16,18 @@ from skillweave.messages import short, shortened
 from skillweave.policies.mapped import (
     Input,
     Linear,
-    Mapped,
-    Model,
     Outputs,
     Shapes,
     Take,
     fits_shape,
     numbers_of,
 )
-from skillweave.policies.spaces import Space as Data
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import Acts, Goal, LastAction, Part, PolicyMapping, Source
-from skillweave.skills.outputs import Asked
+from skillweave.skills.outputs import of_numbers
 from skillweave.types import Array
-
-
-def fitted_mapping(
-    mapping: PolicyMapping,
-    model: Model,
-    spaces: tuple[Space[Any], Space[Any]],
-    who: str,
-    goal_space: Data | None = None,
-    logits: bool = True,
-) -> Mapped:
-    """Return a policy that acts: a model behind a mapping, fitted to spaces.
-
-    Args:
-        spaces: the environment's, of observations and actions.
-        who: begins messages.
-        goal_space: of the skill; None: it has no goals.
-        logits: outputs that are no whole numbers are logits of choices.
-
-    Raises:
-        PolicyError: the mapping does not fit the spaces or the model; the message names the field.
-    """
-    seen, space = spaces
-    outputs = _outputs(mapping.acts, space, who, logits)
-    goal: Array | Callable[..., Any] | None = None
-    if goal_space is None and mapping.goal is not None:
-        fixed = isinstance(mapping.goal, tuple)
-        goal = np.array(mapping.goal) if fixed else Asked(mapping.goal, f"{who}: goal()")
-    inputs: dict[str, Input] | None = None
-    if mapping.sees is not None:
-        if not isinstance(space, Box) and any(isinstance(s, LastAction) for s in mapping.sources()):
-            raise PolicyError(
-                f"{who}: sees has LastAction(), which needs actions of a Box, not {space}"
-            )
-        own = {"last_action": (outputs.count,)}
-        if goal_space is not None:
-            own["goal"] = (goal_space.size,)
-        elif callable(goal):
-            own["goal"] = numbers_of(goal, made_up(seen, 2), f"{who}: goal()").shape[1:]
-            if len(own["goal"]) != 1:
-                raise PolicyError(f"{who}: goal() must return (n, numbers)")
-        elif goal is not None:
-            own["goal"] = goal.shape
-        inputs = _for_model(fitted_inputs(mapping, seen, who, own), model.expected, who)
-    return Mapped(model, outputs, inputs, mapping.every, mapping.chunk, goal, goal_space, who)
-
 
 # Inputs
 
@@ -159,7 +110,7 @@ class _Reader:
         if isinstance(source, LastAction):
             return [Take("last_action", self.own["last_action"])]
         who = f"{where}, a function,"
-        function = Asked(source.function, who)
+        function = of_numbers(source.function, who)
         shape = numbers_of(function, made_up(self.space, 2), who).shape[1:]
         if len(shape) > 1 and not alone:
             raise PolicyError(
@@ -235,7 +186,7 @@ def _wide(value: float | tuple[float, ...], n: int, where: str) -> Array:
     return np.broadcast_to(np.array(value, np.float64), (n,))
 
 
-def _for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str, Input]:
+def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str, Input]:
     """Return inputs in the shapes that a model takes.
 
     Raises:
@@ -308,7 +259,7 @@ def places_in(
 # Outputs
 
 
-def _outputs(acts: Acts | None, space: Space[Any], who: str, logits: bool) -> Outputs:
+def fitted_outputs(acts: Acts | None, space: Space[Any], who: str, logits: bool) -> Outputs:
     """Return the meaning of a policy's outputs, for an action space.
 
     Raises:

@@ -26,13 +26,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from gymnasium import Space
-from gymnasium.spaces import Discrete
 
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.messages import error_text
 from skillweave.notices import notice
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import Space, discrete
 from skillweave.tracebacks import is_own_code
 from skillweave.types import Array, Step, read_only
 
@@ -59,35 +57,31 @@ REMEMBER = (
 """Advice about functions that keep a state of their own."""
 
 
-class Seen:
-    """Notes about the functions of objects in this process."""
-
-    def __init__(self) -> None:
-        self._notes: dict[int, tuple[weakref.ref[Any], dict[str, Any]]] = {}
-
-    def notes(self, owner: Any) -> dict[str, Any] | None:
-        """Return the notes about an object by names of its functions; None: it can have none."""
-        key = id(owner)
-        if key not in self._notes:
-            try:
-                reference = weakref.ref(owner, lambda _: self._notes.pop(key, None))
-            except TypeError:  # of some objects written in C
-                return None
-            self._notes[key] = reference, {}
-        return self._notes[key][1]
-
-    def first_time(self, owner: Any, name: str) -> bool:
-        """Return whether this is the first call with these arguments."""
-        notes = self.notes(owner)
-        if notes is None or name in notes:
-            return False
-        notes[name] = True
-        return True
+_notes: dict[int, tuple[weakref.ref[Any], dict[Any, Any]]] = {}
 
 
-_seen = Seen()
-_faults = Seen()
-"""What is wrong with functions, until it is said."""
+def _notes_of(owner: Any) -> dict[Any, Any] | None:
+    """Return this process's notes about an object; None: it can have none.
+
+    Under the name of a function stands what is wrong with it, until it is said.
+    """
+    key = id(owner)
+    if key not in _notes:
+        try:
+            reference = weakref.ref(owner, lambda _: _notes.pop(key, None))
+        except TypeError:  # of some objects written in C
+            return None
+        _notes[key] = reference, {}
+    return _notes[key][1]
+
+
+def first_time(owner: Any, *what: str) -> bool:
+    """Return whether this is the first call with these arguments."""
+    notes = _notes_of(owner)
+    if notes is None or what in notes:
+        return False
+    notes[what] = True
+    return True
 
 
 def watch(
@@ -109,7 +103,7 @@ def watch(
     owner, name = _owner_and_name(function)
     if judges is None or str(getattr(function, "__module__", "")).startswith("skillweave."):
         return
-    notes = _faults.notes(owner)
+    notes = _notes_of(owner)
     if notes is None:
         return
     fault, notes[name] = notes.get(name), ""
@@ -139,7 +133,7 @@ def _written(
         who: its name in a SkillError, raised where it answers otherwise when it is called again;
             empty: this is no error.
     """
-    n = next((len(x) for x in _values(given) if isinstance(x, np.ndarray) and x.ndim), 0)
+    n = _count(given)
     others = [_taken(given, np.arange(n), n, factor) for factor in (0, 100, -100)]
     with untouched(function) as spaces:
         order = (given, given, *others, given) if spaces else (given, given) if who else ()
@@ -193,9 +187,8 @@ def _close(one: Any, other: Any) -> bool:
 def probe(
     function: Callable[..., Any],
     given: Step | Array | tuple[Any, ...],
-    n: int,
     who: str,
-    space: Space[Any] | None = None,
+    space: Space | None = None,
     kind: type[SkillweaveError] = SkillError,
 ) -> None:
     """Call a function for other numbers of environments than n, at its first call.
@@ -203,7 +196,6 @@ def probe(
     Args:
         function: the user's, which has just returned the right shape for n environments.
         given: its argument, or arguments: a step, or arrays whose first axis has n rows.
-        n: environments.
         who: the function's name in messages.
         space: of its result for one environment; None: a number.
         kind: the type of the error: PolicyError if the function is a policy.
@@ -212,13 +204,14 @@ def probe(
         SkillError: its result does not have a row for each environment; the message names it.
     """
     owner, name = _owner_and_name(function)
-    if not n or not _seen.first_time(owner, name):
-        return
     arguments = given if isinstance(given, tuple) else (given,)
+    n = _count(arguments[0])
+    if not n or not first_time(owner, name, "for others"):
+        return
     sizes = _other_sizes(arguments, n)
     certain = all(_has_rows(a, n) for a in arguments)
-    fault = (_faults.notes(owner) or {}).get(name)
-    leaves = space_of(space or Discrete(2)).leaves
+    fault = (_notes_of(owner) or {}).get(name)
+    leaves = (space or discrete(2)).leaves
     with untouched(function):
         for m in sizes:
             rows = np.arange(m) % n
@@ -267,6 +260,11 @@ def _values(given: Any) -> Iterator[Any]:
             yield from _values(value)
     else:
         yield given
+
+
+def _count(given: Any) -> int:
+    """Return the number of environments of an argument."""
+    return next((len(x) for x in _values(given) if isinstance(x, np.ndarray) and x.ndim), 0)
 
 
 def _has_rows(given: Any, n: int) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sys
 from types import MethodType
 from typing import Any
@@ -13,12 +12,12 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
 from skillweave.policies.parts import GOAL
 from skillweave.skills.base import Skill, is_trained
-from skillweave.skills.foreign_policy import checked_fit, fitted
+from skillweave.skills.foreign_policy import fitted
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.goals import goals_of
-from skillweave.skills.outputs import required_arguments
+from skillweave.skills.outputs import parameters_of, required_arguments
 from skillweave.skills.own_part import OwnPart
-from skillweave.skills.residual import Correction, Residual, check_corrected, refuse_skill
+from skillweave.skills.residual import Residual, correction, refuse_skill
 from skillweave.skills.scripted import from_function
 from skillweave.skills.torch_module import from_torch
 from skillweave.types import Policy
@@ -88,22 +87,21 @@ def fitted_to_skill(
     """
     from skillweave.spaces import same_space  # needs torch, which declaring a skill does not
 
-    spaces = observation_space, action_space
     goals, seen = goals_of(skill), policy.observation_space
-    if goals is None:
-        return fitted(policy, *spaces, who, env)
-    if seen is not None and same_space(seen, spaces[0]):  # as saved here, for example
-        if says := other_goals(goal_part(seen), goals.space):
-            raise PolicyError(f"{who}: its policy {says}")
-        return fitted(policy, *spaces, who, env)
-    if not hasattr(policy, "bind_with_goals"):
-        raise PolicyError(
-            f"{who} has goals, but its policy observes {seen}: one for it observes the goal, too, "
-            f"as {spaces[0]}; or give a function, policy(self, obs, goal), or a policy from "
-            "elsewhere with Goal() at its place in sees"
-        )
-    bound = policy.bind_with_goals(without_goal(spaces[0]), spaces[1], who, goals)
-    return checked_fit(bound, *spaces, who, env)
+    if goals is not None:
+        if seen is not None and same_space(seen, observation_space):  # as saved here, for example
+            if says := other_goals(goal_part(seen), goals.goal_space):
+                raise PolicyError(f"{who}: its policy {says}")
+        elif hasattr(policy, "bind_with_goals"):
+            plain = without_goal(observation_space)
+            policy = policy.bind_with_goals(plain, action_space, who, goals)
+        else:
+            raise PolicyError(
+                f"{who} has goals, but its policy observes {seen}: one for it observes the goal, "
+                f"too, as {observation_space}; or give a function, policy(self, obs, goal), or a "
+                "policy from elsewhere with Goal() at its place in sees"
+            )
+    return fitted(policy, observation_space, action_space, who, env)
 
 
 def has_part(skill: Skill) -> bool:
@@ -127,17 +125,18 @@ def own_part(
         DeclarationError: the part does not fit the environment's spaces.
         PolicyError: the ready policy that it corrects does not.
     """
-    part = OwnPart(skill.sees, skill.acts, rest, *spaces, who)
+    part = OwnPart(skill, rest, *spaces, who)
     residual, seen = skill.policy, part.observation_space
     if not isinstance(residual, Residual):
         return part
-    check_corrected(part.action_space, who)
+    added = correction(residual.scale, part.action_space, who)
     base = _as_policy(residual.policy, skill)
     if skill.goal_space is not None:
         seen = with_goal(seen, skill.goal_space)
     env += "" if skill.sees is None and skill.acts is None else PART
     fit = fitted_to_skill(base, skill, seen, part.action_space, who, env)
-    return part.corrected(Correction(residual, fit, part.action_space, who))
+    part.correct(fit, added)
+    return part
 
 
 def _is_method(function: Any, skill: Skill) -> bool:
@@ -152,10 +151,7 @@ def _is_method(function: Any, skill: Skill) -> bool:
     required = required_arguments(function)
     if skill.goal_space is None:
         return required >= 2
-    try:
-        names = list(inspect.signature(function).parameters)
-    except (TypeError, ValueError):  # of some functions written in C
-        return False
+    names = [p.name for p in parameters_of(function)]
     if names[:1] == ["self"] or required >= 3:
         return True
     if required == 2 and GOAL not in names:

@@ -16,11 +16,10 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.policies import parts
+from skillweave.policies.parts import Correction
 from skillweave.policies.spaces import space_of
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.mapping import floats
-from skillweave.types import Policy
 
 TAKES = "a function of observations, from_sb3(...), from_onnx(...), or another ready policy"
 
@@ -107,38 +106,17 @@ def refuse_skill(value: Any, where: str) -> None:
     )
 
 
-class Correction:
-    """A correction of a ready policy's actions in a space.
+def correction(scale: Any, space: Space[Any], who: str) -> Correction:
+    """Return what adds to the actions of a ready policy, in a space, what is learnt in [−1, 1].
 
     Args:
-        residual: as declared.
-        base: its policy, fitted to the skill's spaces.
-        space: of the skill's actions, real numbers: see ``check_corrected``.
+        scale: as of ``Residual``.
+        space: of the skill's actions.
         who: begins messages.
 
     Raises:
-        DeclarationError: ``scale`` does not fit the actions.
+        DeclarationError: actions of the space cannot be corrected, or ``scale`` does not fit them.
     """
-
-    def __init__(self, residual: Residual, base: Policy, space: Space[Any], who: str) -> None:
-        assert isinstance(space, Box)
-        self.base, self.scale = base, residual.scale
-        size = int(np.prod(space.shape))
-        if isinstance(self.scale, list) and len(self.scale) != size:
-            raise DeclarationError(
-                f"{who}: Residual.scale has {len(self.scale)} numbers, but the action has {size}"
-            )
-        bounded = np.isfinite(space.low) & np.isfinite(space.high)
-        low, high = (np.where(bounded, x, 0.0).astype(np.float64) for x in (space.low, space.high))
-        half = np.where(bounded, 0.5 * (high - low), 1.0)
-        step = half * np.broadcast_to(self.scale, size).reshape(space.shape)
-        self.added = parts.Correction(step, space_of(space))
-        self.space = Box(-1.0, 1.0, space.shape, np.float32)
-        """Of what is learnt."""
-
-
-def check_corrected(space: Space[Any], who: str) -> None:
-    """Raise a DeclarationError where actions of a space cannot be corrected."""
     if not isinstance(space, Box) or space.dtype is None or space.dtype.kind != "f":
         has_parts = isinstance(space, Dict | Tuple)
         part = ", or let it own and correct one part of real numbers (acts)" if has_parts else ""
@@ -146,3 +124,12 @@ def check_corrected(space: Space[Any], who: str) -> None:
             f"{who}: Residual adds to actions, which needs a Box of real numbers, but actions are "
             f"of {short(space)}: let the skill learn without it, policy = None{part}"
         )
+    size = int(np.prod(space.shape))
+    if isinstance(scale, list) and len(scale) != size:
+        raise DeclarationError(
+            f"{who}: Residual.scale has {len(scale)} numbers, but the action has {size}"
+        )
+    bounded = np.isfinite(space.low) & np.isfinite(space.high)
+    low, high = (np.where(bounded, x, 0.0).astype(np.float64) for x in (space.low, space.high))
+    half = np.where(bounded, 0.5 * (high - low), 1.0)
+    return Correction(half * np.broadcast_to(scale, size).reshape(space.shape), space_of(space))

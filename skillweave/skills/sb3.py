@@ -5,7 +5,6 @@ Stands alone because it is one kind of foreign policy, as ``onnx_file`` and ``to
 
 from __future__ import annotations
 
-import copy
 import io
 import zipfile
 from pathlib import Path
@@ -25,42 +24,33 @@ from skillweave.policies.mapped import Shapes
 from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
-from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
-from skillweave.skills.torch_module import weights_of, with_weights
+from skillweave.skills.torch_module import TorchPolicy
 from skillweave.types import Array
 
-ALGORITHMS = ("ppo", "a2c", "dqn", "sac", "td3", "ddpg")
+ALGORITHMS = {"PPO": "PPO", "A2C": "PPO", "DQN": "DQN", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3"}
+"""The algorithms of Stable-Baselines3, with those of this library by which a model learns on."""
 
 
-class SB3Policy(MappedPolicy):
+class SB3Policy(TorchPolicy):
     """The policy of a Stable-Baselines3 model; without a mapping it acts on the model's own spaces.
 
     Samples are from the policy's distribution; DQN's exploration belongs to its training.
     """
 
     kind = "sb3"
-    suffix = ".safetensors"
     logits = False
 
     def __init__(
-        self,
-        model: Any,
-        file: Path | None = None,
-        sha256: str | None = None,
-        mapping: PolicyMapping | None = None,
+        self, model: Any, name: str, origin: dict[str, str], mapping: PolicyMapping
     ) -> None:
-        self.algorithm = type(model).__name__
-        name = _name_of(model, file)
-        mapping = mapping or PolicyMapping()
-        self.model_space = model.observation_space
         seen = None if mapping.sees is not None else model.observation_space
         taken = None if mapping.acts is not None else model.action_space
-        super().__init__(name, seen, taken, mapping)
-        self.policy = model.policy
-        self.file = file
-        self.sha256 = sha256
-        if hasattr(self.policy, "lstm_actor"):
+        super().__init__(model.policy, seen, taken, mapping)
+        self.model_space = model.observation_space
+        self.name = self._who = name
+        self.label, self.origin = type(model).__name__, origin
+        if hasattr(model.policy, "lstm_actor"):
             raise PolicyError(
                 f"{name} has a recurrent policy, whose state predict() would forget here: give its "
                 "network as a module that takes and returns the state, from_torch(..., state=...)"
@@ -69,19 +59,29 @@ class SB3Policy(MappedPolicy):
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy; images may have their channels last if the model transposes them."""
         bound = super().bind(observation_space, action_space, who)
-        bound.policy = _copied(self.policy, self.model_space)
-        mine = self.model_space
-        theirs = observation_space
-        if (
-            self.mapping.sees is None
-            and isinstance(mine, Box)
-            and isinstance(theirs, Box)
-            and len(theirs.shape) == 3
-            and mine.dtype == theirs.dtype == np.uint8
-            and mine.shape == (theirs.shape[2], *theirs.shape[:2])
-        ):
-            bound.observation_space = theirs
+        mine, theirs = self.model_space, observation_space
+        bytes_alone = mine.dtype == theirs.dtype == np.uint8
+        if self.mapping.sees is None and bytes_alone and theirs.shape and len(theirs.shape) == 3:
+            height, width, channels = theirs.shape
+            if mine.shape == (channels, height, width):
+                bound.observation_space = theirs
         return bound
+
+    def _copied(self) -> Any:
+        """Return a copy of the model's policy.
+
+        After training its latest distribution is part of a graph, which cannot be copied; acting
+        once replaces it.
+        """
+        import torch
+
+        from skillweave.spaces import unpack
+
+        policy, space = self.module, self.model_space
+        with torch.random.fork_rng(devices=[]):
+            _reset_noise(policy, 1)
+        policy.predict(unpack(space, made_up(space, 1)), deterministic=True)
+        return super()._copied()
 
     @property
     def expected(self) -> Shapes:
@@ -107,52 +107,15 @@ class SB3Policy(MappedPolicy):
             parts = unpack(self.observation_space, parts)
         try:
             if turn.greedy:
-                return self.policy.predict(parts, deterministic=True)[0], ()
+                return self.module.predict(parts, deterministic=True)[0], ()
             # It samples from torch's global generator, which other code may use.
             rng = turn.world.rng or np.random.default_rng()
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(int(rng.integers(2**62)))
-                _reset_noise(self.policy, len(next(iter(inputs.values()))))
-                return self.policy.predict(parts, deterministic=False)[0], ()
+                _reset_noise(self.module, len(next(iter(inputs.values()))))
+                return self.module.predict(parts, deterministic=False)[0], ()
         except (Exception, SystemExit) as error:
             raise self._failure(error) from error
-
-    def source(self) -> dict[str, Any]:
-        """Return a zip's path and checksum, or the checksum of weights; and the mapping."""
-        where = {"file": str(self.file), "sha256": self.sha256} if self.file else {}
-        return super().source() | {"name": self.algorithm} | where
-
-    def content(self) -> bytes | None:
-        """Return the weights of a model in memory; None for a zip, which can run code."""
-        return None if self.file else weights_of(self.policy, self._who)
-
-    def restored(self, content: bytes) -> Self:
-        """Return a copy with these weights."""
-        policy = copy.copy(self)
-        copied = _copied(self.policy, self.model_space)
-        policy.policy = with_weights(copied, content, self._who)
-        return policy
-
-
-def _name_of(model: Any, file: Path | None) -> str:
-    """Return a model's name in messages."""
-    return f"Stable-Baselines3's {type(model).__name__}" + (f" of {file}" if file else "")
-
-
-def _copied(policy: Any, space: Space[Any]) -> Any:
-    """Return a copy of a model's policy, in evaluation mode.
-
-    After training its latest distribution is part of a graph, which cannot be copied; acting once
-    replaces it.
-    """
-    import torch
-
-    from skillweave.spaces import unpack
-
-    with torch.random.fork_rng(devices=[]):
-        _reset_noise(policy, 1)
-    policy.predict(unpack(space, made_up(space, 1)), deterministic=True)
-    return copy.deepcopy(policy)
 
 
 def _has_gsde(policy: Any) -> bool:
@@ -244,9 +207,7 @@ def from_sb3(
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_sb3(): learn is {short(learn)}; it must be True or False")
-    if normalize is None:
-        normalize = _statistics_of(model)
-    file = sha256 = None
+    file, origin = None, dict[str, str]()
     if isinstance(model, str | Path):
         file = Path(model)
         if trust is not True:
@@ -261,17 +222,16 @@ def from_sb3(
                 f"from_sb3({str(file)!r}, {kind_of}, trust=True{further})"
             )
         model, sha256 = _loaded(file, algorithm)
+        origin = {"file": str(file), "sha256": sha256}
     elif not (hasattr(model, "policy") and hasattr(model, "observation_space")):
         raise DeclarationError(
             f"{short(model)} is neither a Stable-Baselines3 model nor the path of one"
         )
-    if isinstance(normalize, str | Path):
-        normalize = _opened(Path(normalize), trust, model)
-    if normalize is False or not getattr(normalize, "norm_obs", True):
-        normalize = None
+    name = f"Stable-Baselines3's {type(model).__name__}" + (f" of {file}" if file else "")
+    scales = _statistics(normalize, model, file, trust)
     if learn:
-        return _learnable(model, _name_of(model, file), normalize, options)
-    return SB3Policy(model, file, sha256, _mapping(model, normalize, options))
+        return _learnable(model, name, scales, options)
+    return SB3Policy(model, name, origin, _mapping(model, scales, options))
 
 
 def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
@@ -283,12 +243,12 @@ def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     kind: Any = algorithm
-    if isinstance(algorithm, str) and algorithm.lower() in ALGORITHMS:
+    if isinstance(algorithm, str) and algorithm.upper() in ALGORITHMS:
         kind = getattr(stable_baselines3, algorithm.upper())
     if not (isinstance(kind, type) and hasattr(kind, "load")):
         raise DeclarationError(
             f"{file}: algorithm is {algorithm!r}; it must be the class that saved the file, or one "
-            f"of {', '.join(ALGORITHMS)}"
+            f"of {', '.join(ALGORITHMS).lower()}"
         )
     content = read_file(file)
     # A replay buffer is for training only, and may take gigabytes.
@@ -303,19 +263,24 @@ def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
         ) from error
 
 
-def _statistics_of(model: Any) -> Any:
-    """Return the ``VecNormalize`` of a model in memory; of a zip, say which file may hold it."""
-    if not isinstance(model, str | Path):
-        return getattr(model, "get_vec_normalize_env", lambda: None)()
-    file = Path(model)
-    # RL Baselines3 Zoo has them in a folder of the zip's name.
-    files = *file.parent.glob("*.pkl"), *file.with_suffix("").glob("*.pkl")
-    if scales := sorted(str(f) for f in files if "normali" in f.name.lower()):
-        notice(
-            f"{file}: {scales[0]} may hold the scaling of its observations. If it was trained so, "
-            f"add normalize={scales[0]!r}; normalize=False ends this message"
-        )
-    return None
+def _statistics(normalize: Any, model: Any, file: Path | None, trust: bool) -> Any:
+    """Return the ``VecNormalize`` of a model; None: its observations are not scaled.
+
+    If a file beside the model's may hold it, a notice names that file.
+    """
+    if isinstance(normalize, str | Path):
+        normalize = _opened(Path(normalize), trust, model)
+    elif normalize is None and file is None:
+        normalize = getattr(model, "get_vec_normalize_env", lambda: None)()
+    elif normalize is None and file is not None:
+        # RL Baselines3 Zoo has them in a folder of the zip's name.
+        files = *file.parent.glob("*.pkl"), *file.with_suffix("").glob("*.pkl")
+        if scales := sorted(str(f) for f in files if "normali" in f.name.lower()):
+            notice(
+                f"{file}: {scales[0]} may hold the scaling of its observations. If it was trained "
+                f"so, add normalize={scales[0]!r}; normalize=False ends this message"
+            )
+    return normalize if normalize is not False and getattr(normalize, "norm_obs", True) else None
 
 
 def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -> Learnable:
@@ -329,11 +294,11 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
     given = [k for k, v in options.items() if v is not None and v != 1]
     if given:
         raise DeclarationError(no_mapping(f"from_sb3(learn=True): {name}", " and ".join(given)))
-    kinds = {"PPO": "PPO", "A2C": "PPO", "SAC": "SAC", "TD3": "TD3", "DDPG": "TD3", "DQN": "DQN"}
-    if kind not in kinds or hasattr(policy, "lstm_actor") or _has_gsde(policy):
+    learns_by = ALGORITHMS.get(kind)
+    if learns_by is None or hasattr(policy, "lstm_actor") or _has_gsde(policy):
         raise PolicyError(
-            f"{name} cannot learn on: only the networks of {', '.join(kinds)} without memory and "
-            "without gSDE are known. Let it act as it is (without learn=True)"
+            f"{name} cannot learn on: only the networks of {', '.join(ALGORITHMS)} without memory "
+            "and without gSDE are known. Let it act as it is (without learn=True)"
         )
     if isinstance(model.action_space, MultiBinary):
         raise PolicyError(
@@ -342,10 +307,16 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
         )
     modules = (policy, *policy.children())
     extractors = (getattr(module, "features_extractor", None) for module in modules)
-    _check_features(next(x for x in extractors if x is not None), name)
+    extractor = next(x for x in extractors if x is not None)
+    parts = getattr(extractor, "extractors", {"": extractor}).values()
+    if other := {type(part).__name__ for part in parts} - {"FlattenExtractor", "Flatten"}:
+        raise PolicyError(
+            f"{name} cannot learn on: its observations pass through {', '.join(sorted(other))}, "
+            "and only networks of linear layers are known. Let it act as it is (without learn=True)"
+        )
     settings: dict[str, Any] = {}
     log_std = None
-    if kinds[kind] == "PPO":
+    if learns_by == "PPO":
         hidden = policy.mlp_extractor
         networks = {
             "actor": layers_of([hidden.policy_net, policy.action_net], name),
@@ -366,26 +337,15 @@ def _learnable(model: Any, name: str, normalize: Any, options: dict[str, Any]) -
     space = model.observation_space
     return Learnable(
         name,
-        kinds[kind],
+        learns_by,
         networks,
         None if log_std is None else array_of(log_std),
-        env_units=kinds[kind] == "PPO",
+        env_units=learns_by == "PPO",
         scaling=None if normalize is None else _moments(normalize, space),
         observation_space=space,
         action_space=model.action_space,
         settings=settings,
     )
-
-
-def _check_features(extractor: Any, name: str) -> None:
-    """Raise a PolicyError where observations pass through more than flattening and joining."""
-    parts = getattr(extractor, "extractors", {"": extractor})
-    kinds = {type(part).__name__ for part in parts.values()}
-    if kinds - {"FlattenExtractor", "Flatten"}:
-        raise PolicyError(
-            f"{name} cannot learn on: its observations pass through {', '.join(sorted(kinds))}, "
-            "and only networks of linear layers are known. Let it act as it is (without learn=True)"
-        )
 
 
 def _moments(normalize: Any, space: Space[Any]) -> tuple[Array, Array, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -16,10 +15,11 @@ from skillweave.policies.core import Memory, Turn
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
+from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
-from skillweave.skills.outputs import as_array, called, required_arguments
+from skillweave.skills.outputs import Wrapped, as_array, called, parameters_of, required_arguments
 from skillweave.skills.probing import probe
 from skillweave.types import Array, read_only
 
@@ -51,13 +51,13 @@ class ScriptedPolicy(MappedPolicy):
         mapping = self.mapping
         takes_goal = self._with_goal if self.joins else ""
         how = mapping.state, mapping.single_state, takes_goal, self._who
-        return Function(_Asked(self), *how)
+        return Function(Wrapped(self.function, self._ask), *how)
 
     @cached_property
     def in_place(self) -> InPlace:  # type: ignore[override]
         """The policy that acts: the function alone, while its action space is not known."""
         if self.action_space is None and self.mapping == PolicyMapping():
-            return _Alone(self)
+            return _Alone(self._ask)
         return super().in_place
 
     @property
@@ -74,21 +74,13 @@ class ScriptedPolicy(MappedPolicy):
         """Return the function's name, and the mapping."""
         return super().source() | {"name": qualified(self.function)}
 
-
-class _Asked:
-    """The function of a policy, which is asked by ``called``."""
-
-    def __init__(self, policy: ScriptedPolicy) -> None:
-        self.bare, self.policy = policy.function, policy
-
-    def __call__(self, *given: Any, **named: Any) -> Any:
-        """Return what it makes of its inputs, and perhaps of a goal or a state."""
-        policy, who = self.policy, self.policy._who
+    def _ask(self, *given: Any, **named: Any) -> Any:
+        """Return what the function makes of its inputs, and perhaps of a goal or a state."""
+        who, mapping, space = self._who, self.mapping, self.action_space
         if not given:
-            return called(self.bare, named, who, kind=PolicyError)
-        function = partial(self.bare, **named) if named else self.bare
+            return called(self.function, named, who, kind=PolicyError)
+        function = partial(self.function, **named) if named else self.function
         value = called(function, given[0], who, kind=PolicyError, more=given[1:])
-        mapping, space = policy.mapping, policy.action_space
         if mapping.state and isinstance(value, tuple | list) and len(value) == 2:
             output, after = value
             several = not mapping.single_state and isinstance(after, tuple | list)
@@ -99,20 +91,20 @@ class _Asked:
         if mapping.state or isinstance(space, Dict | Tuple):
             return value
         if isinstance(value, Mapping):
-            policy.must_be_bound()
+            self.must_be_bound()
         action, n = as_array(value, who, PolicyError), len(given[0])
         plain = mapping.acts is None and mapping.chunk is None
         alone = len(given) == 1 and not named
         if space is not None and plain and alone and action.shape == (n, *(space.shape or ())):
-            probe(function, given[0], n, who, space, PolicyError)
+            probe(function, given[0], who, space_of(space), PolicyError)
         return action
 
 
 class _Alone(InPlace):
     """A function whose action space is not known."""
 
-    def __init__(self, policy: ScriptedPolicy) -> None:
-        self._function = _Asked(policy)
+    def __init__(self, function: Callable[[Array], Any]) -> None:
+        self._function = function
 
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return what the function returns."""
@@ -125,22 +117,16 @@ def _takes_goal(function: Any) -> Literal["goal", "second", ""]:
 
     A second parameter with a default, and of another name, is no goal: ``scale=2.0``.
     """
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # of some functions written in C
-        return ""
-    kinds = {p.kind for p in parameters}
-    if any(p.name == GOAL and p.kind in _BY_NAME for p in parameters):
+    parameters = parameters_of(function)
+    if any(
+        p.name == GOAL and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY) for p in parameters
+    ):
         return "goal"
-    if required_arguments(function) > 1 or inspect.Parameter.VAR_POSITIONAL in kinds:
+    # It may be given by its place alone.
+    second = [p.name for p in parameters[1:2]] == [GOAL] or required_arguments(function) > 1
+    if second or any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return "second"
-    second = list(parameters)[1:2]
-    if second and second[0].name == GOAL:  # to be given by its place alone
-        return "second"
-    return "goal" if inspect.Parameter.VAR_KEYWORD in kinds else ""
-
-
-_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    return "goal" if any(p.kind is p.VAR_KEYWORD for p in parameters) else ""
 
 
 @checked_names
@@ -191,7 +177,5 @@ def from_function(
         raise DeclarationError(
             f"from_function takes a function of observations, not {short(function)}"
         )
-    mapping = mapping_of(
-        "from_function()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_function()", sees, goal, acts, every, chunk, state)
     return ScriptedPolicy(function, observation_space, action_space, mapping)

@@ -19,7 +19,7 @@ from skillweave.policies.files import checksum
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
 from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import qualified
-from skillweave.skills.learnable import Learnable, no_mapping, of_module
+from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of
 from skillweave.types import Array
@@ -32,9 +32,8 @@ class TorchPolicy(MappedPolicy):
     """A module whose forward takes observations and returns logits or actions.
 
     Args:
-        module: the module.
         file: the file that it was loaded from, if any.
-        content: the content of that file.
+        content: of that file, from which copies load it again, as it cannot be pickled.
     """
 
     kind = "torch"
@@ -51,27 +50,34 @@ class TorchPolicy(MappedPolicy):
     ) -> None:
         name = str(file) if file else f"module {type(module).__name__}"
         super().__init__(name, observation_space, action_space, mapping)
-        self.module = module
-        self.file = file
+        self.module: Any = module
         self.data = content
+        self.label = qualified(type(module))
+        """Its name in runs."""
+        self.origin = {"file": name, "sha256": checksum(content)} if file else {}
+        """The file's path and checksum; {}: it was made in memory."""
 
     def __getstate__(self) -> dict[str, Any]:
         state = dict(vars(self))
-        if self.file is not None:  # such modules cannot be pickled
+        if self.data:
             del state["module"]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        if self.file is not None:
-            self.module = _module_in(self.data, self.file)
+        if self.data:
+            self.module = _module_in(self.data, self.name)
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy in evaluation mode, independent of later changes of the module."""
         bound = super().bind(observation_space, action_space, who)
-        if self.file is None:  # a file's is its own, and one of torch.export has a fixed mode
-            bound.module = copy.deepcopy(self.module).eval()
+        if not self.data:  # a file's is its own, and one of torch.export has a fixed mode
+            bound.module = self._copied()
         return bound
+
+    def _copied(self) -> nn.Module:
+        module: nn.Module = copy.deepcopy(self.module).eval()
+        return module
 
     @property
     def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
@@ -111,21 +117,48 @@ class TorchPolicy(MappedPolicy):
 
     def source(self) -> dict[str, Any]:
         """Return the module's class, the checksum of its weights or its file, and the mapping."""
-        found = super().source() | {"name": qualified(type(self.module))}
-        return (
-            found
-            if self.file is None
-            else found | {"file": str(self.file), "sha256": checksum(self.data)}
-        )
+        return super().source() | {"name": self.label} | self.origin
 
     def content(self) -> bytes | None:
-        """Return its weights; None for a file, which can run code."""
-        return None if self.file else weights_of(self.module, self._who)
+        """Return its weights as a safetensors file; None for a file, which can run code.
+
+        Raises:
+            PolicyError: it has state that is not a tensor.
+        """
+        if self.origin:
+            return None
+        import safetensors.torch
+        from torch import Tensor
+
+        state = self.module.state_dict()
+        for name, value in state.items():
+            if not isinstance(value, Tensor):
+                raise PolicyError(
+                    f"{self._who}: its state {name!r} is a {type(value).__name__}, no tensor"
+                )
+        # Clones: modules may share tensors, which the format does not support.
+        return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
 
     def restored(self, content: bytes) -> Self:
-        """Return a copy with these weights."""
-        policy = copy.copy(self)
-        policy.module = with_weights(self.module, content, self._who)
+        """Return a copy with these weights.
+
+        Raises:
+            RunError: the weights have other names or shapes.
+        """
+        import safetensors
+        import safetensors.torch
+        import torch
+
+        policy, module = copy.copy(self), self._copied()
+        try:
+            with torch.device("cpu"):  # the user may have changed the default device
+                weights = safetensors.torch.load(content)
+            module.load_state_dict(weights)
+        except (RuntimeError, safetensors.SafetensorError) as error:
+            raise RunError(
+                f"{self._who}: the weights in the run do not fit it: {shortened(str(error))}"
+            ) from error
+        policy.module = module
         return policy
 
 
@@ -212,9 +245,7 @@ def from_torch(
         PolicyError: the file is not trusted, or holds no module; or the module cannot learn on.
         RunError: the file does not exist.
     """
-    mapping = mapping_of(
-        "from_torch()", sees=sees, goal=goal, acts=acts, every=every, chunk=chunk, state=state
-    )
+    mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state)
     if not isinstance(learn, bool):
         raise DeclarationError(f"from_torch(): learn is {short(learn)}; it must be True or False")
     if learn and mapping != PolicyMapping():
@@ -231,16 +262,25 @@ def from_torch(
                 f"machine. If you trust its author: from_torch({str(file)!r}, trust=True)"
             )
         content = read_file(file)
-        loaded = _module_in(content, file)
+        loaded = _module_in(content, str(file))
         return TorchPolicy(loaded, observation_space, action_space, mapping, file, content)
     if isinstance(module, type) or not hasattr(module, "state_dict"):
         raise DeclarationError(f"from_torch takes a module made of its class, not {short(module)}")
     if learn:
-        return of_module(module, f"module {type(module).__name__}", observation_space, action_space)
+        who = f"module {type(module).__name__}"
+        return Learnable(
+            who,
+            "PPO",
+            {"actor": layers_of([module], who)},
+            env_units=True,
+            observation_space=observation_space,
+            action_space=action_space,
+            settings=PLAIN_PPO,
+        )
     return TorchPolicy(module, observation_space, action_space, mapping)
 
 
-def _module_in(content: bytes, file: Path) -> nn.Module:
+def _module_in(content: bytes, file: str) -> nn.Module:
     """Return the module in a file of TorchScript, or of an exported program.
 
     Raises:
@@ -314,41 +354,3 @@ def _tensors(obs: Any, device: Any, dtype: Any) -> Any:
     if isinstance(obs, tuple):
         return tuple(_tensors(part, device, dtype) for part in obs)
     return torch.tensor(obs, dtype=dtype, device=device)
-
-
-def weights_of(module: nn.Module, who: str) -> bytes:
-    """Return the state of a module as a safetensors file.
-
-    Raises:
-        PolicyError: it has state that is not a tensor.
-    """
-    import safetensors.torch
-    from torch import Tensor
-
-    state = module.state_dict()
-    for name, value in state.items():
-        if not isinstance(value, Tensor):
-            raise PolicyError(f"{who}: its state {name!r} is a {type(value).__name__}, no tensor")
-    # Clones: modules may share tensors, which the format does not support.
-    return safetensors.torch.save({k: v.detach().cpu().clone() for k, v in state.items()})
-
-
-def with_weights(module: nn.Module, content: bytes, who: str) -> nn.Module:
-    """Return a copy of a module with the weights of ``weights_of``.
-
-    Raises:
-        RunError: the weights have other names or shapes.
-    """
-    import safetensors
-    import safetensors.torch
-    import torch
-
-    loaded = copy.deepcopy(module)
-    try:
-        with torch.device("cpu"):  # the user may have changed the default device
-            weights = safetensors.torch.load(content)
-        loaded.load_state_dict(weights)
-    except (RuntimeError, safetensors.SafetensorError) as error:
-        reason = shortened(str(error))
-        raise RunError(f"{who}: the weights in the run do not fit it: {reason}") from error
-    return loaded

@@ -12,7 +12,7 @@ from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
-from skillweave.skills.goal_spaces import from_numbers, shown_goal
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import ENDS
 from skillweave.types import Array
@@ -99,7 +99,7 @@ class PlayedEpisodes:
                 continue
             judged = bool(self.skills) and not isinstance(skill, RecordedSkill)
             goals = recorder.goals.get(skill.name)
-            aims = None if goals is None else from_numbers(goals.space, log.goals[skill.name])
+            aims = None if goals is None else goals.space.of_numbers(log.goals[skill.name])
             for row in np.flatnonzero(skills == i).tolist():
                 won = bool(log.succeeded[row]) if skill.defines("success") else None
                 call = Call(

@@ -344,7 +344,7 @@ class CallTally:
         if len(waiting):
             obs = played.step.obs[waiting]
             ids = played.rows[waiting]
-            may = asked(self._skill, "initiation", obs, len(waiting), ids=ids)
+            may = asked(self._skill, "initiation", obs, ids)
             self._running[played.episode[waiting[may]]] = True
         rows = np.flatnonzero(self._running[played.episode])
         if not len(rows):

@@ -49,7 +49,7 @@ def skills_of(env: Point, *skills: sw.Skill, config: Any = PPO, **how: Any) -> S
         goals = goals_of(skill)
         seen: Any = env.observation_space
         if goals is not None:
-            seen = with_goal(seen, goals.space)
+            seen = with_goal(seen, goals.goal_space)
         declared = getattr(skill, "policy", None)
         if declared is None:
             policies.append(mild(config, seen, env.action_space, seed=i))
@@ -154,7 +154,7 @@ def within(**how: Any) -> Any:
     whole = type("Far", (GoTo,), {"max_steps": 7})()
     own = goals_of(whole)
     assert own is not None
-    seen = with_goal(env.observation_space, own.space)
+    seen = with_goal(env.observation_space, own.goal_space)
     spaces = {"go_to": GoTo.goal_space, "other": GoTo.goal_space}
     if how.get("cut"):
         config = SkillCritic(network=SMALL, normalize_obs=False, deciding=True, sees_goals=True)

@@ -104,7 +104,9 @@ def test_a_skill_with_goals_rehearses_observations_and_goals(space: str) -> None
     goals = goals_of(skill)
     assert goals is not None
     assert seen.dtype == goals.join(log.start[:1], goals.start(1)).dtype
-    pairs = {(*o, *g) for o, g in zip(seen["observation"], goals.flat(seen["goal"]), strict=True)}
+    pairs = {
+        (*o, *g) for o, g in zip(seen["observation"], goals.space.flat(seen["goal"]), strict=True)
+    }
     first = np.flatnonzero((log.skill == 0) & log.succeeded & (log.order == 0))
     assert len(first)
     for call in first:

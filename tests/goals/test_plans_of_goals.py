@@ -18,7 +18,7 @@ from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.policies.spaces import space_of
 from skillweave.selectors import LastCall
-from skillweave.skills.goal_spaces import choice_space, draw_from, from_numbers
+from skillweave.skills.goal_spaces import choice_space, draw_from
 from skillweave.skills.goals import goals_of
 
 GAMMA = 0.9
@@ -198,9 +198,9 @@ def test_goals_from_their_numbers(space: str) -> None:
     """Goals of every space are their numbers, and back."""
     goals: Any = goals_of(go_to(space))
     drawn = draw_from(SPACES[space], 5, np.random.default_rng(0))
-    numbers = goals.flat(drawn)
+    numbers = goals.space.flat(drawn)
     assert numbers.shape == (5, space_of(SPACES[space]).size)
-    back = from_numbers(SPACES[space], numbers)
+    back = goals.space.of_numbers(numbers)
     assert back.dtype == drawn.dtype
     assert back.tobytes() == drawn.tobytes()
 

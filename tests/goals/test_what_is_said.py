@@ -15,7 +15,7 @@ from skillweave.collecting.judge import JudgedBy
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
 from skillweave.experience import Batch
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.skills.goal_spaces import draw_from, from_numbers, shown_goal, with_goal
+from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
 from skillweave.skills.goals import Goals, goals_of
 from skillweave.spaces import obs_dtype
 
@@ -414,8 +414,8 @@ def test_goals_are_drawn_and_joined(name):
     assert joint.dtype == obs_dtype(with_goal(Point.observation_space, skill.goal_space))
     assert np.array_equal(joint["observation"], obs)
     assert np.array_equal(joint["goal"], drawn)
-    assert goals.flat(drawn).shape == (50, goals.size)
-    assert np.array_equal(from_numbers(goals.space, goals.flat(drawn)), drawn)
+    assert goals.space.flat(drawn).shape == (50, goals.space.size)
+    assert np.array_equal(goals.space.of_numbers(goals.space.flat(drawn)), drawn)
     assert np.array_equal(
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),
         draw_from(skill.goal_space, 9, np.random.default_rng(3)),

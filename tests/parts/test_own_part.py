@@ -19,8 +19,12 @@ HIGH = np.array([1.0, 2.0, 3.0], np.float32)
 BOX = Box(-HIGH, HIGH)
 
 
+def skill(sees: Any = None, acts: Any = None) -> sw.Skill:
+    return type("X", (sw.Skill,), {"sees": sees, "acts": acts})()
+
+
 def part(sees: Any = None, acts: Any = None, rest: Any = "zero", space: Any = BOX) -> OwnPart:
-    return OwnPart(sees, acts, rest, OBS, space, "skill 'x'")
+    return OwnPart(skill(sees, acts), rest, OBS, space, "skill 'x'")
 
 
 def observations(n: int = 4) -> Any:
@@ -283,6 +287,6 @@ def test_tuples_of_actions_have_names():
     ],
 )
 def test_parts_as_json_are_the_same_parts(sees, acts):
-    content = part_to_json(sees, acts, "x")
-    found = part_from_json(content)
-    assert part_to_json(found.get("sees"), found.get("acts"), "x") == content
+    content = part_to_json(skill(sees, acts), "zero", "x")
+    again = skill(**part_from_json(content))
+    assert part_to_json(again, "zero", "x") == content

@@ -15,7 +15,7 @@ from skillweave.errors import PolicyError, SkillError
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, Predicate, RewardMachine, held
 from skillweave.policies.core import LastCall, Turn, World
 from skillweave.policies.planned import Planned
-from skillweave.skills.goal_spaces import choice_space, number_of
+from skillweave.skills.goal_spaces import choice_space
 from skillweave.spaces import obs_dtype
 
 LINE: Any = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
@@ -96,7 +96,7 @@ def course(plans: Planned, log: CallLog, rows_of: Any, n: int = 5) -> list[Any]:
         chosen = np.full(n, -1)
         for rows in rows_of(np.flatnonzero(rng.random(n) < 0.6)):
             choice = plans.act(memory, rows, obs[rows], Turn(World(), may[rows]))
-            chosen[rows] = number_of(choice)
+            chosen[rows] = choice if choice.dtype.fields is None else choice["skill"]
             skill[rows] = plans.options.skill_of[chosen[rows]]
             found += choice.tolist()
         moved = log.next_obs[rng.integers(log.steps, size=n)]

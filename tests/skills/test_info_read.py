@@ -11,8 +11,8 @@ from test_asked_twice import step
 
 from skillweave.errors import DeclarationError, SkillError
 from skillweave.skills import Skill, asked
-from skillweave.skills.info_read import info_keys_read
 from skillweave.skills.info_words import StoredInfo
+from skillweave.skills.reads import info_keys_read
 
 INFO: dict[str, Any] = {
     "speed": np.arange(4.0),
@@ -88,7 +88,7 @@ def test_a_key_that_was_not_recorded_is_named() -> None:
     with pytest.raises(
         SkillError, match=r"'paid': reward\(\).*parts.*recorded: 'speed'.*needs_inf"
     ):
-        asked(Paid(), "reward", stored, 4)
+        asked(Paid(), "reward", stored)
 
 
 @pytest.mark.parametrize("keys", ["speed", ("speed", 3), 7])

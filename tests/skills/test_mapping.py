@@ -15,8 +15,9 @@ from skills.mapped_models import ACTION, SPACE, observations, onnx_model, weight
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.skills.foreign_policy import as_recorded, fitted, source_of
+from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
-from skillweave.spaces import obs_codec, to_tensor
+from skillweave.spaces import obs_codec, obs_dtype, to_tensor
 from skillweave.types import Array
 
 
@@ -136,6 +137,18 @@ def test_what_is_remembered_is_no_array_of_the_users() -> None:
 
     with pytest.raises(PolicyError, match=r"changes\(\) raised ValueError.*read-only"):
         fit(sw.from_function(changes, state=(None, 1)))
+
+
+def test_a_module_that_takes_the_goal_of_its_skill_is_copied_too() -> None:
+    module = torch.nn.Linear(5, 5)
+    skill = type("Go", (sw.Skill,), {"goal_space": Box(-1, 1, (2,))})()
+    policy = sw.from_torch(module, sees=("gyro", sw.Goal()))
+    bound = policy.bind_with_goals(SPACE, ACTION, "it", Goals(skill))
+    obs = np.zeros(2, obs_dtype(bound.observation_space))
+    before = bound.act(bound.start(2), obs)[0]
+    with torch.no_grad():
+        module.bias.add_(1.0)
+    np.testing.assert_array_equal(bound.act(bound.start(2), obs)[0], before)
 
 
 def test_choices_of_a_policy_may_have_other_numbers_in_the_environment() -> None:

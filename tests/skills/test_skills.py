@@ -8,7 +8,9 @@ from skillweave.errors import SkillweaveError
 from skillweave.messages import short, whole_number
 from skillweave.policies.core import Policy
 from skillweave.policies.parts import Reflexes
-from skillweave.skills import Reflex, Skill, asked, checked, from_function
+from skillweave.policies.spaces import space_of
+from skillweave.skills import Reflex, Skill, asked, from_function
+from skillweave.skills.outputs import checked
 from skillweave.types import Step
 
 
@@ -80,20 +82,24 @@ OBS = np.array([[0.0], [1.0], [2.0]])
 
 def test_a_reflex_overrides_the_action_where_it_holds_and_leaves_its_argument_alone():
     action = np.array([5, 5, 5])
-    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(OBS, action, Discrete(6))
+    overridden, holds = Reflex(lambda obs: obs[:, 0] > 0, 0).apply(
+        OBS, action, space_of(Discrete(6))
+    )
     assert (overridden.tolist(), holds.tolist()) == ([5, 0, 0], [False, True, True])
     assert action.tolist() == [5, 5, 5]
 
 
 def test_a_reflex_may_compute_its_actions_from_the_observations_where_it_holds():
     reflex = Reflex(lambda obs: obs[:, 0] > 0, lambda obs: 10 * obs)
-    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), Box(-50, 50, (1,)))
+    overridden, _ = reflex.apply(OBS, np.full((3, 1), 5.0), space_of(Box(-50, 50, (1,))))
     assert overridden.tolist() == [[5], [10], [20]]
 
 
 def test_the_last_reflex_wins():
     reflexes = (Reflex(lambda o: o[:, 0] > 0, 1), Reflex(lambda o: o[:, 0] > 1, 2))
-    action, overridden = Reflexes(Policy(), reflexes, Discrete(3)).over(OBS, np.zeros(3, int))
+    action, overridden = Reflexes(Policy(), reflexes, space_of(Discrete(3))).over(
+        OBS, np.zeros(3, int)
+    )
     assert action.tolist() == [0, 1, 2]
     assert overridden.tolist() == [False, True, True]
 
@@ -108,7 +114,7 @@ def test_a_reflex_is_named_after_its_condition():
     with pytest.raises(
         SkillweaveError, match=r"'leg_touches': condition\(\) returned shape \(2,\)"
     ):
-        reflex.apply(OBS, np.zeros(3, int), Discrete(2))
+        reflex.apply(OBS, np.zeros(3, int), space_of(Discrete(2)))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -116,40 +122,41 @@ def test_a_number_that_is_not_finite_names_who_what_when_and_where(bad):
     with pytest.raises(
         SkillweaveError, match=rf"skill x: reward\(\).*{bad} at step 7.*environment 1"
     ):
-        checked([0.0, bad], 2, np.float32, "skill x", "reward", 7)
+        checked([0.0, bad], 2, np.float32, "skill x: reward()", 7)
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
 def test_a_number_too_large_for_float32_is_not_finite_either():
     with pytest.raises(SkillweaveError, match=r"skill x: reward\(\)"):
-        checked([0.0, 1e300], 2, np.float32, "skill x", "reward", 7)
+        checked([0.0, 1e300], 2, np.float32, "skill x: reward()", 7)
 
 
 @pytest.mark.parametrize("bad", [2e15, -1e33])
 def test_a_reward_too_large_to_be_squared_is_refused(bad):
     says = r"skill x: reward\(\).*environment 1.*at most 1e\+15"
     with pytest.raises(SkillweaveError, match=says):
-        checked([1e15, bad], 2, np.float32, "skill x", "reward", 7)
+        checked([1e15, bad], 2, np.float32, "skill x: reward()", 7)
 
 
 @pytest.mark.parametrize("bad", [0.0, np.zeros(3), np.zeros((2, 1))], ids=["()", "(3,)", "(2, 1)"])
 def test_a_wrong_shape_is_named(bad):
     with pytest.raises(SkillweaveError, match=r"reward\(\) returned shape \(.*at step 7.*\(2,\)"):
-        checked(bad, 2, np.float32, "skill x", "reward", 7)
+        checked(bad, 2, np.float32, "skill x: reward()", 7)
 
 
 def test_numbers_are_cast():
-    assert checked([1, 0], 2, np.float32, "", "").dtype == np.float32
-    assert checked([1, 0], 2, bool, "", "").tolist() == [True, False]
+    assert checked([1, 0], 2, np.float32, "").dtype == np.float32
+    assert checked([1, 0], 2, bool, "").tolist() == [True, False]
 
 
 # What users return -----------------------------------------------------------------------------
 
 
-def step_of(n: int = 2) -> Step:
+def step_of(last: int = 2) -> Step:
+    n, elapsed = 2, np.full(2, last)
     never = np.zeros(n, bool)
     obs, action = np.zeros((n, 1)), np.zeros(n, int)
-    reward, elapsed = np.ones(n, np.float32), np.arange(1, n + 1)
+    reward = np.ones(n, np.float32)
     goal = np.zeros((n, 2))
     return Step(obs, action, obs.copy(), reward, never, never, never, elapsed, {}, goal)
 
@@ -167,7 +174,7 @@ def step_of(n: int = 2) -> Step:
 def test_a_reward_of_another_kind_is_told(bad, says):
     skill = type("Odd", (Skill,), {"reward": lambda self, step: bad})()
     with pytest.raises(SkillweaveError, match=rf"skill 'odd': reward\(\) {says}|{says}"):
-        asked(skill, "reward", step_of(), 2, np.array([2, 2]))
+        asked(skill, "reward", step_of(2))
 
 
 @pytest.mark.parametrize("method", ["termination", "success", "initiation"])
@@ -185,7 +192,7 @@ def test_a_reward_of_another_kind_is_told(bad, says):
 def test_what_is_neither_yes_nor_no_is_told(method, bad, says):
     skill = type("Odd", (Skill,), {method: lambda self, about: bad})()
     with pytest.raises(SkillweaveError, match=rf"skill 'odd': {method}\(\) {says}"):
-        asked(skill, method, step_of(), 2, np.array([3, 3]))
+        asked(skill, method, step_of(3))
 
 
 def test_zeros_and_ones_of_any_kind_are_yes_and_no():
@@ -196,7 +203,7 @@ def test_zeros_and_ones_of_any_kind_are_yes_and_no():
             return [int(x) for x in even] if kind is list else even.astype(kind)
 
         skill = type("Fine", (Skill,), {"termination": termination})()
-        found = asked(skill, "termination", step_of(), 2)
+        found = asked(skill, "termination", step_of())
         assert (found.dtype, found.tolist()) == (bool, [True, False])
 
 
@@ -207,7 +214,7 @@ def test_an_error_of_a_skill_is_told_with_its_step_and_line_and_is_its_cause():
 
     says = r"skill 'divides': reward\(\) raised ZeroDivisionError.*\(test_skills.py, line \d+\) at "
     with pytest.raises(SkillweaveError, match=f"{says}step 4") as raised:
-        asked(Divides(), "reward", step_of(), 2, np.array([4, 4]))
+        asked(Divides(), "reward", step_of(4))
     assert isinstance(raised.value.__cause__, ZeroDivisionError)
 
 
@@ -223,7 +230,7 @@ def test_a_skill_cannot_change_what_others_see(name):
 
     step = step_of()
     with pytest.raises(SkillweaveError, match=r"reward\(\) raised ValueError.*change a copy"):
-        asked(Writes(), "reward", step, 2)
+        asked(Writes(), "reward", step)
 
 
 def test_what_a_step_is_made_of_can_still_be_changed_by_its_owner():
@@ -241,8 +248,10 @@ def test_observations_cannot_be_changed_either(function):
 
     skill = type("Writes", (Skill,), {"initiation": lambda self, obs: write(obs)})()
     call = {
-        "initiation": lambda obs: asked(skill, "initiation", obs, 3),
-        "condition": lambda obs: Reflex(write, 0).apply(obs, np.zeros(3, int), Discrete(2)),
+        "initiation": lambda obs: asked(skill, "initiation", obs),
+        "condition": lambda obs: Reflex(write, 0).apply(
+            obs, np.zeros(3, int), space_of(Discrete(2))
+        ),
         "policy": lambda obs: from_function(write).act({}, obs),
     }[function]
     obs = OBS.copy()
@@ -272,10 +281,10 @@ def test_observations_cannot_be_changed_either(function):
 def test_a_wrong_action_of_a_reflex_is_told(action, space, says):
     reflex = Reflex(lambda obs: obs[:, 0] > 0, action, "tilted")
     with pytest.raises(SkillweaveError, match=f"reflex 'tilted': .*{says}|{says}"):
-        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space)
+        reflex.apply(OBS, np.zeros((3, *space.shape), space.dtype), space_of(space))
     if not callable(action):
         with pytest.raises(SkillweaveError, match="reflex 'tilted'"):
-            reflex.check(space)
+            reflex.check(space_of(space))
 
 
 @pytest.mark.parametrize(

@@ -18,13 +18,13 @@ from skillweave.errors import PolicyError
 from skillweave.notices import collected_notices
 from skillweave.planning import GoalTask, Predicate, RewardMachine
 from skillweave.policies.core import LastCall
+from skillweave.policies.spaces import space_of
 from skillweave.selectors import Automaton, ready_selector
 from skillweave.skills import Reflex, Skill, asked, from_function
-from skillweave.skills.answers import answer
 from skillweave.skills.foreign_policy import check_spaces
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.skills.goals import Goals
-from skillweave.skills.outputs import called
+from skillweave.skills.outputs import answer, called
 from skillweave.skills.probing import watch
 from skillweave.types import Memoryless
 
@@ -95,7 +95,7 @@ def method(name: str) -> Any:
         "goals": lambda: goals.draw(OBS, np.random.default_rng(0)),
         "clip_goal": lambda: goals.fitted(OBS, OBS, "it"),
     }
-    return ways.get(name, lambda: asked(goals.skill, name, about, 4))
+    return ways.get(name, lambda: asked(goals.skill, name, about))
 
 
 def places() -> dict[str, list[Callable[[], Any]]]:
@@ -120,7 +120,7 @@ def places() -> dict[str, list[Callable[[], Any]]]:
         "selectors.ready": [chooses(Best()), chooses(Two())],
         "skills.base": [
             lambda: condition.holds(OBS),
-            lambda: reflex.apply(OBS, np.zeros(4, int), SPACES[1]),
+            lambda: reflex.apply(OBS, np.zeros(4, int), space_of(SPACES[1])),
             *map(method, Skill.methods),
         ],
         "skills.foreign_policy": [lambda: check_spaces(own, *SPACES, "it", "env")],
@@ -139,7 +139,7 @@ def test_each_function_that_keeps_a_state_gets_one_notice(place: str) -> None:
 
 
 def test_every_module_that_calls_functions_of_the_user_is_tested() -> None:
-    others = ("outputs", "answers", "probing", "info_read", "goal_read")  # of all, or before them
+    others = ("outputs", "probing", "reads")  # of all, or before them
     calls = {
         name.removeprefix("skillweave.")
         for name, module in sys.modules.items()

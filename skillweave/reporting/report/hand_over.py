@@ -36,7 +36,7 @@ from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
-from skillweave.skills.goal_spaces import from_numbers, shown_goal
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
 from skillweave.spaces import env_form
 from skillweave.types import Array
@@ -275,9 +275,9 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
     """Return the goal of a call in words; empty: it has none, or its space is not known."""
     name = log.skills[int(log.skill[row])]
     goals, numbers = goals_of(with_goals.get(name)), log.goals.get(name)
-    if goals is None or numbers is None or numbers.shape[1] != goals.size:
+    if goals is None or numbers is None or numbers.shape[1] != goals.space.size:
         return ""
-    return shown_goal(from_numbers(goals.space, numbers[[row]])[0])
+    return shown_goal(goals.space.of_numbers(numbers[[row]])[0])
 
 
 # The film
