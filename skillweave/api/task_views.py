@@ -43,11 +43,6 @@ class OwnPolicy(Functional):
             then returns the actions of this part, corrected where the skill corrects others.
     """
 
-    not_exported = (
-        "acts where observations hold the state of a task, which no runner follows: export the run "
-        "that its skills are from"
-    )
-
     def __init__(
         self,
         policy: Policy,
@@ -61,11 +56,11 @@ class OwnPolicy(Functional):
             own = view.obs(obs)
             return own if part is None else part.part.see(own)
 
-        inside = policy_of(policy, goals, part, "the policy's act()")
-        super().__init__(Viewed(inside, seen), joins=goals is not None)
+        inside = Viewed(policy_of(policy, goals, part, "the policy's act()"), seen)
+        space = space if goals is None else with_goal(space, goals.space)
+        acts = policy.action_space if part is None else part.written_space
+        super().__init__(inside, space, acts, joins=goals is not None)
         self.policy = policy
-        self.observation_space = space if goals is None else with_goal(space, goals.space)
-        self.action_space = policy.action_space if part is None else part.written_space
         self.labels = policy.labels
 
     def source(self) -> dict[str, Any]:
@@ -78,10 +73,9 @@ class ViewedSelector(Viewed, Selector):
 
     policy: Selector
 
-    @property
-    def ends_matter(self) -> bool:  # type: ignore[override]
-        """As the selector's."""
-        return self.policy.ends_matter
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.ends_matter = self.policy.ends_matter
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
         """Return how likely the selector's choices are, see ``Selector``."""
@@ -122,7 +116,7 @@ class OwnSelector(ReadySelector):
         return changed
 
     @cached_property
-    def in_place(self) -> ViewedSelector:
+    def in_place(self) -> ViewedSelector:  # type: ignore[override]
         """The selector, which sees its own observations."""
         return ViewedSelector(selects(self.selector, "the selector"), self._view.obs)
 

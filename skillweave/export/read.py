@@ -74,7 +74,7 @@ class Exported(Functional, Foreign):
     ) -> None:
         spaces = gym_space(deployed.sees), gym_space(deployed.acts)
         Foreign.__init__(self, str(folder), *spaces)
-        Functional.__init__(self, deployed.policy)
+        Functional.__init__(self, deployed.policy, *spaces)
         self._archive, self._code = archive, code
 
     @property
@@ -143,10 +143,9 @@ class ExportedHierarchy(HierarchyPolicy):
     """A hierarchy of a folder: its skills are known by name, and act by its data alone."""
 
     def __init__(self, deployed: Deployed, sha256: str) -> None:
-        Functional.__init__(self, deployed.policy)
+        spaces = gym_space(deployed.sees), gym_space(deployed.acts)
+        Functional.__init__(self, deployed.policy, *spaces)
         tree = within(deployed.policy)
-        self.observation_space = gym_space(deployed.sees)
-        self.action_space = gym_space(deployed.acts)
         self.skills = _skill_set(tree, deployed)
         self.labels = tuple(skill.name for skill in tree.skills)
         self.goals = None
@@ -175,10 +174,8 @@ def _policy(skill: CalledSkill, deployed: Deployed) -> AnyPolicy:
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
     if isinstance(innermost(skill.policy), Hierarchy):
         return ExportedHierarchy(inside, "")
-    alone: Any = Functional(skill.policy, joins=skill.goals is not None)
-    alone.observation_space = gym_space(deployed.sees)
-    alone.action_space = gym_space(deployed.acts)
-    return alone  # type: ignore[no-any-return]
+    spaces = gym_space(deployed.sees), gym_space(deployed.acts)
+    return Functional(skill.policy, *spaces, joins=skill.goals is not None)
 
 
 def _recorded(called: CalledSkill) -> RecordedSkill:

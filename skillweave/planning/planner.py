@@ -164,7 +164,7 @@ class Planner(ReadySelector):
             self.plan = self._plan_of(self.task.goal)
 
     @cached_property
-    def in_place(self) -> Planned:
+    def in_place(self) -> Planned:  # type: ignore[override]
         """The plan as data, which acts in many environments at once."""
         graph, states, worth = self.graph, self.states, self.plan.worth
         kind: type[Planned] = Planned

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,15 +18,21 @@ class Functional:
 
     Args:
         in_place: the same policy.
+        sees: its ``observation_space``.
+        acts: its ``action_space``.
         joins: it observes its goal beside the observation.
     """
 
     labels: tuple[str, ...] = ()
+    joins = False
 
-    def __init__(self, in_place: Policy, *, joins: bool = False) -> None:
-        self.in_place = in_place
-        self.joins = joins
-        self._like = in_place.start(1)
+    def __init__(self, in_place: Policy, sees: Any, acts: Any, *, joins: bool = False) -> None:
+        self.in_place, self.joins = in_place, joins
+        self.observation_space, self.action_space = sees, acts
+
+    @cached_property
+    def _like(self) -> Memory:
+        return self.in_place.start(1)
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""

@@ -84,8 +84,8 @@ class Planned(Rule):
         super().__post_init__()
 
     @property
-    def count(self) -> int:
-        """The number of choices: skills, perhaps each with some lengths."""
+    def count(self) -> int:  # type: ignore[override]
+        """The number of its choices."""
         return self.options.choices
 
     def start(self, n: int) -> Memory:

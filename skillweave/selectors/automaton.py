@@ -113,7 +113,7 @@ class Automaton(ReadySelector):
                 yield f"state {short(state)}", name, self.goals.get((state, name))
 
     @cached_property
-    def in_place(self) -> selectors.Automaton:
+    def in_place(self) -> selectors.Automaton:  # type: ignore[override]
         """The rule that acts."""
         states = {state: self._in_order(names) for state, names in self.states.items()}
         transitions = tuple(

@@ -14,7 +14,8 @@ from gymnasium.spaces import Dict
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import shortened
-from skillweave.policies.core import LastCall, Turn, World, take
+from skillweave.policies.core import LastCall, take
+from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import Rule
 from skillweave.policies.selectors import function_name as function_name
@@ -27,7 +28,7 @@ from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step
 
 
-class ReadySelector(Foreign):
+class ReadySelector(Functional, Foreign):
     """A selector that is not trained: a policy over skills that also observes the ends of calls.
 
     It is called only where a call is over. It respects the skills' initiation sets, which are its
@@ -43,7 +44,7 @@ class ReadySelector(Foreign):
     SkillError where a fixed goal does not fit its skill."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name)
+        Foreign.__init__(self, name)
         self.skills: tuple[str, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -88,29 +89,6 @@ class ReadySelector(Foreign):
         """Return what every ``Rule`` is made of: who, skills and goals."""
         goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
         return self._who, self.skills, goals
-
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments in which it has not chosen yet."""
-        memory: Memory = self.in_place.start(n)
-        return memory
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` allows, and the memory.
-
-        They are skills; where skills have goals, skills and goals. ``deterministic`` and ``rng``
-        are as of any policy.
-        """
-        rows, turn = np.arange(len(obs)), Turn(World(rng), mask, None, deterministic)
-        memory = take(memory, rows)
-        return self.in_place.act(memory, rows, obs, turn), memory
 
     def chances(self, memory: Memory, obs: Array, mask: Array) -> tuple[Array, Memory]:
         """Return the probability of each choice where a call is over, (n, choices) float32.

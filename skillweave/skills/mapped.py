@@ -17,7 +17,6 @@ from gymnasium.spaces import Box, Dict, Tuple
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short
 from skillweave.notices import notice
-from skillweave.policies.core import Memory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.functional import Functional
 from skillweave.policies.mapped import Model
@@ -34,8 +33,6 @@ class MappedPolicy(Functional, Foreign, Model):
 
     logits = True
     """Outputs that are no whole numbers are logits of choices."""
-    joins = False
-    """It is the policy of a skill with goals, and takes them by itself."""
     acting = Memoryless.acting
 
     def __init__(
@@ -78,10 +75,6 @@ class MappedPolicy(Functional, Foreign, Model):
         unseen = self.mapping.sees is not None and self.observation_space is None
         if unseen or self.action_space is None:
             raise PolicyError(f"{self._who} has no spaces yet: bind() it to an environment's")
-
-    @cached_property
-    def _like(self) -> Memory:  # type: ignore[override]
-        return self.in_place.start(1)
 
     def bind(self, observation_space: Space[Any], action_space: Space[Any], who: str) -> Self:
         """Return a copy for these spaces, with its mapping fitted to them.
