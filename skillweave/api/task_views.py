@@ -24,6 +24,7 @@ from skillweave.policies.leaves import Selector
 from skillweave.policies.parts import Viewed
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
+from skillweave.skills.base import own_methods
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
@@ -136,19 +137,21 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
         view: returns these.
         space: of the observations that hold the task's state.
     """
+    own: Any
     whole, policies = [], []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
         part = skills.part(i)
-        whole.append(_own_policy(policy, view, space, goals_of(skill), part))
-        policies.append(whole[i] if part is None else policy)
+        if isinstance(policy, HierarchyPolicy):
+            own = _own_hierarchy(policy, view, space)
+        else:
+            own = OwnPolicy(policy, view, space, goals_of(skill), part)
+        whole.append(_own_skill(skill, own, view))
+        policies.append(own if part is None else policy)
     parts = tuple(part and part.within(view.obs, space) for part in skills.parts)
     cuts = skills.interruption
     return replace(
         skills,
-        skills=tuple(
-            _own_skill(skill, policy, view)
-            for skill, policy in zip(skills.skills, whole, strict=True)
-        ),
+        skills=tuple(whole),
         policies=tuple(policies),
         parts=parts,
         reflexes=tuple(_own_reflex(reflex, view) for reflex in skills.reflexes),
@@ -156,15 +159,9 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
     )
 
 
-def _own_policy(
-    policy: Policy,
-    view: OwnView,
-    space: gym.Space[Any],
-    goals: Goals | None,
-    part: OwnPart | None,
-) -> Policy:
-    if not isinstance(policy, HierarchyPolicy):
-        return OwnPolicy(policy, view, space, goals, part)
+def _own_hierarchy(
+    policy: HierarchyPolicy, view: OwnView, space: gym.Space[Any]
+) -> HierarchyPolicy:
     selector: Any = policy.selector
     spaces = space, selector.action_space
     if isinstance(selector, ReadySelector):
@@ -181,28 +178,20 @@ def _own_policy(
 def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
     """Return a skill with the methods, limits and colour of another, and a ready policy."""
 
-    def of_step(method: str) -> Callable[[Any, Step], Array]:
+    def seeing(method: str) -> Callable[..., Any]:
         asked = getattr(skill, method)
-        return lambda self, step: asked(view.step(step))
 
-    attributes: dict[str, Any] = {
-        field: getattr(skill, field)
-        for field in ("name", "max_steps", "call_steps", "color", "needs_info", "reward_changes")
-    }
-    attributes |= {
-        method: of_step(method)
-        for method in ("reward", "termination", "success")
-        if skill.defines(method)
-    }
-    if skill.acts is not None:  # sees is left out: the policy sees all, and cuts it to its part
-        attributes["acts"] = skill.acts
-    if skill.goal_space is not None:
-        attributes["goal_space"] = skill.goal_space
-        attributes["goals"] = lambda self, obs, rng: skill.goals(view.obs(obs), rng)
-    if skill.defines("clip_goal"):
-        attributes["clip_goal"] = lambda self, obs, goal: skill.clip_goal(view.obs(obs), goal)
-    if skill.defines("initiation"):
-        attributes["initiation"] = lambda self, obs: skill.initiation(view.obs(obs))
+        def ask(self: Skill, about: Any, *more: Any) -> Any:
+            """Return the method's answer about a step or observations of the environment."""
+            own = view.step(about) if isinstance(about, Step) else view.obs(about)
+            return asked(own, *more)
+
+        return ask
+
+    # Without sees: the policy sees all, and cuts it to its part.
+    fields = "name", "max_steps", "call_steps", "color", "needs_info", "reward_changes"
+    attributes = {field: getattr(skill, field) for field in (*fields, "goal_space", "acts")}
+    attributes |= {method: seeing(method) for method in own_methods(skill)}
     kind = type(type(skill).__name__, (Skill,), attributes | {"policy": policy})
     own: Skill = kind()
     own._path = skill._path

@@ -80,8 +80,7 @@ class Exported(Functional, Foreign):
     @property
     def _goal_places(self) -> list[Take]:
         """The places of the goal among its inputs."""
-        inputs = self.in_place.inputs if isinstance(self.in_place, Mapped) else None
-        takes = [take for one in (inputs or {}).values() for take in one.takes]
+        takes = getattr(self.in_place, "takes", ())
         return [take for take in takes if take.source == "goal"]
 
     @property
