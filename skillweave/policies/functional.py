@@ -34,6 +34,11 @@ class Functional:
     def _like(self) -> Memory:
         return self.in_place.start(1)
 
+    def _copied(self, memory: Memory) -> tuple[Memory, Memory]:
+        """Return a copy of a memory, and its arrays as ``in_place`` has them."""
+        memory = {k: v.copy() for k, v in memory.items()}
+        return memory, nested(self._like, memory)
+
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""
         return flat(self.in_place.start(n))
@@ -56,16 +61,16 @@ class Functional:
         ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
         selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
         """
-        memory = {k: v.copy() for k, v in memory.items()}
+        memory, own = self._copied(memory)
         if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
         turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
-        return self.in_place.act(nested(self._like, memory), rows, obs, turn), memory
+        return self.in_place.act(own, rows, obs, turn), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Return the ``memory`` after a ``step``; calls that are over end in it."""
-        memory = {k: v.copy() for k, v in memory.items()}
-        self.in_place.observe(nested(self._like, memory), np.arange(len(step.reward)), step)
+        memory, own = self._copied(memory)
+        self.in_place.observe(own, np.arange(len(step.reward)), step)
         return memory
 
     def acting(self, memory: Memory) -> Array | None:

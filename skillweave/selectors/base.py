@@ -14,7 +14,7 @@ from gymnasium.spaces import Dict
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import shortened
-from skillweave.policies.core import LastCall, take
+from skillweave.policies.core import LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import Rule
@@ -101,9 +101,8 @@ class ReadySelector(Functional, Foreign):
         Returns:
             The probabilities, and the memory after the choice.
         """
-        rows = np.arange(len(obs))
-        memory = take(memory, rows)
-        return self.in_place.chances(memory, rows, obs, mask), memory
+        memory, own = self._copied(memory)
+        return self.in_place.chances(own, np.arange(len(obs)), obs, mask), memory
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
@@ -117,9 +116,8 @@ class ReadySelector(Functional, Foreign):
             step: the environments' transition; ``elapsed`` counts as for any policy.
             last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
         """
-        rows = np.arange(len(last.why))
-        memory = take(memory, rows)
-        self.in_place.watch(memory, rows, step, last)
+        memory, own = self._copied(memory)
+        self.in_place.watch(own, np.arange(len(last.why)), step, last)
         return memory
 
     def _goal(self, name: str, goal: Any, where: str) -> Any:
