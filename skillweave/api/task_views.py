@@ -178,15 +178,15 @@ def _own_hierarchy(
 def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
     """Return a skill with the methods, limits and colour of another, and a ready policy."""
 
-    def seeing(method: str) -> Callable[..., Any]:
+    def seeing(method: str) -> Any:
         asked = getattr(skill, method)
 
-        def ask(self: Skill, about: Any, *more: Any) -> Any:
+        def ask(about: Any, *more: Any) -> Any:
             """Return the method's answer about a step or observations of the environment."""
             own = view.step(about) if isinstance(about, Step) else view.obs(about)
             return asked(own, *more)
 
-        return ask
+        return staticmethod(ask)
 
     # Without sees: the policy sees all, and cuts it to its part.
     fields = "name", "max_steps", "call_steps", "color", "needs_info", "reward_changes"

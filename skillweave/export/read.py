@@ -144,9 +144,8 @@ class ExportedHierarchy(HierarchyPolicy):
     def __init__(self, deployed: Deployed, sha256: str) -> None:
         spaces = gym_space(deployed.sees), gym_space(deployed.acts)
         Functional.__init__(self, deployed.policy, *spaces)
-        tree = within(deployed.policy)
-        self.skills = _skill_set(tree, deployed)
-        self.labels = tuple(skill.name for skill in tree.skills)
+        self.skills = _skill_set(deployed)
+        self.labels = tuple(skill.name for skill in self.skills.skills)
         self.goals = None
         self._sha256 = sha256
 
@@ -155,12 +154,12 @@ class ExportedHierarchy(HierarchyPolicy):
         return {"sha256": self._sha256}
 
 
-def _skill_set(tree: Hierarchy, deployed: Deployed) -> SkillSet:
+def _skill_set(deployed: Deployed) -> SkillSet:
     """Return the skills of a hierarchy as reports know them."""
-    policies = tuple(_policy(skill, deployed) for skill in tree.skills)
+    tree = within(deployed.policy)
     return SkillSet(
         tuple(map(_recorded, tree.skills)),
-        policies,
+        tuple(_policy(skill, deployed) for skill in tree.skills),
         reflexes=_reflexes(deployed.policy),
         call_steps=Lengths(*tree.lengths) if tree.lengths else None,
         greedy=tree.greedy,
@@ -180,26 +179,17 @@ def _policy(skill: CalledSkill, deployed: Deployed) -> AnyPolicy:
 def _recorded(called: CalledSkill) -> RecordedSkill:
     """Return a skill with the functions that judge its calls."""
     methods: dict[str, Any] = {
-        name: _method(function)
+        name: staticmethod(function)
         for name in ("initiation", "termination", "success")
         if (function := getattr(called, name)) is not None
     }
     if called.goals is not None:
         methods["goal_space"] = gym_space(called.goals.space)
         if called.goals.clip is not None:
-            methods["clip_goal"] = _method(called.goals.clip)
+            methods["clip_goal"] = staticmethod(called.goals.clip)
     skill: RecordedSkill = type("Exported", (RecordedSkill,), methods | {"name": called.name})()
     skill.max_steps, skill.call_steps = called.max_steps, called.limit
     return skill
-
-
-def _method(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function as the method of a skill."""
-
-    def method(self: Any, *about: Any) -> Any:
-        return function(*about)
-
-    return method
 
 
 def _reflexes(policy: Policy) -> tuple[Reflex, ...]:

@@ -40,13 +40,13 @@ class Selector(Policy):
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """Return which choices (k, choices) it leaves, as far as is known before it sees more."""
-        allowed = self._allowed(memory, rows)
+        allowed = self.allowed(memory, rows)
         if allowed is None:
             return may
         left: Array = may & allowed.repeat(may.shape[1] // allowed.shape[1], axis=1)
         return left
 
-    def _allowed(self, memory: Memory, rows: Array) -> Array | None:
+    def allowed(self, memory: Memory, rows: Array) -> Array | None:
         """Return the skills that it may choose next, (k, S) bool; None: it needs observations."""
         return None
 
@@ -76,7 +76,8 @@ class Ready(Returns, Selector):
         found: Array = chances
         return found
 
-    def _allowed(self, memory: Memory, rows: Array) -> Array | None:
+    def allowed(self, memory: Memory, rows: Array) -> Array | None:
+        """Return the skills that it may choose next, see ``Selector``."""
         allowed: Array | None = self.policy.allowed(self._of(memory, rows))
         return allowed
 
@@ -197,17 +198,12 @@ class Network(Policy):
                         f"{_words(given.get(name))}"
                     )
             rows, turn = np.zeros(1, np.int64), Turn(World(np.random.default_rng(0)))
-            action, size = self._run(self.start(1), rows, self.sees.start(1), turn), self._size
+            action = self._run(self.start(1), rows, self.sees.start(1), turn)
+            size = self.acts.shape if self.acts.parts is None else (self.acts.size,)
             if action.shape != (1, *size):
                 raise PolicyError(f"its file gives shape {action.shape}, not {(1, *size)}")
         except PolicyError as error:
             raise PolicyError(f"{where}: {error}") from error
-
-    @property
-    def _size(self) -> tuple[int, ...]:
-        if self.acts.parts is None:
-            return self.acts.shape
-        return (self.acts.size,)
 
     def start(self, n: int) -> Memory:
         """Return zeros (n, M), where the network is recurrent."""

@@ -92,8 +92,7 @@ class Take:
             self._places = slice(first, end) if follow else np.array(self.places)
         if self.whole and (self.choices or self.places is not None):
             raise PolicyError("Take.whole is true, but Take.choices or Take.places are given")
-        for name in ("low", "high"):
-            check_size(getattr(self, name), (self.size,), f"Take.{name}")
+        _check_sizes(self, (self.size,), "low", "high")
         if self.source in ("goal", "last_action") and len(self.shape) != 1:
             raise PolicyError(f"Take.shape is {self.shape}, but a {self.source} is (numbers,)")
 
@@ -194,8 +193,7 @@ class Input:
         if not self.takes or size != prod(self.shape):
             raise PolicyError(f"Input.shape is {self.shape}, but Input.takes gives {size} numbers")
         for one in self.scalings:
-            for name in ("offset", "scale", "low", "high"):
-                check_size(getattr(one, name), self.shape, f"Linear.{name}")
+            _check_sizes(one, self.shape, "offset", "scale", "low", "high")
 
     def __call__(self, obs: Array, goal: Array | None = None, last: Array | None = None) -> Array:
         """Return the input (n, *shape) for observations (n, …); see ``Take``."""
@@ -228,10 +226,13 @@ def clipped(x: Array, low: Array | float | None, high: Array | float | None) -> 
     return x if high is None else np.minimum(x, high)
 
 
-def check_size(x: Array | None, shape: tuple[int, ...], name: str) -> None:
+def _check_sizes(one: Any, shape: tuple[int, ...], *names: str) -> None:
     """Raise a PolicyError where a field is not None, one number, or numbers of a shape."""
-    if x is not None and np.shape(x) not in ((), (1,), shape):
-        raise PolicyError(f"{name} has the shape {np.shape(x)}, but it is for {shape}")
+    for name in names:
+        x = getattr(one, name)
+        if x is not None and np.shape(x) not in ((), (1,), shape):
+            where = f"{type(one).__name__}.{name}"
+            raise PolicyError(f"{where} has the shape {np.shape(x)}, but it is for {shape}")
 
 
 def check_places(places: tuple[int, ...], size: int, name: str, *, once: bool = False) -> None:
@@ -296,8 +297,7 @@ class Outputs:
         if not box:
             self._chosen = discrete(self.count)
             return
-        for name in ("scale", "offset"):
-            check_size(getattr(self, name), (self.count,), f"Outputs.{name}")
+        _check_sizes(self, (self.count,), "scale", "offset")
         if self.clip is not None and not self.clip[0] <= self.clip[1]:
             raise PolicyError(f"Outputs.clip is {self.clip}: its second number is the highest")
         if self.rest is not None and np.shape(self.rest) != (size,):

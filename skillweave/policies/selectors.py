@@ -373,7 +373,8 @@ class Automaton(Rule):
             )
         return may
 
-    def _allowed(self, memory: Memory, rows: Array) -> Array:
+    def allowed(self, memory: Memory, rows: Array) -> Array:
+        """Return the skills of the states, see ``Selector``."""
         allowed: Array = self.ranks[memory["state"][rows]] > 0
         return allowed
 

@@ -106,7 +106,8 @@ class ReadySelector(Functional, Foreign):
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
-        return None
+        skills: Array | None = self.in_place.allowed(memory, slice(None))
+        return skills
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a step of n environments; called after every step.
