@@ -6,7 +6,6 @@ it makes the parts of a hierarchy for other observations, and ``planning`` joins
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -101,20 +100,17 @@ class OwnSelector(ReadySelector):
 
     def among(self, skills: tuple[str, ...]) -> Self:
         """Return a copy that chooses among the skills of these names."""
-        return self._with(self.selector.among(skills))
+        changed = super().among(skills)
+        changed.selector = self.selector.among(skills)
+        return changed
 
     def bind(
         self, observation_space: gym.Space[Any], action_space: gym.Space[Any], who: str
     ) -> Self:
         """Return a copy for these spaces; ``who`` begins messages."""
-        bound = self._with(self.selector.bind(self._view.space, action_space, who))
-        bound.observation_space, bound.action_space = observation_space, action_space
+        bound = super().bind(observation_space, action_space, who)
+        bound.selector = self.selector.bind(self._view.space, action_space, who)
         return bound
-
-    def _with(self, selector: Any) -> Self:
-        changed = copy.copy(self)
-        changed.selector, changed.skills = selector, selector.skills
-        return changed
 
     @cached_property
     def in_place(self) -> ViewedSelector:  # type: ignore[override]
@@ -123,8 +119,7 @@ class OwnSelector(ReadySelector):
 
     def source(self) -> dict[str, Any]:
         """Return the selector's source."""
-        source: dict[str, Any] = self.selector.source()
-        return source
+        return source_of(self.selector)
 
 
 def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:
