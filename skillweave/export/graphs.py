@@ -197,20 +197,17 @@ def traced(
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise MissingExtra("exporting to ONNX", "onnx") from error
-    names: Any = {"input_names": list(given), "output_names": list(outputs)}
+    how: Any = {"input_names": list(given), "output_names": list(outputs), "opset_version": OPSET}
+    example = tuple(given.values())
     try:
-        if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
-            return _traced_script(module, given, names)
         with _quiet(), torch.no_grad():
-            program = torch.onnx.export(
-                module,
-                tuple(given.values()),
-                None,
-                dynamo=True,
-                verbose=False,
-                opset_version=OPSET,
-                **names,
-            )
+            if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
+                # dynamo does not trace TorchScript.
+                file: Any = io.BytesIO()
+                script = torch.jit.trace(module, example, check_trace=False)
+                torch.onnx.export(script, example, file, dynamo=False, **how)
+                return bytes(file.getvalue())
+            program = torch.onnx.export(module, example, None, dynamo=True, verbose=False, **how)
     except Exception as error:  # torch's own errors have no common class
         raise PolicyError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
     assert program is not None
@@ -218,17 +215,6 @@ def traced(
     model.ClearField("metadata_props")
     _strip(model.graph)
     content: bytes = model.SerializeToString(deterministic=True)
-    return content
-
-
-def _traced_script(module: nn.Module, given: dict[str, Tensor], names: dict[str, Any]) -> bytes:
-    """Return the ONNX file of a module with TorchScript in it, which ``dynamo`` does not trace."""
-    file: Any = io.BytesIO()
-    example = tuple(given.values())
-    with _quiet(), torch.no_grad():
-        script = torch.jit.trace(module, example, check_trace=False)
-        torch.onnx.export(script, example, file, dynamo=False, opset_version=OPSET, **names)
-    content: bytes = file.getvalue()
     return content
 
 

@@ -272,8 +272,8 @@ class CallGraph:
         *,
         caution: float = 0.0,
         novel: Array | None = None,
-    ) -> tuple[Array, int]:
-        """Return the worth of each piece from each planning state, (P, M), and the sweeps.
+    ) -> Array:
+        """Return the worth of each piece from each planning state, (P, M).
 
         A piece is worth what it pays and what follows: the next piece of its call, or at the call's
         end the best choice, by the weighted mean of its nearest pieces' worth.
@@ -293,7 +293,7 @@ class CallGraph:
         allowed = may[:, self.choice_of]
         if novel is None:
             allowed &= np.isfinite(near.distance)
-        for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
+        for _ in range(MOST_SWEEPS):
             worth = self._worth(judged, value)
             best = np.full_like(value, -np.inf)
             for c in options:
@@ -309,7 +309,7 @@ class CallGraph:
             value = best
             if change <= TOLERANCE * largest:
                 break
-        return self._worth(judged, value), sweeps
+        return self._worth(judged, value)
 
     def _worth(self, judged: Judged, value: Array) -> Array:
         """Return the worth of pieces, (P, M), where the ends of calls have a ``value`` (E, M)."""
