@@ -49,7 +49,8 @@ class ReadySelector(Functional, Foreign):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies have: each makes its own rule."""
-        return {name: value for name, value in vars(self).items() if name != "in_place"}
+        made = ("in_place", "_like")
+        return {name: value for name, value in vars(self).items() if name not in made}
 
     @property
     def ranges(self) -> dict[str, range]:
