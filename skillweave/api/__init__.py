@@ -923,7 +923,7 @@ class Run:
         hierarchy, policy = planned(declared, self.policy, planner)
         run = PlannedRun(hierarchy, self.path, policy)
         # Each goal of its own would need a plan of its own now.
-        if planner.plan.sweeps and (expected := run.explain()).reason:
+        if planner.plan.size and (expected := run.explain()).reason:
             notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         return run
 

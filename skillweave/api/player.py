@@ -48,6 +48,7 @@ class Player(Actor):
 
     Raises:
         DeclarationError: a goal is given to a policy that takes none.
+        EnvError: the policy observes an unsupported space.
         SkillError: the goal is out of the skill's ``goal_space``.
     """
 
@@ -61,7 +62,10 @@ class Player(Actor):
         nan: Literal["error", "zero"] = "error",
     ) -> None:
         self.policy = self._with_goal(policy, goal)
-        super().__init__(deployed(policy), deterministic=deterministic, seed=seed, nan=nan)
+        obs_dtype(policy.observation_space)
+        spaces = map(space_of, (policy.observation_space, policy.action_space))
+        deployed = Deployed(in_place(policy), *spaces)
+        super().__init__(deployed, deterministic=deterministic, seed=seed, nan=nan)
 
     def reset(self, *, goal: Any = None) -> None:
         """Start a new episode with an empty memory.
@@ -90,14 +94,3 @@ class Player(Actor):
             f"the goal {short(goal)} is given to a policy that takes none: name a skill with "
             'goals, run.player(skill="go_to", goal=...)'
         )
-
-
-def deployed(policy: Policy) -> Deployed:
-    """Return a policy as it acts in one environment.
-
-    Raises:
-        EnvError: it observes an unsupported space.
-    """
-    spaces = policy.observation_space, policy.action_space
-    obs_dtype(spaces[0])
-    return Deployed(in_place(policy), *map(space_of, spaces))

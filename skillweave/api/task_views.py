@@ -6,7 +6,6 @@ it makes the parts of a hierarchy for other observations, and ``planning`` joins
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -24,6 +23,7 @@ from skillweave.policies.leaves import Selector
 from skillweave.policies.parts import Viewed
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
+from skillweave.skills.base import own_methods
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals, goals_of
@@ -43,11 +43,6 @@ class OwnPolicy(Functional):
             then returns the actions of this part, corrected where the skill corrects others.
     """
 
-    not_exported = (
-        "acts where observations hold the state of a task, which no runner follows: export the run "
-        "that its skills are from"
-    )
-
     def __init__(
         self,
         policy: Policy,
@@ -61,11 +56,11 @@ class OwnPolicy(Functional):
             own = view.obs(obs)
             return own if part is None else part.part.see(own)
 
-        inside = policy_of(policy, goals, part, "the policy's act()")
-        super().__init__(Viewed(inside, seen), joins=goals is not None)
+        inside = Viewed(policy_of(policy, goals, part, "the policy's act()"), seen)
+        space = space if goals is None else with_goal(space, goals.goal_space)
+        acts = policy.action_space if part is None else part.written_space
+        super().__init__(inside, space, acts, joins=goals is not None)
         self.policy = policy
-        self.observation_space = space if goals is None else with_goal(space, goals.goal_space)
-        self.action_space = policy.action_space if part is None else part.written_space
         self.labels = policy.labels
 
     def source(self) -> dict[str, Any]:
@@ -78,10 +73,9 @@ class ViewedSelector(Viewed, Selector):
 
     policy: Selector
 
-    @property
-    def ends_matter(self) -> bool:  # type: ignore[override]
-        """As the selector's."""
-        return self.policy.ends_matter
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.ends_matter = self.policy.ends_matter
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
         """Return how likely the selector's choices are, see ``Selector``."""
@@ -106,30 +100,26 @@ class OwnSelector(ReadySelector):
 
     def among(self, skills: tuple[str, ...]) -> Self:
         """Return a copy that chooses among the skills of these names."""
-        return self._with(self.selector.among(skills))
+        changed = super().among(skills)
+        changed.selector = self.selector.among(skills)
+        return changed
 
     def bind(
         self, observation_space: gym.Space[Any], action_space: gym.Space[Any], who: str
     ) -> Self:
         """Return a copy for these spaces; ``who`` begins messages."""
-        bound = self._with(self.selector.bind(self._view.space, action_space, who))
-        bound.observation_space, bound.action_space = observation_space, action_space
+        bound = super().bind(observation_space, action_space, who)
+        bound.selector = self.selector.bind(self._view.space, action_space, who)
         return bound
 
-    def _with(self, selector: Any) -> Self:
-        changed = copy.copy(self)
-        changed.selector, changed.skills = selector, selector.skills
-        return changed
-
     @cached_property
-    def in_place(self) -> ViewedSelector:
+    def in_place(self) -> ViewedSelector:  # type: ignore[override]
         """The selector, which sees its own observations."""
         return ViewedSelector(selects(self.selector, "the selector"), self._view.obs)
 
     def source(self) -> dict[str, Any]:
         """Return the selector's source."""
-        source: dict[str, Any] = self.selector.source()
-        return source
+        return source_of(self.selector)
 
 
 def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:
@@ -142,19 +132,21 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
         view: returns these.
         space: of the observations that hold the task's state.
     """
+    own: Any
     whole, policies = [], []
     for i, (skill, policy) in enumerate(zip(skills.skills, skills.policies, strict=True)):
         part = skills.part(i)
-        whole.append(_own_policy(policy, view, space, goals_of(skill), part))
-        policies.append(whole[i] if part is None else policy)
+        if isinstance(policy, HierarchyPolicy):
+            own = _own_hierarchy(policy, view, space)
+        else:
+            own = OwnPolicy(policy, view, space, goals_of(skill), part)
+        whole.append(_own_skill(skill, own, view))
+        policies.append(own if part is None else policy)
     parts = tuple(part and part.within(view.obs, space) for part in skills.parts)
     cuts = skills.interruption
     return replace(
         skills,
-        skills=tuple(
-            _own_skill(skill, policy, view)
-            for skill, policy in zip(skills.skills, whole, strict=True)
-        ),
+        skills=tuple(whole),
         policies=tuple(policies),
         parts=parts,
         reflexes=tuple(_own_reflex(reflex, view) for reflex in skills.reflexes),
@@ -162,15 +154,9 @@ def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillS
     )
 
 
-def _own_policy(
-    policy: Policy,
-    view: OwnView,
-    space: gym.Space[Any],
-    goals: Goals | None,
-    part: OwnPart | None,
-) -> Policy:
-    if not isinstance(policy, HierarchyPolicy):
-        return OwnPolicy(policy, view, space, goals, part)
+def _own_hierarchy(
+    policy: HierarchyPolicy, view: OwnView, space: gym.Space[Any]
+) -> HierarchyPolicy:
     selector: Any = policy.selector
     spaces = space, selector.action_space
     if isinstance(selector, ReadySelector):
@@ -187,28 +173,20 @@ def _own_policy(
 def _own_skill(skill: Skill, policy: Policy, view: OwnView) -> Skill:
     """Return a skill with the methods, limits and colour of another, and a ready policy."""
 
-    def of_step(method: str) -> Callable[[Any, Step], Array]:
+    def seeing(method: str) -> Any:
         asked = getattr(skill, method)
-        return lambda self, step: asked(view.step(step))
 
-    attributes: dict[str, Any] = {
-        field: getattr(skill, field)
-        for field in ("name", "max_steps", "call_steps", "color", "needs_info", "reward_changes")
-    }
-    attributes |= {
-        method: of_step(method)
-        for method in ("reward", "termination", "success")
-        if skill.defines(method)
-    }
-    if skill.acts is not None:  # sees is left out: the policy sees all, and cuts it to its part
-        attributes["acts"] = skill.acts
-    if skill.goal_space is not None:
-        attributes["goal_space"] = skill.goal_space
-        attributes["goals"] = lambda self, obs, rng: skill.goals(view.obs(obs), rng)
-    if skill.defines("clip_goal"):
-        attributes["clip_goal"] = lambda self, obs, goal: skill.clip_goal(view.obs(obs), goal)
-    if skill.defines("initiation"):
-        attributes["initiation"] = lambda self, obs: skill.initiation(view.obs(obs))
+        def ask(about: Any, *more: Any) -> Any:
+            """Return the method's answer about a step or observations of the environment."""
+            own = view.step(about) if isinstance(about, Step) else view.obs(about)
+            return asked(own, *more)
+
+        return staticmethod(ask)
+
+    # Without sees: the policy sees all, and cuts it to its part.
+    fields = "name", "max_steps", "call_steps", "color", "needs_info", "reward_changes"
+    attributes = {field: getattr(skill, field) for field in (*fields, "goal_space", "acts")}
+    attributes |= {method: seeing(method) for method in own_methods(skill)}
     kind = type(type(skill).__name__, (Skill,), attributes | {"policy": policy})
     own: Skill = kind()
     own._path = skill._path

@@ -59,20 +59,18 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
     match policy:
         case Hierarchy():
             return _hierarchy(policy, f"{name}/" if name else "", sampled)
-        case Viewed():
-            raise PolicyError(f"{where} {_OF_A_TASK}")
-        case PartOf() if policy.part.view is not None:
-            raise PolicyError(f"{where} {_OF_A_TASK}")
-        case Reflexes():
-            rules = tuple(_rule(reflex, policy.space) for reflex in policy.reflexes)
-            inside = _compiled(policy.policy, name, sampled=sampled)
-            return Reflexes(inside, rules, policy.space)
-        case Corrects():
-            inside = _compiled(policy.policy, name, sampled=sampled)
-            base = _compiled(policy.base, f"{name}.base", sampled=False)
-            return Corrects(inside, base, policy.correction)
+        case Viewed() | PartOf() if isinstance(policy, Viewed) or policy.part.view is not None:
+            raise PolicyError(
+                f"{where} acts where observations hold the state of a task, which no runner "
+                "follows: export the run that its skills are from"
+            )
         case Around():
-            return replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
+            made = replace(policy, policy=_compiled(policy.policy, name, sampled=sampled))
+            if isinstance(made, Corrects):
+                made.base = _compiled(made.base, f"{name}.base", sampled=False)
+            if isinstance(made, Reflexes):
+                made.reflexes = tuple(_rule(reflex, made.space) for reflex in made.reflexes)
+            return made
         case Mapped():
             return as_file(policy, where, sampled=sampled)
         case Returns():
@@ -85,17 +83,11 @@ def _compiled(policy: Policy, name: str, *, sampled: bool) -> Policy:
     return policy
 
 
-_OF_A_TASK = (
-    "acts where observations hold the state of a task, which no runner follows: export the run "
-    "that its skills are from"
-)
-
-
 def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
     """Return what is no combinator: a network, or a function."""
     inside = policy.policy
     if isinstance(inside, AgentPolicy):
-        return _network(inside, sampled, where)
+        return agent_graph(inside, sampled, where)
     if isinstance(policy, Ready) or inside.start(1):
         kind = type(inside).__name__
         raise PolicyError(
@@ -108,12 +100,6 @@ def _leaf(policy: Returns, where: str, sampled: bool) -> Policy:
 
 def _actions(policy: AnyPolicy, obs: Any) -> Any:
     return policy.act({}, obs)[0]
-
-
-def _network(policy: AgentPolicy, sampled: bool, where: str) -> Network:
-    graph = agent_graph(policy, sampled, where)
-    sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
-    return Network(graph.content, sees, acts, graph.choices, graph.memory, graph.noise)
 
 
 def _hierarchy(policy: Hierarchy, prefix: str, sampled: bool) -> Hierarchy:
@@ -154,10 +140,10 @@ def _interruption(how: Interruption | None, prefix: str) -> Interruption | None:
     if not isinstance(how.critic, AgentPolicy):
         raise PolicyError(f"the critic of {prefix or 'the selector'} is not trained")
     sees = space_of(how.critic.observation_space)
-    content = worth_graph(how.critic, "the skill critic").content
+    file = worth_graph(how.critic, "the skill critic")
     values = int(how.critic.heads(sees.start(1)).shape[1])
     worth = Space("Box", "float32", (values,), np.array(-np.inf), np.array(np.inf))
-    return Interruption(Critic(Network(content, sees, worth)), how.margin)
+    return Interruption(Critic(Network(file, sees, worth)), how.margin)
 
 
 def _rule(reflex: Any, space: Space) -> Override:

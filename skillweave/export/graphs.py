@@ -11,7 +11,7 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -24,25 +24,13 @@ from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import MissingExtra, PolicyError
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
+from skillweave.policies.leaves import Network
 from skillweave.policies.spaces import space_of
 from skillweave.spaces import ActionCodec, ChoiceSpace, JointCodec
 from skillweave.spaces.choices import NumberedChoiceCodec
 
 OPSET = 18
 """Version of ONNX's operators."""
-
-
-@dataclass(frozen=True)
-class Graph:
-    """An ONNX file's content, and its inputs for the runner."""
-
-    content: bytes
-    choices: int = 0
-    """Width of the input ``mask``; 0: no mask."""
-    memory: int = 0
-    """Width of the input ``memory`` and of the output of the same name; 0: no memory."""
-    noise: tuple[Any, ...] = ()
-    """Inputs ``noise.0``, …: a distribution by NumPy's name, and the count of its numbers."""
 
 
 def examples(space: gym.Space[Any]) -> dict[str, Tensor]:
@@ -61,17 +49,16 @@ def mask_width(space: gym.Space[Any]) -> int:
 class _Acting(nn.Module):
     """A trained agent on one observation; inputs: leaves, mask, memory, noise."""
 
-    def __init__(self, policy: AgentPolicy, leaves: int, inputs: Graph) -> None:
+    def __init__(self, policy: AgentPolicy, inputs: Network) -> None:
         super().__init__()
         self.policy = policy
-        self.leaves = leaves
         self.inputs = inputs
 
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
         """Return the action in the environment's units, and the new memory if there is one."""
         algorithm = self.policy.algorithm
         left = list(given)
-        obs: Any = [left.pop(0)[None] for _ in range(self.leaves)]
+        obs: Any = [left.pop(0)[None] for _ in self.inputs.sees.leaves]
         mask = left.pop(0)[None] if self.inputs.choices else None
         if mask is not None and isinstance(algorithm.codec, NumberedChoiceCodec):
             mask = mask[..., torch.from_numpy(algorithm.codec.number_of_choice)]
@@ -101,8 +88,8 @@ class _Worth(nn.Module):
         return values[0]
 
 
-def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
-    """Return the graph of a trained agent.
+def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Network:
+    """Return a trained agent as the graph of its network.
 
     Inputs ``obs…``, ``mask``, ``memory``, ``noise.…``; outputs ``action``, ``memory.after``.
 
@@ -114,10 +101,10 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
     """
     algorithm = policy.algorithm
     given = examples(policy.observation_space)
-    leaves = len(given)
+    sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
     choices = mask_width(policy.action_space)
     noise = _noise_of(algorithm) if sampled else ()
-    graph = Graph(b"", choices, algorithm.memory_size, noise)
+    graph = Network(b"", sees, acts, choices, algorithm.memory_size, noise)
     if choices:
         given["mask"] = torch.ones(1, choices, **BOOL)
     outputs = ["action"]
@@ -125,17 +112,16 @@ def agent_graph(policy: AgentPolicy, sampled: bool, where: str) -> Graph:
         given["memory"] = torch.zeros(1, graph.memory, **FLOAT)
         outputs.append("memory.after")
     given |= {f"noise.{i}": torch.full((1, n), 0.5, **FLOAT) for i, (_, n) in enumerate(noise)}
-    module = _Acting(policy, leaves, graph)
-    return replace(graph, content=traced(module, given, outputs, where))
+    return replace(graph, file=traced(_Acting(policy, graph), given, outputs, where))
 
 
-def worth_graph(critic: AgentPolicy, where: str) -> Graph:
-    """Return the graph of a skill critic: inputs ``obs…``, output ``worth``.
+def worth_graph(critic: AgentPolicy, where: str) -> bytes:
+    """Return the ONNX file of a skill critic: inputs ``obs…``, output ``worth``.
 
     ``worth`` is (1, S), or (1, S + 1) where the critic also has the value of a new decision.
     """
     given = examples(critic.observation_space)
-    return Graph(traced(_Worth(critic), given, ["worth"], where))
+    return traced(_Worth(critic), given, ["worth"], where)
 
 
 def in_env_units(algorithm: Algorithm, action: Tensor) -> Tensor:
@@ -184,7 +170,7 @@ def _in_env_units(codec: ActionCodec, action: Tensor, squash: bool) -> Tensor:
     return scaled.to(dtype).clamp(*ends).reshape(shape)
 
 
-def _noise_of(algorithm: Algorithm) -> tuple[tuple[str, int], ...]:
+def _noise_of(algorithm: Algorithm) -> tuple[Any, ...]:
     """Return the noise that an algorithm's ``act`` takes, for one observation."""
     noise = algorithm.noise([torch.Generator()], 1, 1)[0]
     if isinstance(noise, Tensor):
@@ -211,20 +197,17 @@ def traced(
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise MissingExtra("exporting to ONNX", "onnx") from error
-    names: Any = {"input_names": list(given), "output_names": list(outputs)}
+    how: Any = {"input_names": list(given), "output_names": list(outputs), "opset_version": OPSET}
+    example = tuple(given.values())
     try:
-        if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
-            return _traced_script(module, given, names)
         with _quiet(), torch.no_grad():
-            program = torch.onnx.export(
-                module,
-                tuple(given.values()),
-                None,
-                dynamo=True,
-                verbose=False,
-                opset_version=OPSET,
-                **names,
-            )
+            if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
+                # dynamo does not trace TorchScript.
+                file: Any = io.BytesIO()
+                script = torch.jit.trace(module, example, check_trace=False)
+                torch.onnx.export(script, example, file, dynamo=False, **how)
+                return bytes(file.getvalue())
+            program = torch.onnx.export(module, example, None, dynamo=True, verbose=False, **how)
     except Exception as error:  # torch's own errors have no common class
         raise PolicyError(f"{where} cannot be written as ONNX: {str(error)[:500]}") from error
     assert program is not None
@@ -232,17 +215,6 @@ def traced(
     model.ClearField("metadata_props")
     _strip(model.graph)
     content: bytes = model.SerializeToString(deterministic=True)
-    return content
-
-
-def _traced_script(module: nn.Module, given: dict[str, Tensor], names: dict[str, Any]) -> bytes:
-    """Return the ONNX file of a module with TorchScript in it, which ``dynamo`` does not trace."""
-    file: Any = io.BytesIO()
-    example = tuple(given.values())
-    with _quiet(), torch.no_grad():
-        script = torch.jit.trace(module, example, check_trace=False)
-        torch.onnx.export(script, example, file, dynamo=False, opset_version=OPSET, **names)
-    content: bytes = file.getvalue()
     return content
 
 

@@ -73,14 +73,13 @@ class Exported(Functional, Foreign):
     ) -> None:
         spaces = gym_space(deployed.sees), gym_space(deployed.acts)
         Foreign.__init__(self, str(folder), *spaces)
-        Functional.__init__(self, deployed.policy)
+        Functional.__init__(self, deployed.policy, *spaces)
         self._archive, self._code = archive, code
 
     @property
     def _goal_places(self) -> list[Take]:
         """The places of the goal among its inputs."""
-        inputs = self.in_place.inputs if isinstance(self.in_place, Mapped) else None
-        takes = [take for one in (inputs or {}).values() for take in one.takes]
+        takes = getattr(self.in_place, "takes", ())
         return [take for take in takes if take.source == "goal"]
 
     @property
@@ -142,12 +141,10 @@ class ExportedHierarchy(HierarchyPolicy):
     """A hierarchy of a folder: its skills are known by name, and act by its data alone."""
 
     def __init__(self, deployed: Deployed, sha256: str) -> None:
-        Functional.__init__(self, deployed.policy)
-        tree = within(deployed.policy)
-        self.observation_space = gym_space(deployed.sees)
-        self.action_space = gym_space(deployed.acts)
-        self.skills = _skill_set(tree, deployed)
-        self.labels = tuple(skill.name for skill in tree.skills)
+        spaces = gym_space(deployed.sees), gym_space(deployed.acts)
+        Functional.__init__(self, deployed.policy, *spaces)
+        self.skills = _skill_set(deployed)
+        self.labels = tuple(skill.name for skill in self.skills.skills)
         self.goals = None
         self._sha256 = sha256
 
@@ -156,12 +153,12 @@ class ExportedHierarchy(HierarchyPolicy):
         return {"sha256": self._sha256}
 
 
-def _skill_set(tree: Hierarchy, deployed: Deployed) -> SkillSet:
+def _skill_set(deployed: Deployed) -> SkillSet:
     """Return the skills of a hierarchy as reports know them."""
-    policies = tuple(_policy(skill, deployed) for skill in tree.skills)
+    tree = within(deployed.policy)
     return SkillSet(
         tuple(map(_recorded, tree.skills)),
-        policies,
+        tuple(_policy(skill, deployed) for skill in tree.skills),
         reflexes=_reflexes(deployed.policy),
         call_steps=Lengths(*tree.lengths) if tree.lengths else None,
         greedy=tree.greedy,
@@ -174,35 +171,24 @@ def _policy(skill: CalledSkill, deployed: Deployed) -> AnyPolicy:
     inside = Deployed(skill.policy, deployed.sees, deployed.acts)
     if isinstance(innermost(skill.policy), Hierarchy):
         return ExportedHierarchy(inside, "")
-    alone: Any = Functional(skill.policy, joins=skill.goals is not None)
-    alone.observation_space = gym_space(deployed.sees)
-    alone.action_space = gym_space(deployed.acts)
-    return alone  # type: ignore[no-any-return]
+    spaces = gym_space(deployed.sees), gym_space(deployed.acts)
+    return Functional(skill.policy, *spaces, joins=skill.goals is not None)
 
 
 def _recorded(called: CalledSkill) -> RecordedSkill:
     """Return a skill with the functions that judge its calls."""
     methods: dict[str, Any] = {
-        name: _method(function)
+        name: staticmethod(function)
         for name in ("initiation", "termination", "success")
         if (function := getattr(called, name)) is not None
     }
     if called.goals is not None:
         methods["goal_space"] = gym_space(called.goals.space)
         if called.goals.clip is not None:
-            methods["clip_goal"] = _method(called.goals.clip)
+            methods["clip_goal"] = staticmethod(called.goals.clip)
     skill: RecordedSkill = type("Exported", (RecordedSkill,), methods | {"name": called.name})()
     skill.max_steps, skill.call_steps = called.max_steps, called.limit
     return skill
-
-
-def _method(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function as the method of a skill."""
-
-    def method(self: Any, *about: Any) -> Any:
-        return function(*about)
-
-    return method
 
 
 def _reflexes(policy: Policy) -> tuple[Reflex, ...]:

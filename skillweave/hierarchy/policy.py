@@ -42,13 +42,12 @@ class HierarchyPolicy(Functional):
         guide: ActiveGuide | None = None,
         goals: Goals | None = None,
     ) -> None:
-        super().__init__(acting_policy(skills, selector, guide, goals), joins=goals is not None)
+        acting, joins = acting_policy(skills, selector, guide, goals), goals is not None
+        super().__init__(acting, selector.observation_space, skills.action_space, joins=joins)
         self.goals = goals
         self.selector = selector
         self.skills = skills
         self.guide = guide
-        self.observation_space = selector.observation_space
-        self.action_space = skills.action_space
         self.labels = tuple(s.name for s in skills.skills)
 
     def source(self) -> dict[str, Any]:
@@ -122,18 +121,15 @@ class SkillAlone(Functional):
 
     def __init__(self, skills: SkillSet, name: str, path: str = "") -> None:
         at = [s.name for s in skills.skills].index(name)
-        super().__init__(acting_alone(skills, at))
-        self.skill = skills.skills[at]
-        self.path = path or name
-        self.policy = skills.policies[at]
-        self.reflexes = skills.reflexes
+        self.skill, self.policy = skills.skills[at], skills.policies[at]
         self.goals = goals_of(self.skill)
-        self.observation_space = self.policy.observation_space
-        if self.goals is not None:
-            self.observation_space = without_goal(self.observation_space)
+        sees = self.policy.observation_space
+        sees = sees if self.goals is None else without_goal(sees)
         if (part := skills.part(at)) is not None:
-            self.observation_space = part.whole_observation_space
-        self.action_space = skills.action_space
+            sees = part.whole_observation_space
+        super().__init__(acting_alone(skills, at), sees, skills.action_space)
+        self.path = path or name
+        self.reflexes = skills.reflexes
         self.labels = self.policy.labels
         self.skills = getattr(self.policy, "skills", None)  # of a skill that is a hierarchy
         self._goal: Array | None = None  # (1, …), of all episodes; None: drawn for each
@@ -173,12 +169,12 @@ class SkillAlone(Functional):
             obs: (k, …).
             rngs: the source of chance of each episode.
         """
-        for i, rng in enumerate(rngs if self.goals is not None else ()):
-            memory[OWN_GOAL][rows[i]] = self._next_goal(obs[i : i + 1], rng)[0]
-
-    def _next_goal(self, obs: Array, rng: Any) -> Array:
-        """Return the goal of an episode that starts in ``obs`` (1, …), (1, …)."""
-        assert self.goals is not None
-        if self._goal is None:
-            return self.goals.draw(obs, rng)
-        return self.goals.fitted(obs, self._goal.copy(), self._gives)
+        if self.goals is None:
+            return
+        for row, here, rng in zip(rows, obs[:, None], rngs, strict=True):
+            goal = self._goal
+            if goal is None:
+                goal = self.goals.draw(here, rng)
+            else:
+                goal = self.goals.fitted(here, goal.copy(), self._gives)
+            memory[OWN_GOAL][row] = goal[0]

@@ -10,9 +10,9 @@ import numpy as np
 
 from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.compared import compared_places
+from skillweave.planning.compared import feature_maps
 from skillweave.planning.hand_over import START, before_each, calls_done, shown_rate, wilson
-from skillweave.planning.neighbours import Standard, feature_maps, nearest
+from skillweave.planning.neighbours import Standard, nearest
 from skillweave.types import Array
 
 LEAST = 20
@@ -153,8 +153,7 @@ def blame(
     )  # fmt: skip
     if after == START or len(rows) < LEAST:
         return unknown
-    places = compared_places(log)
-    maps = feature_maps(log.observation_space, features, places, log.start, log.skills)
+    maps = feature_maps(log, features, log.start)
     known = np.flatnonzero(counts & (~log.was_cut | won))
     starts, of_first = log.flat(log.start), log.skill[log.owner] == log.number(after)
     changes = (log.flat(log.before[of_first]) != log.flat(log.next_obs[of_first])).any(0)

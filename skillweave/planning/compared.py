@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from skillweave.errors import DeclarationError
+from skillweave.messages import close_matches, short
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import Standard, nearest
+from skillweave.planning.neighbours import FeatureMap, Standard, nearest
 from skillweave.spaces import obs_codec
 from skillweave.types import Array
 
@@ -69,6 +72,36 @@ def compared_places(log: CallColumns, task: RewardMachine | None = None) -> tupl
         else:
             places.append(seen if seen is None else whole)
     return tuple(places)
+
+
+def feature_maps(
+    log: CallColumns, features: Any, known: Array, task: RewardMachine | None = None
+) -> list[FeatureMap]:
+    """Return the features of each skill.
+
+    Args:
+        log: the calls.
+        features: for all skills, or by skill; None: the ``compared_places``.
+        known: logged observations.
+        task: see ``compared_places``.
+    """
+    places, names = compared_places(log, task), log.skills
+    by_skill = features if isinstance(features, Mapping) else dict.fromkeys(names, features)
+    for name in by_skill:
+        if name not in names:
+            raise DeclarationError(
+                f"features= names {short(name)}, which is no skill of the log; its skills are: "
+                f"{', '.join(names)}.{close_matches(str(name), names)}"
+            )
+    return [
+        FeatureMap(
+            log.observation_space,
+            seen if by_skill.get(name) is None else by_skill[name],
+            known,
+            f"skill {name!r}",
+        )
+        for name, seen in zip(names, places, strict=True)
+    ]
 
 
 def _help(

@@ -85,7 +85,7 @@ class Explorer(Policy):
             nothing, planning_states(nothing), readings, self._gamma, graph.terminated
         )
         self._far = self._radius_of(graph)
-        worth, _ = graph.solve(judged, graph.after, graph.may, novel=self._far)
+        worth = graph.solve(judged, graph.after, graph.may, novel=self._far)
         self._graph, self._worth = graph, worth[:, 0]
 
     def _radius_of(self, graph: CallGraph) -> Array:

@@ -21,10 +21,10 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
-from skillweave.planning.compared import compared_places
+from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import Standard, feature_maps, tie_order
+from skillweave.planning.neighbours import Standard, tie_order
 from skillweave.planning.states import exact_states
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import Levels, Near, OptionGroup, Options, Readings
@@ -122,21 +122,10 @@ class CallGraph:
             log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
         self.log, self.neighbours, self.skills = log, neighbours, skills
         self.pieces = pieces = _pieces(log, skills)
-        known = np.concatenate([log.start, log.end])
-        space = log.observation_space
-        places = compared_places(log, task)
-        self.maps = feature_maps(space, features, places, known, log.skills)
-        goals, starts = (
-            [_standard_goals(log, name) for name in log.skills],
-            log.before[pieces.first],
-        )
-        each = max(1, len(log.lengths))
-        groups = [
-            group
-            for choice in range(log.choices)
-            for group in self._groups_of(choice, choice // each, starts, goals[choice // each])
-        ]
-        self.options = Options(tuple(groups), tuple(goals), neighbours, log.lengths)
+        self.maps = feature_maps(log, features, np.concatenate([log.start, log.end]), task)
+        aims = [_standard_goals(log, name) for name in log.skills]
+        groups = tuple(self._groups(log.before[pieces.first], aims))
+        self.options = Options(groups, tuple(aims), neighbours, log.lengths)
         self.choice_of = self.options.choice_of
         """(O,) int64, the choice of each option."""
         self.known = np.bincount(pieces.choice, minlength=log.choices)[self.choice_of] > 0
@@ -180,37 +169,36 @@ class CallGraph:
             end[rows] = end[self.pieces.then[rows]]
         return end
 
-    def _groups_of(
-        self, choice: int, skill: int, starts: Array, aims: Array | None
-    ) -> Iterator[OptionGroup]:
-        """Yield the options of a choice, by groups that share their calls.
+    def _groups(self, starts: Array, aims: list[Array | None]) -> Iterator[OptionGroup]:
+        """Yield the options of all choices, by groups that share their calls.
 
         Args:
-            skill: of the choice.
             starts: (P, *obs_shape), the observations in which pieces start.
-            aims: the standardised goals of all calls; None: the skill has no goals.
+            aims: of each skill, the standardised goals of all calls; None: it has none.
         """
-        rows = np.flatnonzero(self.pieces.choice == choice)
-        call = self.pieces.call[rows]
-        features = self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
-        which, one, count = np.zeros(len(rows), np.int64), np.array([-1]), 1
-        if aims is not None and len(rows):
-            _, one, which = np.unique(aims[call], axis=0, return_index=True, return_inverse=True)
-            one, which = call[one], which.reshape(-1)
-            if len(one) > MOST_APART or 2 * len(one) > len(np.unique(call)):
-                one, which, count = np.array([-1]), np.zeros_like(which), CANDIDATES
-        for i, goal in enumerate(one):
-            own = np.flatnonzero(which == i)
-            mine = own[tie_order(len(own))]
-            goals = np.full(len(mine), goal) if count == 1 else call[mine]
-            group = OptionGroup(
-                choice, count, rows[mine], features[mine], call[mine], goals, float("inf")
-            )
-            if len(own):
-                some = own[np.linspace(0, len(own) - 1, min(len(own), SAMPLED)).astype(np.int64)]
-                far = group.near(features[some], self.neighbours, aims, call[some])[1]
-                group.usual = float(np.median(far[:, :, -1]))
-            yield group
+        for choice in range(self.log.choices):
+            skill = choice // max(1, len(self.log.lengths))
+            own, rows = aims[skill], np.flatnonzero(self.pieces.choice == choice)
+            call = self.pieces.call[rows]
+            features = self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
+            which, one, count = np.zeros(len(rows), np.int64), np.array([-1]), 1
+            if own is not None and len(rows):
+                _, one, which = np.unique(own[call], axis=0, return_index=True, return_inverse=True)
+                one, which = call[one], which.reshape(-1)
+                if len(one) > MOST_APART or 2 * len(one) > len(np.unique(call)):
+                    one, which, count = np.array([-1]), np.zeros_like(which), CANDIDATES
+            for i, goal in enumerate(one):
+                alike = np.flatnonzero(which == i)
+                mine = alike[tie_order(len(alike))]
+                goals = np.full(len(mine), goal) if count == 1 else call[mine]
+                group = OptionGroup(
+                    choice, count, rows[mine], features[mine], call[mine], goals, float("inf")
+                )
+                if n := len(alike):
+                    some = alike[np.linspace(0, n - 1, min(n, SAMPLED)).astype(np.int64)]
+                    far = group.near(features[some], self.neighbours, own, call[some])[1]
+                    group.usual = float(np.median(far[:, :, -1]))
+                yield group
 
     @cached_property
     def after(self) -> Near:
@@ -284,9 +272,8 @@ class CallGraph:
         *,
         caution: float = 0.0,
         novel: Array | None = None,
-        bonus: float = 1.0,
-    ) -> tuple[Array, int]:
-        """Return the worth of each piece from each planning state, (P, M), and the sweeps.
+    ) -> Array:
+        """Return the worth of each piece from each planning state, (P, M).
 
         A piece is worth what it pays and what follows: the next piece of its call, or at the call's
         end the best choice, by the weighted mean of its nearest pieces' worth.
@@ -296,9 +283,8 @@ class CallGraph:
             near: the nearest pieces to the ends.
             may: (E, choices) bool, what may follow.
             caution: see ``Options.trust``.
-            novel: (O,), the distance from which on each option is new, and worth ``bonus``; None:
-                none is.
-            bonus: its value.
+            novel: (O,), the distance from which on each option is new, and worth 1; None: none
+                is.
         """
         count = judged.reward.shape[1]
         value = np.zeros((len(self.end), count), np.float32)
@@ -307,7 +293,7 @@ class CallGraph:
         allowed = may[:, self.choice_of]
         if novel is None:
             allowed &= np.isfinite(near.distance)
-        for sweeps in range(1, MOST_SWEEPS + 1):  # noqa: B007
+        for _ in range(MOST_SWEEPS):
             worth = self._worth(judged, value)
             best = np.full_like(value, -np.inf)
             for c in options:
@@ -316,14 +302,14 @@ class CallGraph:
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:
-                    q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(bonus), q)
+                    q = np.where((near.distance[:, c] > novel[c])[:, None], np.float32(1.0), q)
                 np.maximum(best, q, out=best, where=allowed[:, c, None])
             best[~np.isfinite(best)] = 0.0  # no choice may follow, or none that is known
             change, largest = np.abs(best - value).max(initial=0.0), np.abs(best).max(initial=0.0)
             value = best
             if change <= TOLERANCE * largest:
                 break
-        return self._worth(judged, value), sweeps
+        return self._worth(judged, value)
 
     def _worth(self, judged: Judged, value: Array) -> Array:
         """Return the worth of pieces, (P, M), where the ends of calls have a ``value`` (E, M)."""

@@ -13,10 +13,10 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
-from skillweave.planning.compared import compared_places
+from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import feature_maps, nearest
+from skillweave.planning.neighbours import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
@@ -256,8 +256,7 @@ def chain(
                 f"the log has no complete call of {name!r}{where}; record more calls, chosen at "
                 "random"
             )
-    known = np.concatenate([log.start, log.end])
-    maps = feature_maps(log.observation_space, features, compared_places(log), known, log.skills)
+    maps = feature_maps(log, features, np.concatenate([log.start, log.end]))
     # From the last skill back: the chance that the rest of the chain is done after each call.
     chance = won[rows[-1]].astype(np.float64)
     for i in reversed(range(len(skills) - 1)):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, error_text, short
+from skillweave.messages import error_text, short
 from skillweave.ops.moments import is_constant, scale_of
 from skillweave.ops.seen import Seen
 from skillweave.policies import plan
@@ -141,11 +141,13 @@ class FeatureMap:
             function = Wrapped(self._features, self.raw)
         elif isinstance(self._space, gym.spaces.Box) and not self._codec.images:
             places = np.array(self.places)[self._standard.places]
-            return replace(self._standard, places=places, function=None, look=self._notice_places)
+            return replace(
+                self._standard,
+                places=places,
+                function=None,
+                look=lambda numbers: self._notice(numbers[:, self.places].astype(np.float64)),
+            )
         return replace(self._standard, function=function, look=self._notice)
-
-    def _notice_places(self, numbers: Array) -> None:
-        self._notice(numbers[:, self.places].astype(np.float64))
 
     def _notice(self, raw: Array) -> None:
         self._check(raw)
@@ -189,39 +191,6 @@ class FeatureMap:
                 "each once, or a function of observations"
             )
         return [int(p) for p in whole]
-
-
-def feature_maps(
-    space: gym.Space[Any],
-    features: Any,
-    sees: Sequence[Sequence[int] | None],
-    known: Array,
-    skills: Sequence[str],
-) -> list[FeatureMap]:
-    """Return the features of each skill.
-
-    Args:
-        features: for all skills, or by skill; None: what each skill sees.
-        sees: the places by which each skill's calls are compared; None: all.
-        known: logged observations.
-        skills: names.
-    """
-    by_skill = features if isinstance(features, Mapping) else dict.fromkeys(skills, features)
-    for name in by_skill:
-        if name not in skills:
-            raise DeclarationError(
-                f"features= names {short(name)}, which is no skill of the log; its skills are: "
-                f"{', '.join(skills)}.{close_matches(str(name), skills)}"
-            )
-    return [
-        FeatureMap(
-            space,
-            places if by_skill.get(name) is None else by_skill[name],
-            known,
-            f"skill {name!r}",
-        )
-        for name, places in zip(skills, sees, strict=True)
-    ]
 
 
 @lru_cache(64)

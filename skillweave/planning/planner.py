@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -34,16 +33,6 @@ from skillweave.types import Array
 
 MOST_GOALS = 256
 """Goals whose plans are kept."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A solved task."""
-
-    worth: Array
-    """(P, M) float32, of each piece of a logged call from each planning state."""
-    sweeps: int
-    """Sweeps of value iteration."""
 
 
 @checked_names
@@ -139,7 +128,7 @@ class Planner(ReadySelector):
             self.task if isinstance(self.task, RewardMachine) else None,
         )
         self.gamma, self.caution, self.temperature = gamma, caution, temperature
-        self._plans: OrderedDict[bytes, Plan] = OrderedDict()
+        self._plans: OrderedDict[bytes, Array] = OrderedDict()
         self.over = _over(self.task, self.graph)
         """(E,) bool, the ends of calls after which nothing follows."""
         self.machine = self.task.at(None) if isinstance(self.task, GoalTask) else self.task
@@ -153,8 +142,9 @@ class Planner(ReadySelector):
                 f"these skills have a memory: {names}. The planner compares their calls by "
                 "observations alone"
             )
-        self.plan = Plan(np.zeros((0, 0), np.float32), 0)
-        """The plan; empty where each observation has a goal of its own."""
+        self.plan: Array = np.zeros((0, 0), np.float32)
+        """(P, M) float32, the worth of each piece of a logged call from each planning state; empty
+        where each observation has a goal of its own."""
         self.obstacle = ""
         """Why no order of logged steps does the task; empty: one does, or it has no end."""
         if isinstance(self.task, RewardMachine):
@@ -164,9 +154,9 @@ class Planner(ReadySelector):
             self.plan = self._plan_of(self.task.goal)
 
     @cached_property
-    def in_place(self) -> Planned:
+    def in_place(self) -> Planned:  # type: ignore[override]
         """The plan as data, which acts in many environments at once."""
-        graph, states, worth = self.graph, self.states, self.plan.worth
+        graph, states, worth = self.graph, self.states, self.plan
         kind: type[Planned] = Planned
         if isinstance(self.task, GoalTask) and self.task.columns is not None:
             kind, worth = _OfObserved, np.zeros((len(graph.pieces.call), states.count), np.float32)
@@ -188,8 +178,8 @@ class Planner(ReadySelector):
 
     # Planning
 
-    def _solve(self, task: RewardMachine, place: Array | None = None) -> Plan:
-        """Plan a task; ``place`` is its goal, if it is one."""
+    def _solve(self, task: RewardMachine, place: Array | None = None) -> Array:
+        """Return the plan of a task; ``place`` is its goal, if it is one."""
         graph = self.graph
         readings = read_log(task, graph.log)
         check_possible(task, readings, graph.log)
@@ -197,9 +187,9 @@ class Planner(ReadySelector):
         if place is not None and isinstance(self.task, GoalTask):
             near, may = graph.for_goal(self.task, place)
         judged = graph.judge(task, self.states, readings, self.gamma, self.over)
-        return Plan(*graph.solve(judged, near, may, caution=self.caution))
+        return graph.solve(judged, near, may, caution=self.caution)
 
-    def _plan_of(self, goal: Array) -> Plan:
+    def _plan_of(self, goal: Array) -> Array:
         """Return the plan of a goal (G,), solved when it is first needed."""
         assert isinstance(self.task, GoalTask)
         key = np.asarray(goal, np.float64).tobytes()
@@ -350,7 +340,7 @@ class _OfObserved(Planned):
         assert isinstance(task, GoalTask)
         unique, which = np.unique(task.of(obs), axis=0, return_inverse=True)
         for i, goal in enumerate(unique):
-            yield np.flatnonzero(which.reshape(-1) == i), self.planner._plan_of(goal).worth
+            yield np.flatnonzero(which.reshape(-1) == i), self.planner._plan_of(goal)
 
 
 def _shown_sizes(sizes: Mapping[str, int]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -27,13 +26,6 @@ class Deployed:
     policy: Policy
     sees: Space
     acts: Space
-
-    @cached_property
-    def observed_mask(self) -> bool:
-        """Observations have a part that is the mask of actions."""
-        part = (self.sees.parts or {}).get(MASK) if self.sees.kind == "Dict" else None
-        size = sum(self.acts.counts)
-        return part is not None and size > 0 and int(np.prod(part.shape)) == size
 
 
 class Actor:
@@ -59,7 +51,11 @@ class Actor:
         self._deployed = deployed
         self._deterministic = deterministic
         self._nan = nan
-        self._real = [p for p, leaf in deployed.sees.leaves.items() if leaf.record.kind == "f"]
+        leaves, size = deployed.sees.leaves, sum(deployed.acts.counts)
+        self._real = [path for path, leaf in leaves.items() if leaf.record.kind == "f"]
+        part = leaves.get((MASK,)) if deployed.sees.kind == "Dict" else None
+        self._observed_mask = part is not None and size > 0 and int(np.prod(part.shape)) == size
+        """Observations have a part that is the mask of actions."""
         self._world = World(np.random.default_rng(seed))
         self.reset()
 
@@ -104,7 +100,7 @@ class Actor:
             )
         if mask is None and choices:
             mask = given.get(MASK)
-        if mask is None and deployed.observed_mask:
+        if mask is None and self._observed_mask:
             mask = seen[MASK].reshape(-1)
         allowed = None if mask is None else self._allowed(mask)
         turn = Turn(self._world, allowed, greedy=self._deterministic)

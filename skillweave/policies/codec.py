@@ -105,7 +105,7 @@ class Written:
             name = value.name
             path = f"{path}/{name}" if path else name
         made: Any = type(value)
-        for one in written_fields(made):
+        for one, _ in written_fields(made).values():
             own = getattr(value, one.name)
             unset = one.default if one.default is not MISSING else None
             if own is unset or (isinstance(unset, bool | int | float | str) and own == unset):
@@ -157,9 +157,14 @@ def _below(path: str, name: str) -> str:
 
 
 @cache
-def written_fields(kind: Any) -> tuple[Field[Any], ...]:
-    """Return the fields of a type that are written."""
-    return tuple(one for one in fields(kind) if one.metadata.get("written", True))
+def written_fields(kind: Any) -> dict[str, tuple[Field[Any], Any]]:
+    """Return the fields of a type that are written, each with the kind of its values, by name."""
+    hints = get_type_hints(kind)
+    return {
+        one.name: (one, one.metadata.get("kind", hints[one.name]))
+        for one in fields(kind)
+        if one.metadata.get("written", True)
+    }
 
 
 # Reading ----------------------------------------------------------------------------------------
@@ -179,17 +184,16 @@ class Reader:
         Raises:
             PolicyError: it is not; the message names the place ``where``.
         """
+        options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+        forms = [_form(option, entry) for option in options]
+        fitting = [option for option, (fits, _) in zip(options, forms, strict=True) if fits]
+        if len(fitting) != 1:
+            raise _unfit(where, entry, " or ".join(wanted for _, wanted in forms))
+        kind = fitting[0]
         origin, inner = get_origin(kind), get_args(kind)
-        if origin in (Union, UnionType):
-            options = [option for option in inner if _may_be(option, entry)]
-            if len(options) != 1:
-                raise _unfit(where, entry, " or ".join(map(_described, inner)))
-            return self.read(options[0], entry, where)
-        if not _may_be(kind, entry):
-            raise _unfit(where, entry, _described(kind))
         if kind is float:
             return float(entry["float"]) if isinstance(entry, dict) else float(entry)
-        if kind in (int, bool, str, NoneType) or origin is Literal:
+        if kind is int or kind in PLAIN or origin is Literal:
             return entry
         if kind is bytes:
             return self._beside(self.files, entry["file"], where, "files")
@@ -209,17 +213,15 @@ class Reader:
 
     def _object(self, entry: dict[str, Any], where: str) -> Any:
         made: Any = kinds()[entry["type"]]
-        own = {one.name: one for one in written_fields(made)}
+        own, values = written_fields(made), dict[str, Any]()
         if wrong := [name for name in entry if name not in own and name != "type"]:
             near = get_close_matches(str(wrong[0]), own, 1)
             hint = f": is {near[0]!r} meant" if near else f"; it has {', '.join(own)}"
             raise PolicyError(f"{where}.{shown(wrong[0])} is unknown{hint}")
-        hints, values = hints_of(made), dict[str, Any]()
-        if "who" in hints and "who" not in own:
+        if "who" in made.__dataclass_fields__ and "who" not in own:
             values["who"] = where
-        for name, one in own.items():
+        for name, (one, kind) in own.items():
             if name in entry:
-                kind = one.metadata.get("kind", hints[name])
                 values[name] = self.read(kind, entry[name], f"{where}.{name}")
             elif one.default is MISSING and one.default_factory is MISSING:
                 raise PolicyError(f"{where} has no field {name!r}")
@@ -255,66 +257,38 @@ class Reader:
         return table[name]
 
 
-def _may_be(kind: Any, entry: Any) -> bool:
-    """Return whether an entry has the form of a kind."""
-    origin = get_origin(kind)
-    if kind is float:
-        infinite = isinstance(entry, dict) and entry.get("float") in ("inf", "-inf")
-        return infinite or type(entry) is float or (type(entry) is int and abs(entry) < 2**63)
-    if kind is int:
-        return type(entry) is int and abs(entry) < 2**63
-    if kind in (bool, str):
-        return type(entry) is kind
-    if kind is NoneType:
-        return entry is None
-    if origin is Literal:
-        return isinstance(entry, str | int) and entry in get_args(kind)
-    if origin is tuple:
-        return isinstance(entry, list)
-    if not isinstance(entry, dict):
-        return False
-    if kind is bytes:
-        return set(entry) == {"file"} and isinstance(entry["file"], str)
-    if kind == Array:
-        return isinstance(entry.get("stored"), str) or "array" in entry
-    if origin is Callable:
-        return set(entry) == {"code"} and isinstance(entry["code"], str)
-    if origin is dict:
-        return "type" not in entry
-    named = entry.get("type")
-    return isinstance(named, str) and issubclass(kinds().get(named, NoneType), kind)
-
-
-@cache
-def hints_of(kind: type[object]) -> dict[str, Any]:
-    """Return the annotations of a type."""
-    return get_type_hints(kind)
-
-
-def _described(kind: Any) -> str:
+def _form(kind: Any, entry: Any) -> tuple[bool, str]:
+    """Return whether an entry has the form of a kind, and what this form is, for messages."""
     origin, inner = get_origin(kind), get_args(kind)
-    plain = {
-        float: "a number",
-        int: "a whole number",
-        bool: "true or false",
-        str: "a text",
-        NoneType: "null",
-        bytes: '{"file": its name}',
-    }
-    if kind in plain:
-        return plain[kind]
-    if kind == Array:
-        return "an array"
-    if origin is Callable:
-        return '{"code": its name}'
+    given = entry if isinstance(entry, dict) else {}
+    whole = type(entry) is int and abs(entry) < 2**63
+    if kind is int:
+        return whole, "a whole number"
+    if kind is float:
+        infinite = given.get("float") in ("inf", "-inf")
+        return whole or type(entry) is float or infinite, "a number"
+    if kind in PLAIN:
+        return type(entry) is kind, PLAIN[kind]
     if origin is Literal:
-        return f"one of {', '.join(map(repr, inner))}"
+        known = isinstance(entry, str | int) and entry in inner
+        return known, f"one of {', '.join(map(repr, inner))}"
     if origin is tuple:
-        return "a list"
+        return isinstance(entry, list), "a list"
+    if kind == Array:
+        return isinstance(given.get("stored"), str) or "array" in given, "an array"
+    if kind is bytes or origin is Callable:
+        name = "file" if kind is bytes else "code"
+        named = set(given) == {name} and isinstance(given[name], str)
+        return named, f'{{"{name}": its name}}'
     if origin is dict:
-        return "an object"
+        return isinstance(entry, dict) and "type" not in entry, "an object"
     options = [name for name, one in kinds().items() if issubclass(one, kind)]
-    return f'an object whose field "type" is one of {", ".join(options)}'
+    wanted = f'an object whose field "type" is one of {", ".join(options)}'
+    return given.get("type") in options, wanted
+
+
+PLAIN = {bool: "true or false", str: "a text", NoneType: "null"}
+"""Kinds whose values are in JSON what they are in Python, described for messages."""
 
 
 def _unfit(where: str, entry: Any, wanted: str) -> PolicyError:

@@ -18,18 +18,26 @@ class Functional:
 
     Args:
         in_place: the same policy.
+        sees: its ``observation_space``.
+        acts: its ``action_space``.
         joins: it observes its goal beside the observation.
     """
 
     labels: tuple[str, ...] = ()
+    joins = False
 
-    def __init__(self, in_place: Policy, *, joins: bool = False) -> None:
-        self.in_place = in_place
-        self.joins = joins
+    def __init__(self, in_place: Policy, sees: Any, acts: Any, *, joins: bool = False) -> None:
+        self.in_place, self.joins = in_place, joins
+        self.observation_space, self.action_space = sees, acts
 
     @cached_property
     def _like(self) -> Memory:
         return self.in_place.start(1)
+
+    def _copied(self, memory: Memory) -> tuple[Memory, Memory]:
+        """Return a copy of a memory, and its arrays as ``in_place`` has them."""
+        memory = {k: v.copy() for k, v in memory.items()}
+        return memory, nested(self._like, memory)
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments whose episodes start."""
@@ -53,16 +61,16 @@ class Functional:
         ``deterministic`` sets how the selector acts, ``SkillSet.greedy`` how the skills act. A
         selector that is to sample (not ``SkillSet.greedy_selector``) samples in any case.
         """
-        memory = {k: v.copy() for k, v in memory.items()}
+        memory, own = self._copied(memory)
         if self.joins:
             obs, goal = obs[OBSERVATION], obs[GOAL]
         turn, rows = Turn(World(rng), mask, goal, deterministic), np.arange(len(obs))
-        return self.in_place.act(nested(self._like, memory), rows, obs, turn), memory
+        return self.in_place.act(own, rows, obs, turn), memory
 
     def observe(self, memory: Memory, step: Step) -> Memory:
         """Return the ``memory`` after a ``step``; calls that are over end in it."""
-        memory = {k: v.copy() for k, v in memory.items()}
-        self.in_place.observe(nested(self._like, memory), np.arange(len(step.reward)), step)
+        memory, own = self._copied(memory)
+        self.in_place.observe(own, np.arange(len(step.reward)), step)
         return memory
 
     def acting(self, memory: Memory) -> Array | None:

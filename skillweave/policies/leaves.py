@@ -21,17 +21,34 @@ class Selector(Policy):
     watches = True
     ends_matter = True
     """``watch`` has something to notice."""
+    count: int
+    """The number of its choices: skills, perhaps each with some lengths."""
 
     def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
         """Return how likely each of the choices that ``may`` be made is, (k, choices) float32.
 
         Where it chooses no lengths, all lengths of a skill are equally likely.
         """
+        lengths = may.shape[1] // self.count
+        chances = self._chances(memory, rows, obs, may[:, ::lengths])
+        found: Array = chances.repeat(lengths, axis=1) / np.float32(lengths)
+        return found
+
+    def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
+        """Return how likely each of its own choices is, (k, count) float32."""
         raise NotImplementedError
 
     def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
         """Return which choices (k, choices) it leaves, as far as is known before it sees more."""
-        return may
+        allowed = self.allowed(memory, rows)
+        if allowed is None:
+            return may
+        left: Array = may & allowed.repeat(may.shape[1] // allowed.shape[1], axis=1)
+        return left
+
+    def allowed(self, memory: Memory, rows: Array) -> Array | None:
+        """Return the skills that it may choose next, (k, S) bool; None: it needs observations."""
+        return None
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Notice a step of environments ``rows`` (k,), and how the last calls ended."""
@@ -48,22 +65,21 @@ class Ready(Returns, Selector):
     ``ReadySelector`` has them.
     """
 
-    def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely its choices are, see ``Selector``."""
-        own = len(self.policy.skills) * max(1, len(self.policy.lengths))
-        lengths = may.shape[1] // own
-        chances, after = self.policy.chances(self._of(memory, rows), obs, may[:, ::lengths])
+    @property
+    def count(self) -> int:  # type: ignore[override]
+        """The number of its choices."""
+        return len(self.policy.skills) * max(1, len(self.policy.lengths))
+
+    def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
+        chances, after = self.policy.chances(self._of(memory, rows), obs, may)
         self._keep(memory, rows, after)
-        found: Array = chances.repeat(lengths, axis=1) / np.float32(lengths)
+        found: Array = chances
         return found
 
-    def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return which choices it leaves, see ``Selector``."""
-        allowed = self.policy.allowed(self._of(memory, rows))
-        if allowed is None:
-            return may
-        left: Array = may & allowed.repeat(may.shape[1] // allowed.shape[1], axis=1)
-        return left
+    def allowed(self, memory: Memory, rows: Array) -> Array | None:
+        """Return the skills that it may choose next, see ``Selector``."""
+        allowed: Array | None = self.policy.allowed(self._of(memory, rows))
+        return allowed
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Show it a step, and how the last calls ended."""
@@ -183,17 +199,12 @@ class Network(Policy):
                         f"{_words(given.get(name))}"
                     )
             rows, turn = np.zeros(1, np.int64), Turn(World(np.random.default_rng(0)))
-            action, size = self._run(self.start(1), rows, self.sees.start(1), turn), self._size
+            action = self._run(self.start(1), rows, self.sees.start(1), turn)
+            size = self.acts.shape if self.acts.parts is None else (self.acts.size,)
             if action.shape != (1, *size):
                 raise PolicyError(f"its file gives shape {action.shape}, not {(1, *size)}")
         except PolicyError as error:
             raise PolicyError(f"{where}: {error}") from error
-
-    @property
-    def _size(self) -> tuple[int, ...]:
-        if self.acts.parts is None:
-            return self.acts.shape
-        return (self.acts.size,)
 
     def start(self, n: int) -> Memory:
         """Return zeros (n, M), where the network is recurrent."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import prod
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -91,8 +92,7 @@ class Take:
             self._places = slice(first, end) if follow else np.array(self.places)
         if self.whole and (self.choices or self.places is not None):
             raise PolicyError("Take.whole is true, but Take.choices or Take.places are given")
-        for name in ("low", "high"):
-            check_size(getattr(self, name), (self.size,), f"Take.{name}")
+        _check_sizes(self, (self.size,), "low", "high")
         if self.source in ("goal", "last_action") and len(self.shape) != 1:
             raise PolicyError(f"Take.shape is {self.shape}, but a {self.source} is (numbers,)")
 
@@ -193,8 +193,7 @@ class Input:
         if not self.takes or size != prod(self.shape):
             raise PolicyError(f"Input.shape is {self.shape}, but Input.takes gives {size} numbers")
         for one in self.scalings:
-            for name in ("offset", "scale", "low", "high"):
-                check_size(getattr(one, name), self.shape, f"Linear.{name}")
+            _check_sizes(one, self.shape, "offset", "scale", "low", "high")
 
     def __call__(self, obs: Array, goal: Array | None = None, last: Array | None = None) -> Array:
         """Return the input (n, *shape) for observations (n, …); see ``Take``."""
@@ -227,10 +226,13 @@ def clipped(x: Array, low: Array | float | None, high: Array | float | None) -> 
     return x if high is None else np.minimum(x, high)
 
 
-def check_size(x: Array | None, shape: tuple[int, ...], name: str) -> None:
+def _check_sizes(one: Any, shape: tuple[int, ...], *names: str) -> None:
     """Raise a PolicyError where a field is not None, one number, or numbers of a shape."""
-    if x is not None and np.shape(x) not in ((), (1,), shape):
-        raise PolicyError(f"{name} has the shape {np.shape(x)}, but it is for {shape}")
+    for name in names:
+        x = getattr(one, name)
+        if x is not None and np.shape(x) not in ((), (1,), shape):
+            where = f"{type(one).__name__}.{name}"
+            raise PolicyError(f"{where} has the shape {np.shape(x)}, but it is for {shape}")
 
 
 def check_places(places: tuple[int, ...], size: int, name: str, *, once: bool = False) -> None:
@@ -295,8 +297,7 @@ class Outputs:
         if not box:
             self._chosen = discrete(self.count)
             return
-        for name in ("scale", "offset"):
-            check_size(getattr(self, name), (self.count,), f"Outputs.{name}")
+        _check_sizes(self, (self.count,), "scale", "offset")
         if self.clip is not None and not self.clip[0] <= self.clip[1]:
             raise PolicyError(f"Outputs.clip is {self.clip}: its second number is the highest")
         if self.rest is not None and np.shape(self.rest) != (size,):
@@ -606,10 +607,9 @@ class OnnxFile(Model):
     @property
     def expected(self) -> Shapes:
         """The shapes of its inputs, without those of its state."""
-        shapes = {name: self._given[name].shape[1:] for name in self.inputs}
         return {
-            name: tuple(n if isinstance(n, int) else None for n in shape)
-            for name, shape in shapes.items()
+            name: tuple(n if isinstance(n, int) else None for n in self._given[name].shape[1:])
+            for name in self.inputs
         }
 
     @property
@@ -679,31 +679,6 @@ def open_session(content: bytes, who: str) -> Any:
         raise PolicyError(f"{who} cannot be run by onnxruntime: {str(error)[:300]}") from error
 
 
-class _Zeros(Model):
-    """A model whose numbers do not count, to try out what shapes they have."""
-
-    def __init__(self, model: Model) -> None:
-        self._model = model
-
-    @property
-    def expected(self) -> Shapes:
-        """The shapes of its inputs."""
-        return self._model.expected
-
-    @property
-    def states(self) -> Sequence[tuple[tuple[int, ...], Any]]:
-        """The shapes of its recurrent state."""
-        return self._model.states
-
-    def call(
-        self, inputs: dict[str, Array], state: tuple[Array, ...], turn: Turn
-    ) -> tuple[Any, Sequence[Array]]:
-        """Return zeros where the model gives real numbers."""
-        output, after = self._model.call(inputs, state, turn)
-        output = np.asarray(output)
-        return np.zeros_like(output) if output.dtype.kind == "f" else output, after
-
-
 # The policy -------------------------------------------------------------------------------------
 
 
@@ -747,9 +722,10 @@ class Mapped(Policy):
             raise PolicyError(
                 f"{self.who}: chunk needs actions of one array, but they are of {str(space)[:300]}"
             )
-        self._takes = [take for one in (self.inputs or {}).values() for take in one.takes]
+        self.takes = [take for one in (self.inputs or {}).values() for take in one.takes]
+        """What its inputs are joined of."""
         goals, last = (
-            {take.shape for take in self._takes if take.source == source}
+            {take.shape for take in self.takes if take.source == source}
             for source in ("goal", "last_action")
         )
         self._goal_shape = next(iter(goals), None)
@@ -814,15 +790,26 @@ class Mapped(Policy):
         own = self.goal_space
         if own is not None and (goal is None or not own.is_like(goal)):
             raise PolicyError(f"{where}.goal_space is {own}, but goals are of {goal}")
-        functions = [take.function for take in self._takes]
-        if not any([*functions, callable(self.goal), isinstance(self.model, Function)]):
-            aim = None if goal is None else goal.start(1)
-            turn = Turn(World(np.random.default_rng(0)), None, aim)
-            try:  # it is data alone
-                tried = replace(self, model=_Zeros(self.model))
-                tried.act(self.start(1), np.zeros(1, np.int64), sees.start(1), turn)
-            except PolicyError as error:
-                raise PolicyError(f"{where}: {error}") from error
+        functions = [take.function for take in self.takes]
+        if any([*functions, callable(self.goal), isinstance(self.model, Function)]):
+            return
+
+        def zeros(*given: Any) -> tuple[Any, Sequence[Array]]:
+            """Return zeros for real numbers: what they are does not count, only their shape."""
+            output, after = self.model.call(*given)
+            output = np.asarray(output)
+            return np.zeros_like(output) if output.dtype.kind == "f" else output, after
+
+        model: Any = SimpleNamespace(
+            expected=self.model.expected, states=self.model.states, call=zeros
+        )
+        aim = None if goal is None else goal.start(1)
+        turn = Turn(World(np.random.default_rng(0)), None, aim)
+        try:
+            tried = replace(self, model=model)
+            tried.act(self.start(1), np.zeros(1, np.int64), sees.start(1), turn)
+        except PolicyError as error:
+            raise PolicyError(f"{where}: {error}") from error
 
     def start(self, n: int) -> Memory:
         """Return the memory of n environments in which it has not acted yet."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from .core import Array, Step, code
 from .errors import PolicyError
+from .mapped import fits_shape
 
 BLOCK = 4_000_000
 """Distances that are computed at once."""
@@ -48,11 +49,10 @@ def check(
         least: the lowest number that it may hold.
         below: all its numbers are below it.
     """
-    if isinstance(x, np.ndarray) and x.dtype.kind in kinds and x.ndim == len(shape):
-        fits = all(want in (None, size) for want, size in zip(shape, x.shape, strict=True))
-        # A NaN is neither at least the one, nor below the other.
-        if fits and (not x.size or (least <= x.min() and x.max() < below)):
-            return
+    fits = isinstance(x, np.ndarray) and x.dtype.kind in kinds and fits_shape(x.shape, shape)
+    # A NaN is neither at least the one, nor below the other.
+    if fits and (not x.size or (least <= x.min() and x.max() < below)):
+        return
     sizes = ", ".join("any" if size is None else str(size) for size in shape)
     raise PolicyError(
         f"{name} of a plan must be an array ({sizes}) of numbers from {least:g} to below {below:g},"

@@ -80,36 +80,31 @@ class Planned(Rule):
             check("numbers", self.numbers.get(name), "f", (len(aims), size))
         self._aimed = np.array([aims is not None for aims in options.aims])
         self._aim = max((aims.shape[1] for aims in options.aims if aims is not None), default=1)
-        self._calls = (LATEST, count, max(len(each.places) for each in self.features))
+        self._calls = (count, max(len(each.places) for each in self.features))
         super().__post_init__()
 
     @property
-    def count(self) -> int:
-        """The number of choices: skills, perhaps each with some lengths."""
+    def count(self) -> int:  # type: ignore[override]
+        """The number of its choices."""
         return self.options.choices
 
     def start(self, n: int) -> Memory:
         """Return the memory of ``n`` environments: the task's state, and no call so far."""
         state, calls, options = self.task.start(n), (n, LATEST), len(self.options.choice_of)
-        return {
-            "state": state[:, 0].copy(),
-            "counters": state[:, 1:].copy(),
-            "tried.count": np.zeros(n, np.int64),
-            "tried.choice": np.full(calls, -1),
-            "tried.steps": np.zeros(calls, np.int64),
-            "tried.start": np.zeros((n, *self._calls), np.float32),
-            "tried.end": np.zeros((n, *self._calls), np.float32),
-            "tried.reward": np.zeros(calls),
-            "tried.discount": np.ones(calls),
-            "tried.from": np.full(calls, -1),
-            "tried.to": np.full(calls, -1),
-            "tried.q": np.zeros((*calls, options), np.float32),
-            "tried.total": np.zeros((*calls, options), np.float32),
-            "tried.far": np.zeros((*calls, options), np.float32),
-            "tried.may": np.zeros((*calls, options), bool),
-            "tried.goal": np.zeros((*calls, self._aim), np.float32),
-            "tried.goals": np.zeros((*calls, options, self._aim), np.float32),
+        shapes = {
+            "start": self._calls,
+            "end": self._calls,
+            "q": (options,),
+            "total": (options,),
+            "far": (options,),
+            "goal": (self._aim,),
+            "goals": (options, self._aim),
         }
+        numbers = {"choice": -1, "steps": 0, "reward": 0.0, "discount": 1.0, "from": -1, "to": -1}
+        tried: Memory = {name: np.full(calls, number) for name, number in numbers.items()}
+        tried |= {k: np.zeros((*calls, *shape), np.float32) for k, shape in shapes.items()}
+        tried |= {"may": np.zeros((*calls, options), bool), "count": np.zeros(n, np.int64)}
+        return {"state": state[:, 0].copy(), "counters": state[:, 1:].copy(), "tried": tried}
 
     def check(self, sees: Space, acts: Space, goal: Space | None, where: str) -> None:
         """Check that it compares numbers which observations have, and makes these choices."""
@@ -132,6 +127,7 @@ class Planned(Rule):
     def act(self, memory: Memory, rows: Array, obs: Array, turn: Turn) -> Array:
         """Return choices (k,); where it has ``goals``, they have goals."""
         features, each = [own(obs) for own in self.features], np.arange(len(rows))
+        tried = memory["tried"]
         near, corners = self.options.near(features), self.levels.corners(_state(memory, rows))
         may = turn.mask
         may = np.ones((len(rows), self.count), bool) if may is None else may
@@ -144,9 +140,9 @@ class Planned(Rule):
             "may": may[:, self.options.choice_of],
             "goals": self._aims(near),
         }
-        ended = np.flatnonzero(memory["tried.count"][rows] > 0)
-        _put(memory, rows[ended], -1, {name: value[ended] for name, value in now.items()})
-        option = self.choose(self._corrected(memory, rows, now), may, turn.world.rng)
+        ended = np.flatnonzero(tried["count"][rows] > 0)
+        _put(tried, rows[ended], -1, {name: value[ended] for name, value in now.items()})
+        option = self.choose(self._corrected(tried, rows, now), may, turn.world.rng)
         choice, call = self.options.choice_of[option], near.goal[each, option]
         # A guide does not say which goal: that of the call is unknown, and it counts for none.
         unknown = np.where(call < 0, np.float32(0.0), np.float32(np.nan))[:, None]
@@ -160,8 +156,8 @@ class Planned(Rule):
             "from": now["to"],
             "to": -1,
         }
-        _put(memory, rows, 0, new)
-        memory["tried.count"][rows] += 1
+        _put(tried, rows, 0, new)
+        tried["count"][rows] += 1
         return self.record(choice, call, obs)
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
@@ -172,16 +168,17 @@ class Planned(Rule):
         """
         after, reward = self.task.advance(_state(memory, rows), self.task.read(own_step(step)))
         memory["state"][rows], memory["counters"][rows] = after[:, 0], after[:, 1:]
-        latest = rows, (memory["tried.count"][rows] - 1) % LATEST
-        discount = memory["tried.discount"][latest]
-        memory["tried.reward"][latest] += discount * reward
-        memory["tried.discount"][latest] = discount * self.gamma
-        memory["tried.steps"][latest] += 1
-        choice, steps = memory["tried.choice"][latest], memory["tried.steps"][latest]
+        tried = memory["tried"]
+        latest = rows, (tried["count"][rows] - 1) % LATEST
+        discount = tried["discount"][latest]
+        tried["reward"][latest] += discount * reward
+        tried["discount"][latest] = discount * self.gamma
+        tried["steps"][latest] += 1
+        choice, steps = tried["choice"][latest], tried["steps"][latest]
         other = self.options.skill_of[np.maximum(choice, 0)] != last.skill
-        memory["tried.choice"][latest] = self._called(choice, steps, other, last)
+        tried["choice"][latest] = self._called(choice, steps, other, last)
         lost = other & self._aimed[last.skill]
-        _put(memory, rows[lost], -1, {"goal": np.nan})
+        _put(tried, rows[lost], -1, {"goal": np.nan})
 
     def _called(self, choice: Array, steps: Array, other: Array, last: LastCall) -> Array:
         """Return the choices (k,) that the calls are of, after this number of their steps."""
@@ -246,7 +243,7 @@ class Planned(Rule):
 
     def _padded(self, features: list[Array]) -> Array:
         """Return the features of each skill, (n, F) each, as one array (n, S, F)."""
-        whole = np.zeros((len(features[0]), *self._calls[1:]), np.float32)
+        whole = np.zeros((len(features[0]), *self._calls), np.float32)
         for skill, some in enumerate(features):
             whole[:, skill, : some.shape[1]] = some
         return whole
@@ -263,7 +260,7 @@ class Planned(Rule):
 
     # The calls of the episode
 
-    def _corrected(self, memory: Memory, rows: Array, now: Mapping[str, Array]) -> Array:
+    def _corrected(self, tried: Memory, rows: Array, now: Mapping[str, Array]) -> Array:
         """Return values (k, O) for which the episode's own calls count as logged ones.
 
         Args:
@@ -271,14 +268,14 @@ class Planned(Rule):
         """
         corrected = now["q"].copy()
         names: tuple[str, ...] = ("choice", "start", "from", "goal")
-        calls = {name: memory[f"tried.{name}"][rows] for name in names}
+        calls = {name: tried[name][rows] for name in names}
         count = self._counts(calls, {name: value[:, None] for name, value in now.items()})[1]
         at = np.flatnonzero(count.any((1, 2, 3)))
         if not len(at):
             return corrected
         # Ends of calls, and last the present: there values are wanted.
         names = (*names, *now, "reward", "discount")
-        calls = {name: memory[f"tried.{name}"][rows[at]] for name in names}
+        calls = {name: tried[name][rows[at]] for name in names}
         ends = {k: np.concatenate([calls[k], v[at, None]], 1) for k, v in now.items()}
         far, counts = self._counts(calls, ends)
         weight = np.where(counts, TRUST / (far + SOFT), 0.0)
@@ -332,8 +329,8 @@ def _best(q: Array, may: Array) -> Array:
     return np.where(np.isfinite(best), best, 0.0)
 
 
-def _put(memory: Memory, rows: Array, call: int, values: Mapping[str, Any]) -> None:
+def _put(tried: Memory, rows: Array, call: int, values: Mapping[str, Any]) -> None:
     """Write values (k, …) of the latest calls (−1), or of the next ones (0), in place."""
-    slot = (memory["tried.count"][rows] + call) % LATEST
+    slot = (tried["count"][rows] + call) % LATEST
     for name, value in values.items():
-        memory[f"tried.{name}"][rows, slot] = value
+        tried[name][rows, slot] = value

@@ -64,8 +64,8 @@ class Rule(Selector):
         """By the place of a rule and a skill, see ``_goal``."""
 
     @property
-    def count(self) -> int:
-        """The number of choices: skills, perhaps each with some lengths."""
+    def count(self) -> int:  # type: ignore[override]
+        """The number of its choices."""
         return len(self.skills)
 
     def number(self, skill: Any, where: str = "", kind: type[SkillweaveError] = SkillError) -> int:
@@ -81,15 +81,7 @@ class Rule(Selector):
             )
         return self.skills.index(skill)
 
-    def chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely its choices are, see ``Selector``."""
-        lengths = may.shape[1] // self.count
-        chances = self._chances(memory, rows, obs, may[:, ::lengths])
-        found: Array = chances.repeat(lengths, axis=1) / np.float32(lengths)
-        return found
-
     def _chances(self, memory: Memory, rows: Array, obs: Array, may: Array) -> Array:
-        """Return how likely each of its own choices is, (k, count) float32."""
         choice = self.act(memory, rows, obs, Turn(World(), may))
         number = choice[SKILL] if self.goals else choice
         found: Array = np.eye(self.count, dtype=np.float32)[number]
@@ -381,11 +373,10 @@ class Automaton(Rule):
             )
         return may
 
-    def ahead(self, memory: Memory, rows: Array, may: Array) -> Array:
-        """Return which of the choices are of a skill of the state, see ``Selector``."""
-        own = self.ranks[memory["state"][rows]] > 0
-        left: Array = may & own.repeat(may.shape[1] // own.shape[1], axis=1)
-        return left
+    def allowed(self, memory: Memory, rows: Array) -> Array:
+        """Return the skills of the states, see ``Selector``."""
+        allowed: Array = self.ranks[memory["state"][rows]] > 0
+        return allowed
 
     def watch(self, memory: Memory, rows: Array, step: Step, last: LastCall) -> None:
         """Take the transitions whose events have happened in a step."""

@@ -24,7 +24,7 @@ from skillweave.selectors.base import (
     function_name,
     goal_as_json,
 )
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Step
 
 Event = Callable[[Step], Any] | str
 """The event of a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
@@ -113,7 +113,7 @@ class Automaton(ReadySelector):
                 yield f"state {short(state)}", name, self.goals.get((state, name))
 
     @cached_property
-    def in_place(self) -> selectors.Automaton:
+    def in_place(self) -> selectors.Automaton:  # type: ignore[override]
         """The rule that acts."""
         states = {state: self._in_order(names) for state, names in self.states.items()}
         transitions = tuple(
@@ -133,11 +133,6 @@ class Automaton(ReadySelector):
 
     def _in_order(self, names: tuple[str, ...] | frozenset[str]) -> tuple[str, ...]:
         return names if isinstance(names, tuple) else tuple(filter(names.__contains__, self.skills))
-
-    def allowed(self, memory: Memory) -> Array:
-        """Return the skills of each environment's state in ``memory``, (n, S) bool."""
-        allowed: Array = self.in_place.ranks[memory["state"]] > 0
-        return allowed
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its states and transitions, with only the names of functions."""

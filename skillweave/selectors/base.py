@@ -13,7 +13,8 @@ from gymnasium.spaces import Dict
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import shortened
-from skillweave.policies.core import LastCall, Turn, World, take
+from skillweave.policies.core import LastCall
+from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
 from skillweave.policies.selectors import Rule
 from skillweave.policies.selectors import function_name as function_name
@@ -26,7 +27,7 @@ from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Step
 
 
-class ReadySelector(Foreign):
+class ReadySelector(Functional, Foreign):
     """A selector that is not trained: a policy over skills that also observes the ends of calls.
 
     It is called only where a call is over. It respects the skills' initiation sets, which are its
@@ -42,12 +43,13 @@ class ReadySelector(Foreign):
     SkillError where a fixed goal does not fit its skill."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name)
+        Foreign.__init__(self, name)
         self.skills: tuple[str, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what copies have: each makes its own rule."""
-        return {name: value for name, value in vars(self).items() if name != "in_place"}
+        made = ("in_place", "_like")
+        return {name: value for name, value in vars(self).items() if name not in made}
 
     @property
     def ranges(self) -> dict[str, range]:
@@ -88,29 +90,6 @@ class ReadySelector(Foreign):
         goals = {name: space_of(space) for name, space in self.goal_spaces.items()}
         return self._who, self.skills, goals
 
-    def start(self, n: int) -> Memory:
-        """Return the memory of ``n`` environments in which it has not chosen yet."""
-        memory: Memory = self.in_place.start(n)
-        return memory
-
-    def act(
-        self,
-        memory: Memory,
-        obs: Array,
-        mask: Array | None = None,
-        *,
-        deterministic: bool = True,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Array, Memory]:
-        """Return choices (n,) for ``obs`` (n, …), among those that ``mask`` allows, and the memory.
-
-        They are skills; where skills have goals, skills and goals. ``deterministic`` and ``rng``
-        are as of any policy.
-        """
-        rows, turn = np.arange(len(obs)), Turn(World(rng), mask, None, deterministic)
-        memory = take(memory, rows)
-        return self.in_place.act(memory, rows, obs, turn), memory
-
     def chances(self, memory: Memory, obs: Array, mask: Array) -> tuple[Array, Memory]:
         """Return the probability of each choice where a call is over, (n, choices) float32.
 
@@ -122,13 +101,13 @@ class ReadySelector(Foreign):
         Returns:
             The probabilities, and the memory after the choice.
         """
-        rows = np.arange(len(obs))
-        memory = take(memory, rows)
-        return self.in_place.chances(memory, rows, obs, mask), memory
+        memory, own = self._copied(memory)
+        return self.in_place.chances(own, np.arange(len(obs)), obs, mask), memory
 
     def allowed(self, memory: Memory) -> Array | None:
         """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
-        return None
+        skills: Array | None = self.in_place.allowed(memory, slice(None))
+        return skills
 
     def watch(self, memory: Memory, step: Step, last: LastCall) -> Memory:
         """Return the memory after a step of n environments; called after every step.
@@ -138,9 +117,8 @@ class ReadySelector(Foreign):
             step: the environments' transition; ``elapsed`` counts as for any policy.
             last: the last calls; ``why`` is 0 (``CallEnd.RUNNING``) where the call continues.
         """
-        rows = np.arange(len(last.why))
-        memory = take(memory, rows)
-        self.in_place.watch(memory, rows, step, last)
+        memory, own = self._copied(memory)
+        self.in_place.watch(own, np.arange(len(last.why)), step, last)
         return memory
 
     def _goal(self, name: str, goal: Any, where: str) -> Any:

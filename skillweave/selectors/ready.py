@@ -57,7 +57,7 @@ class FunctionSelector(ReadySelector):
         self.function = function
 
     @cached_property
-    def in_place(self) -> Asked:
+    def in_place(self) -> Asked:  # type: ignore[override]
         """The rule that acts."""
         asks_last = required_arguments(self.function) > 1
         return Asked(*self._rule_of, Wrapped(self.function, self._ask), asks_last)

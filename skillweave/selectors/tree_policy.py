@@ -48,7 +48,7 @@ class TreeSelector(ReadySelector):
                 yield "a leaf", *skill_and_goal(node)
 
     @cached_property
-    def in_place(self) -> selectors.Tree:
+    def in_place(self) -> selectors.Tree:  # type: ignore[override]
         """The rule that acts."""
         return selectors.Tree(*self._rule_of, self._node(self.root))
 

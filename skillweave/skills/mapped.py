@@ -35,8 +35,6 @@ class MappedPolicy(Functional, Foreign, Model):
 
     logits = True
     """Outputs that are no whole numbers are logits of choices."""
-    joins = False
-    """It is the policy of a skill with goals, and takes them by itself."""
     acting = Memoryless.acting
 
     def __init__(

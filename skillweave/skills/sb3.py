@@ -67,7 +67,7 @@ class SB3Policy(TorchPolicy):
                 bound.observation_space = theirs
         return bound
 
-    def _copied(self) -> Any:
+    def _own_module(self) -> Any:
         """Return a copy of the model's policy.
 
         After training its latest distribution is part of a graph, which cannot be copied; acting
@@ -81,7 +81,7 @@ class SB3Policy(TorchPolicy):
         with torch.random.fork_rng(devices=[]):
             _reset_noise(policy, 1)
         policy.predict(unpack(space, made_up(space, 1)), deterministic=True)
-        return super()._copied()
+        return super()._own_module()
 
     @property
     def expected(self) -> Shapes:

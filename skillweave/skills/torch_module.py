@@ -72,10 +72,10 @@ class TorchPolicy(MappedPolicy):
         """Return a copy in evaluation mode, independent of later changes of the module."""
         bound = super().bind(observation_space, action_space, who)
         if not self.data:  # a file's is its own, and one of torch.export has a fixed mode
-            bound.module = self._copied()
+            bound.module = self._own_module()
         return bound
 
-    def _copied(self) -> nn.Module:
+    def _own_module(self) -> nn.Module:
         module: nn.Module = copy.deepcopy(self.module).eval()
         return module
 
@@ -149,7 +149,7 @@ class TorchPolicy(MappedPolicy):
         import safetensors.torch
         import torch
 
-        policy, module = copy.copy(self), self._copied()
+        policy, module = copy.copy(self), self._own_module()
         try:
             with torch.device("cpu"):  # the user may have changed the default device
                 weights = safetensors.torch.load(content)

@@ -48,11 +48,12 @@ import skillweave as sw
 from skillweave.api.player import Player
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.collector import Collector
-from skillweave.export.graphs import Graph, examples, mask_width
+from skillweave.export.graphs import examples, mask_width
 from skillweave.export.runner import Runner
 from skillweave.export.write import Export, write_export
 from skillweave.policies.core import CallEnd
 from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.leaves import Network as FileNetwork
 from skillweave.policies.spaces import space_of
 from skillweave.spaces import ChoiceSpace, pack
 from skillweave.types import Array
@@ -139,13 +140,14 @@ class Session:
         self.net, self.sampled = self.known[int(content)]
 
     @classmethod
-    def graph(cls, net: Any, sampled: Any, where: str = "") -> Graph:
+    def graph(cls, net: Any, sampled: Any, where: str = "") -> Any:
         cls.known.append((net, sampled is True))
         content = b"%d" % (len(cls.known) - 1)
         if isinstance(net, Worths):
-            return Graph(content)
+            return content
         noise = (("gumbel", 1),) if sampled else ()
-        return Graph(content, mask_width(net.action_space), net.size, noise)
+        spaces = map(space_of, (net.observation_space, net.action_space))
+        return FileNetwork(content, *spaces, mask_width(net.action_space), net.size, noise)
 
     def get_inputs(self) -> list[Any]:
         kinds = {"f": "float", "i": "int64"}

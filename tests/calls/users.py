@@ -25,7 +25,6 @@ from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_set import acting_policy
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.export import compile
-from skillweave.export.graphs import Graph
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.options import OptionsEnv
@@ -33,6 +32,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies import leaves
 from skillweave.policies.core import Memory, Policy, Turn, World, flat, restart, take
 from skillweave.policies.hierarchy import ActiveGuide
+from skillweave.policies.spaces import space_of
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.training.play import SeededEpisodes, play
@@ -482,11 +482,13 @@ class Session:
         return [action, *after.values()]
 
     @classmethod
-    def graph(cls, policy: Any, sampled: Any, where: str = "") -> Graph:
+    def graph(cls, policy: Any, sampled: Any, where: str = "") -> Any:
         cls.known.append((policy, sampled is True))
+        file = b"%d" % (len(cls.known) - 1)
         if isinstance(policy, Worth):
-            return Graph(b"%d" % (len(cls.known) - 1))
-        return Graph(b"%d" % (len(cls.known) - 1), int(policy.action_space.n), policy.size)
+            return file
+        sees, acts = space_of(policy.observation_space), space_of(policy.action_space)
+        return leaves.Network(file, sees, acts, int(policy.action_space.n), policy.size)
 
 
 @contextmanager

@@ -165,7 +165,7 @@ def test_a_sampling_agent_takes_its_noise_as_an_input(name: str) -> None:
     config, obs_space, action_space = CASES[name]
     policy = agent(config, obs_space, action_space)
     graph = agent_graph(policy, True, "it")
-    session = onnxruntime.InferenceSession(graph.content)
+    session = onnxruntime.InferenceSession(graph.file)
     algorithm, rng = policy.algorithm, np.random.default_rng(1)
     drawn = {"gumbel": rng.gumbel, "standard_normal": rng.standard_normal, "random": rng.random}
     actions = []

@@ -89,7 +89,7 @@ def test_calls_count_for_one_another_by_start_and_goal() -> None:
     assert planner.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0, abs=1e-3)
     option = planner.graph.near(np.zeros((1, 1), np.float32))
     aims = goals[option.goal[0]]
-    worth = (planner.plan.worth[option.pieces[0], 0] * option.weights[0]).sum(1)
+    worth = (planner.plan[option.pieces[0], 0] * option.weights[0]).sum(1)
     assert (worth[aims > 0.6] > 0.99).all()
     assert (worth[aims < 0.4] < 0.01).all()
     assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbour differs

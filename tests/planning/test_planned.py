@@ -13,7 +13,7 @@ from planning.steps import step_to
 
 from skillweave.errors import PolicyError, SkillError
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, Predicate, RewardMachine, held
-from skillweave.policies.core import LastCall, Turn, World
+from skillweave.policies.core import LastCall, Turn, World, flat
 from skillweave.policies.planned import Planned
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.spaces import obs_dtype
@@ -107,7 +107,7 @@ def course(plans: Planned, log: CallLog, rows_of: Any, n: int = 5) -> list[Any]:
             last = LastCall(other[rows], why[rows], np.zeros(len(rows), bool))
             plans.watch(memory, rows, step_to(after[rows], obs[rows]), last)
         obs = after
-    return [found, {name: value.tolist() for name, value in memory.items()}]
+    return [found, {name: value.tolist() for name, value in flat(memory).items()}]
 
 
 def together(rows: Any) -> list[Any]:
@@ -126,12 +126,12 @@ def test_rows_are_as_one_environment_each(name: str) -> None:
 def test_rows_that_are_not_asked_do_not_change() -> None:
     planner = PLANS["mission"]()
     memory = planner.in_place.start(4)
-    before = {name: value.copy() for name, value in memory.items()}
+    before = {name: value.copy() for name, value in flat(memory).items()}
     rows = np.array([2, 0])
     planner.in_place.act(memory, rows, planner.log.start[:2], Turn(World()))
-    for name, value in memory.items():
+    for name, value in flat(memory).items():
         np.testing.assert_array_equal(value[[1, 3]], before[name][[1, 3]])
-    assert memory["tried.count"].tolist() == [1, 0, 1, 0]
+    assert memory["tried"]["count"].tolist() == [1, 0, 1, 0]
 
 
 def bare(plans: Planned) -> Planned:
