@@ -292,25 +292,24 @@ class Collector:
 
     def _step(self, out: TraceWriter) -> None:
         """Step every environment, and write what happened."""
-        obs, mask, search, rows = self.obs, self.engine.mask(), self.search, self._all
-        if search is not None:
-            rows = search.playing(obs, self._world)
+        obs, mask, rows, waiting = self.obs, self.engine.mask(), self._all, self._all[:0]
+        if self.search is not None:
+            rows, waiting = self.search.playing(obs, self._world)
         if self.overridden is not None:
             self.overridden[:] = False
         goal = self._goal(rows)
         turn = Turn(self._world, mask, goal, self._greedy)
-        if len(rows) == self.num_envs:
-            waiting, action = rows[:0], self.policy.act(self.memory, rows, obs, turn)
-        else:
-            waiting = np.setdiff1d(self._all, rows)
-            action = self._found(rows, waiting, turn)
+        if len(waiting):
+            action = self._searched(rows, waiting, turn)
             out.write(waiting, valid=np.zeros(len(waiting), bool))
+        else:
+            action = self.policy.act(self.memory, rows, obs, turn)
         whole = self.learning.whole or self.log_calls is not None
         if whole:  # else only where a selector decides and calls end
             out.write(obs=obs, env_action=action, mask=mask, goal=goal, overridden=self.overridden)
         raw = self.engine.step(action)
         self.kept["age"] += 1
-        if search is not None:
+        if self.search is not None:
             self.elapsed[rows] += 1
         if self._last_actions is not None:
             self.kept["last_action"][:] = action
@@ -331,21 +330,15 @@ class Collector:
             out.write(over, next_obs=raw.next_obs[over])
         self.obs = raw.next_obs
         if len(over := np.flatnonzero(end)):
-            success = None if self.skill is not None else reported_success(raw.info, self.num_envs)
-            success = None if success is None else success[over]
-            self._tell(out.row, over, raw.info, success, task=self.skill is not None)
-        if search is not None and (len(over) or len(waiting)):
+            self._tell(out.row, over, raw.info)
+        if self.search is not None and (len(over) or len(waiting)):
             assert step is not None
-            if len(again := search.again(over[end[over] == LIMIT])):
-                self._begin_call(again, episodes=False)
-            lost = waiting[(raw.terminated | raw.truncated)[waiting]]
-            given_up = search.observe(np.setdiff1d(waiting, lost), step) if len(waiting) else lost
-            over = np.union1d(np.setdiff1d(over, again), np.union1d(lost, given_up))
+            over = self._begun(end, over, waiting, step)
         self._begin_anew(over)
         out.next(raw.info)
 
-    def _found(self, rows: Array, waiting: Array, turn: Turn) -> Array:
-        """Return actions (N, …): of the skill in ``rows``, else of the search for its start."""
+    def _searched(self, rows: Array, waiting: Array, turn: Turn) -> Array:
+        """Return actions (N, …): of the skill in ``rows``, and of the search in ``waiting``."""
         assert self.search is not None
         own = None
         if len(rows):
@@ -356,6 +349,26 @@ class Collector:
         if own is not None:
             action[rows] = own
         return action
+
+    def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
+        """Let calls begin anew in episodes that go on, and the search go on where it has to.
+
+        Args:
+            end: (N,), why calls ended.
+            over: environments (k,) in which they did.
+            waiting: environments (k,) in which a start was searched for.
+            step: of all environments.
+
+        Returns:
+            The environments (k,) in which a new episode is to begin.
+        """
+        assert self.search is not None
+        if len(again := self.search.again(over[end[over] == LIMIT])):
+            self._begin_call(again, episodes=False)
+        lost = waiting[(step.terminated | step.truncated)[waiting]]
+        if len(going := np.setdiff1d(waiting, lost)):
+            lost = np.union1d(lost, self.search.observe(going, step))
+        return np.union1d(np.setdiff1d(over, again), lost)
 
     def _goal(self, rows: Array) -> Array | None:
         """Return the goals of all environments, (N, *goal_shape), after those of new calls.
@@ -466,22 +479,13 @@ class Collector:
             self._forget(ids)
         return ids
 
-    def _tell(
-        self,
-        row: int,
-        ids: Array,
-        info: Mapping[str, Any],
-        success: Array | None = None,
-        *,
-        task: bool,
-    ) -> None:
+    def _tell(self, row: int, ids: Array, info: Mapping[str, Any]) -> None:
         """Keep the numbers of the episodes of environments ``ids`` (k,), which are over.
 
         Args:
             row: of the step.
+            ids: (k,).
             info: of all environments, at this step.
-            success: (k,), whether they have succeeded.
-            task: their return of the task is another one than that of who acts.
         """
         episodes = np.full((len(ids), FIRST_INFO + len(self.log_info)), np.nan)
         for column, key in enumerate(self.log_info, FIRST_INFO):
@@ -490,9 +494,11 @@ class Collector:
                 self._info_keys |= set(info_keys(info))
             else:
                 episodes[:, column] = numbers
-        episodes[:, [RETURN, TASK_RETURN, LENGTH] if task else [RETURN, LENGTH]] = 0.0
-        if success is not None:
-            episodes[:, SUCCESS] = success
+        episodes[:, [RETURN, LENGTH]] = 0.0
+        if self.skill is not None:  # the return of the task is another one
+            episodes[:, TASK_RETURN] = 0.0
+        elif (success := reported_success(info, self.num_envs)) is not None:
+            episodes[:, SUCCESS] = success[ids]
         self._ended.append((row, ids, episodes))
 
 

@@ -114,8 +114,8 @@ class Search:
             self.values = prefixed("starters", self._policy.values())
             self.holds = self._policy.holds
 
-    def playing(self, obs: Array, world: World) -> Array:
-        """Return the environments (k,) in which the skill acts, for observations (N, …) of all.
+    def playing(self, obs: Array, world: World) -> tuple[Array, Array]:
+        """Return the environments (k,) in which the skill acts, and the others; obs are of all N.
 
         Where a call of it is to start, how many calls of others come first is drawn.
         """
@@ -129,7 +129,8 @@ class Search:
                 left += named
             self.kept["calls_left"][ids] = left
             self._look(ids, obs)
-        return np.flatnonzero(~self.kept["searching"])
+        searching = self.kept["searching"]
+        return np.flatnonzero(~searching), np.flatnonzero(searching)
 
     def act(self, ids: Array, obs: Array, mask: Array | None, world: World) -> Array:
         """Return actions (k, …) in environments ``ids`` (k,); obs and mask are of all N."""

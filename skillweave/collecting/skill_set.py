@@ -109,15 +109,17 @@ def acting_policy(
         outermost: it remembers the last action, where that counts for a skill; else
             it is in the ``World``.
     """
-    policy = hierarchy_of(skills, selector, guide, goals)
-    return _around(policy, skills, remembers=outermost)
+    whole, space = hierarchy_of(skills, selector, guide, goals), skills.action_space
+    policy = _overridden(whole, skills.reflexes, space)
+    return _remembering(policy, space) if outermost else policy
 
 
 def acting_alone(skills: SkillSet, i: int) -> Policy:
     """Return the policy of skill ``i`` without a selector, with reflexes."""
-    skill = _skill(skills, i)
-    policy = skill.policy if skill.goals is None else Given(skill.policy, skill.goals)
-    return _around(policy, skills, remembers=True)
+    skill, space = skills.skills[i], skills.action_space
+    policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
+    goals = goals_of(skill)
+    return _remembering(policy if goals is None else Given(policy, goals), space)
 
 
 def hierarchy_of(
@@ -183,8 +185,7 @@ def acting_apart(
         reflexes: in force.
         space: of the environment's actions.
     """
-    policy = _whole(policy, skill, part)
-    return Reflexes(policy, reflexes, space_of(space)) if reflexes else policy
+    return _overridden(_whole(policy, skill, part), reflexes, space)
 
 
 def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
@@ -204,13 +205,14 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
     )
 
 
-def _around(policy: Policy, skills: SkillSet, *, remembers: bool) -> Policy:
-    """Return a policy with reflexes, which remembers the last action where that counts."""
-    if skills.reflexes:
-        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
-    if not (remembers and policy.holds):
-        return policy
-    return Remembers(policy, space_of(skills.action_space))
+def _overridden(policy: Policy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]) -> Policy:
+    """Return a policy with reflexes; ``space`` is of the environment's actions."""
+    return Reflexes(policy, reflexes, space_of(space)) if reflexes else policy
+
+
+def _remembering(policy: Policy, space: gym.Space[Any]) -> Policy:
+    """Return a policy that remembers the last action, of ``space``, where that counts."""
+    return Remembers(policy, space_of(space)) if policy.holds else policy
 
 
 def policy_of(

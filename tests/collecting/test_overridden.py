@@ -82,5 +82,5 @@ def test_reflexes_are_in_force_while_skills_learn():
 
     hierarchy = declare(reflexes=[BACK])
     (stage,) = hierarchy.stages()
-    skills = stage.learning_task(ready_policies(roles_of(hierarchy))).skills
+    skills = stage.learning_task(ready_policies(roles_of(hierarchy))).who.skills
     assert skills.reflexes == (BACK,)
