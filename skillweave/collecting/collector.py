@@ -351,7 +351,7 @@ class Collector:
         return action
 
     def _begun(self, end: Array, over: Array, waiting: Array, step: Step) -> Array:
-        """Let calls begin anew in episodes that go on, and the search go on where it has to.
+        """Let new calls begin in episodes that go on, and the search go on where it has to.
 
         Args:
             end: (N,), why calls ended.
@@ -460,7 +460,7 @@ class Collector:
         self._begin_call(ids, episodes=True)
 
     def _begin_call(self, ids: Array, *, episodes: bool) -> None:
-        """The policy begins anew in environments ``ids`` (k,), perhaps in new episodes."""
+        """Let a new call begin in environments ``ids`` (k,), perhaps a new episode."""
         restart(self.policy, self.memory, ids)
         if self._goals is not None:
             self.kept["needs_goal"][ids] = True

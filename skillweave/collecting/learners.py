@@ -1,4 +1,4 @@
-"""Who learns from a collector's steps, and the rows of each: a plain agent, a skill, or levels.
+"""Learners of a collector's steps, and the rows of each: a plain agent, a skill, or levels.
 
 ``OneLearner`` and ``LevelLearners`` have the same methods.
 """
@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from skillweave.collecting.acting import Acting, Request
@@ -105,6 +106,7 @@ class OneLearner:
 
     def __init__(self, who: Alone, engine: Engine, acting: Acting | None) -> None:
         self._acting, self._part, self._goals = acting, who.part, goals_of(who.skill)
+        self._space = engine.action_space if who.part is None else who.part.action_space
         leaf = Policy() if acting is None else Learning(acting, "")
         space = engine.action_space
         self.policy = acting_apart(leaf, who.skill, who.part, who.reflexes, space)
@@ -140,7 +142,7 @@ class OneLearner:
         goes_on = steps["valid"] & ~steps.ended
         steps = steps.replace(valid=trace.get("valid"))
         batch = rows_of(trace, steps, "", trace["elapsed"], self._record, self._goals, self._part)
-        return {"": _with_state(batch, self._before, goes_on)}
+        return {"": _completed(batch, self._space, self._before, goes_on)}
 
 
 class LevelLearners:
@@ -220,7 +222,7 @@ class LevelLearners:
         self._gammas[path] = request.gamma.astype(np.float64).repeat(acting.each)
 
     def _recurrent(self, elapsed: Array) -> Iterator[tuple[str, tuple[Array, Array]]]:
-        """Yield the paths of skills that learn with a recurrent network; see ``_with_state``."""
+        """Yield the paths of skills that learn with a recurrent network; see ``_completed``."""
         acted = {"": elapsed > 0}
         for level in self.levels:
             for i in (*level.learning, *level.below):
@@ -329,10 +331,8 @@ class LevelLearners:
             ends[:-1] |= other.any(axis=tuple(range(2, other.ndim)))
         steps["truncated"][:-1] &= ends[:-1] | ~acts[1:]
         batch = rows_of(trace, steps, f"{path}/", elapsed, self._record, goals, part)
-        if "action" not in batch:
-            space = self._space if part is None else part.action_space
-            batch = batch.replace(action=action_codec(space).zeros(*trace.lead))
-        return _with_state(batch, self._states.get(path), acts & ~trace.ended)
+        space = self._space if part is None else part.action_space
+        return _completed(batch, space, self._states.get(path), acts & ~trace.ended)
 
     @staticmethod
     def _inside(
@@ -354,15 +354,20 @@ class LevelLearners:
         return below, steps, np.where(cut, inner, own), acts & (closes | steps["terminated"])
 
 
-def _with_state(batch: Batch, before: tuple[Array, Array] | None, goes_on: Array) -> Batch:
-    """Return a batch with what a recurrent network remembered before it.
+def _completed(
+    batch: Batch, space: gym.Space[Any], before: tuple[Array, Array] | None, goes_on: Array
+) -> Batch:
+    """Return a batch with actions, also where nobody acted, and with what a network remembered.
 
     Args:
         batch: (T, N).
-        before: what it remembered, (N, M), and (N,) bool, that was nothing; None: it is no
-            recurrent network.
+        space: of the actions.
+        before: what a recurrent network remembered before, (N, M), and (N,) bool, that was
+            nothing; None: it is not recurrent.
         goes_on: (T, N) bool, it remembers what was before the next row.
     """
+    if "action" not in batch:
+        batch = batch.replace(action=action_codec(space).zeros(*batch.lead))
     if before is None:
         return batch
     starts = np.concatenate([before[1][None], ~goes_on[:-1]])

@@ -29,7 +29,7 @@ that what a skill can do from there is not forgotten."""
 
 @dataclass(frozen=True)
 class Starts:
-    """How calls of a skill start that learns apart."""
+    """Settings of how calls of a skill start that learns apart."""
 
     skills: SkillSet | None = None
     """Skills that can act already; None: random actions lead to where it may start."""
@@ -70,7 +70,7 @@ class Starts:
 
 
 class Search:
-    """What leads to where a skill may start, in N environments.
+    """Search for where a skill may start, in N environments.
 
     It calls skills at random wherever they may start, and acts at random where none may. These
     skills sample, as a greedy skill may go round in circles forever. Where skills are named, all
@@ -190,7 +190,7 @@ class Search:
         return ids[made[ids] < self.starts.episode_calls]
 
     def begin(self, ids: Array, obs: Array, *, episodes: bool) -> None:
-        """Let calls of the skill start anew in environments ``ids`` (k,), perhaps in new episodes.
+        """Let new calls of the skill start in environments ``ids`` (k,), perhaps in new episodes.
 
         How long it was searched counts on from episode to episode; obs are of all N.
         """

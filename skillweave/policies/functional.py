@@ -27,8 +27,10 @@ class Functional:
     joins = False
 
     def __init__(self, in_place: Policy, sees: Any, acts: Any, *, joins: bool = False) -> None:
-        self.in_place, self.joins = in_place, joins
-        self.observation_space, self.action_space = sees, acts
+        self.in_place = in_place
+        self.observation_space = sees
+        self.action_space = acts
+        self.joins = joins
 
     @cached_property
     def _like(self) -> Memory:

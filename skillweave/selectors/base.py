@@ -105,7 +105,11 @@ class ReadySelector(Functional, Foreign):
         return self.in_place.chances(own, np.arange(len(obs)), obs, mask), memory
 
     def allowed(self, memory: Memory) -> Array | None:
-        """Return the skills that it may choose next, (n, S) bool; None: depends on observations."""
+        """Return the skills that it may choose next, (n, S) bool; None: depends on observations.
+
+        Args:
+            memory: of n environments.
+        """
         skills: Array | None = self.in_place.allowed(memory, slice(None))
         return skills
 

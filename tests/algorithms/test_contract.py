@@ -40,6 +40,7 @@ from skillweave.algorithms.config import (
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
 from skillweave.collecting.collector import Collector
+from skillweave.collecting.learners import Alone
 from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
@@ -364,7 +365,7 @@ class LongCalls(Toy):
     """Whatever is done lasts 10 steps and pays 3."""
 
     def collector(self, acting, shared=False):
-        return TenSteps(self, acting)
+        return TenSteps(self, acting, Alone())
 
     def play(self, action):
         still = np.zeros((self.num_envs, 1), np.float32)
