@@ -57,7 +57,7 @@ class Starts:
 
     @property
     def draws(self) -> bool:
-        """Whether calls come first is drawn for each episode."""
+        """Calls come first, and how many is drawn for each episode."""
         return self.skills is not None and (self.calls > 0 or bool(self.named))
 
     def search(self, skill: Skill | None, engine: Engine) -> Search | None:
