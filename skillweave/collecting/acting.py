@@ -158,7 +158,8 @@ class Acting:
 
         # Networks of several members take equally many rows of each, so all act, and some count.
         n = self.each * self.members
-        obs, mask, memory = (_spread(x, rows, n) for x in (obs, mask, memory))
+        if len(rows) < n:
+            obs, mask, memory = (_spread(x, rows, n) for x in (obs, mask, memory))
         acted, request = self._act(noise, obs, mask, memory), self._request
         repeat = request.action_repeat
         if self._every and repeat is not None and not (request.at_random or request.greedy):
@@ -233,7 +234,7 @@ def _rows_or_none(x: Tensor | None) -> Array | None:
 
 def _spread(x: Array | None, rows: Array, n: int) -> Any:
     """Return arrays of n environments that hold ``x`` in ``rows``, and elsewhere its first row."""
-    if x is None or len(rows) == n:
+    if x is None:
         return x
     whole = np.repeat(x[:1], n, axis=0)
     whole[rows] = x

@@ -394,11 +394,11 @@ class Collector:
             rows: (k,) environments in which the policy acted.
             goal: (N, *goal_shape).
         """
-        end, elapsed, skill = np.zeros(self.num_envs, np.int8), self.elapsed[rows], self.skill
+        end, skill = np.zeros(self.num_envs, np.int8), self.skill
         if self.call_limit is not None:
-            end[rows[elapsed >= self.call_limit]] = LIMIT
+            end[rows[self.elapsed[rows] >= self.call_limit]] = LIMIT
         if step is not None and len(rows):
-            own_goal = None if goal is None else goal[rows]
+            elapsed, own_goal = self.elapsed[rows], None if goal is None else goal[rows]
             if self.policy.watches:
                 seen = step
                 if self.search is not None or goal is not None:
@@ -409,8 +409,9 @@ class Collector:
                     end[rows[self.policy.stuck(self.memory, rows, raw.next_obs[rows])]] = LIMIT
                 seen = seen_by(skill, step, elapsed, rows, own_goal)
                 end[rows[judge(skill, seen, rows).stops]] = OWN
-        over = np.zeros(self.num_envs, bool)
-        over[rows] = (raw.terminated | raw.truncated)[rows]
+        over = raw.terminated | raw.truncated
+        if self.search is not None:
+            over &= ~self.search.kept["searching"]
         end_with_episode(end, over)
         return end
 
