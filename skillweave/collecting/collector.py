@@ -498,8 +498,9 @@ class Collector:
         episodes[:, [RETURN, LENGTH]] = 0.0
         if self.skill is not None:  # the return of the task is another one
             episodes[:, TASK_RETURN] = 0.0
-        elif (success := reported_success(info, self.num_envs)) is not None:
-            episodes[:, SUCCESS] = success[ids]
+        if self.skill is None or not self.skill.defines("reward"):  # the reward is the task's
+            success = reported_success(info, self.num_envs)
+            episodes[:, SUCCESS] = np.nan if success is None else success[ids]
         self._ended.append((row, ids, episodes))
 
 

@@ -6,12 +6,13 @@ import itertools
 import zlib
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from reference_calls import POSITION, T, Walk, one_step, scripted, seeds_of
 from test_joint import Learner, Values
 from toy_acting import Again, Choices, Counts, requests, valid_rows
-from toys import calling_in
+from toys import alone_in, calling_in
 
 from skillweave.collecting.levels import UntrainedHierarchy
 from skillweave.collecting.skill_set import SkillSet
@@ -351,3 +352,47 @@ def test_apart_a_hierarchy_is_judged_as_the_skill_that_it_is(call_steps):
             assert row["reward"] == pytest.approx(sum(GAMMA**k * r for k, r in enumerate(told)))
             if not row["terminated"]:
                 assert row["truncated"] == (t + tau >= 2), "then none may start: its value goes on"
+
+
+class Says(gym.Env):
+    """Its episodes last four steps, pay one for each, and say at their end that all is well."""
+
+    observation_space = gym.spaces.Box(0.0, 9.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        over = self.t == 4
+        return np.full(1, self.t, np.float32), 1.0, False, over, {"success": over}
+
+
+class Wait(Skill):
+    policy = scripted(1)
+
+
+@pytest.mark.parametrize(
+    ("methods", "success"),
+    [
+        ({}, 1.0),
+        ({"reward": lambda self, step: step.reward}, np.nan),
+        ({"success": lambda self, step: step.next_obs[:, 0] < 0}, 0.0),
+    ],
+)
+@pytest.mark.parametrize("called", [False, True])
+def test_a_skill_without_a_reward_of_its_own_succeeds_as_the_task_does(methods, success, called):
+    skill = type("Whole", (Skill,), methods)()
+    engine = make_engine(EnvSpec(Says, engine="sync"), N)
+    below = SkillSet((Wait(),), (Wait.policy,), call_steps=2)
+    collector = alone_in(engine, Choices(N, 3), skill)
+    if called:
+        collector = calling_in(engine, Choices(N, 1), below, as_skill=skill)
+    collector.start(Seeds(7))
+    episodes = collector.collect(next(requests(9, GAMMA))).episodes
+    assert len(episodes) == 2 * N
+    np.testing.assert_array_equal(episodes[:, 3], success)
+    assert (episodes[:, 2] == 4).all()
+    assert (episodes[:, 0] == episodes[:, 1]).all(), "all maximise what the task pays"
