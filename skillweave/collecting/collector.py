@@ -12,7 +12,7 @@ import numpy as np
 from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.learners import Alone, Calling, LevelLearners, OneLearner
-from skillweave.collecting.restored import check_numbers, opened
+from skillweave.collecting.restored import OF_LEARNERS, check_numbers, opened
 from skillweave.collecting.search import Search
 from skillweave.collecting.views import steps_of, successes_of
 from skillweave.collecting.writer import TraceWriter
@@ -242,8 +242,8 @@ class Collector:
         kept = unprefixed("kept", state)
         if others := sorted(kept.keys() ^ {*self.kept, "obs"}):
             raise RunError(
-                f"the checkpoint's open episodes differ in {others[0]!r}: it is not of this stage, "
-                "or damaged"
+                f"the checkpoint's open episodes differ in {others[0]!r}: it is of another stage "
+                "or another version of Skillweave, or damaged"
             )
         for name, values in self.kept.items():
             found, own = kept[name], as_numbers(values)
@@ -517,16 +517,12 @@ def _checksum(state: Mapping[str, Array]) -> int:
     return found
 
 
-_OF_LEARNERS = {"state_before", "player.rnn", "player.own.rnn", "player.selector.rnn"}
-"""What is kept of the learners' memory: others begin without."""
-
-
 def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting) -> Collector:
     """Several collectors of one kind as one, over an engine of all their environments."""
     found: Collector = collectors[0].like(engine, acting)
     found.log_info = collectors[0].log_info
     for name, rows in found.kept.items():
-        if name not in _OF_LEARNERS:
+        if name not in OF_LEARNERS:
             rows[:] = np.concatenate([c.kept[name] for c in collectors])
     for name, example in collectors[0].open.items():
         parts = [c.open.get(name, np.zeros_like(example)) for c in collectors]
@@ -541,7 +537,7 @@ def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
     for collector in collectors:
         part = slice(first, first + collector.num_envs)
         for name, rows in collector.kept.items():
-            if name not in _OF_LEARNERS:
+            if name not in OF_LEARNERS:
                 rows[:] = joined.kept[name][part]
         collector.open.clear()
         collector.open |= {k: v[part].copy() for k, v in joined.open.items()}

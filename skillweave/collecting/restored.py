@@ -18,8 +18,9 @@ from skillweave.types import Array, Memory
 COUNTS = range(-1, 2**31)
 """What a number of steps or calls may be."""
 OF_OTHERS = ("player.", "starters.", "last_action")
-"""How names begin of what policies remember. They may be a user's, and that may be anything, but
-for what a network remembers (``rnn``)."""
+"""How names begin of what policies remember. They may be a user's, and that may be anything."""
+OF_LEARNERS = {"state_before", "player.rnn", "player.own.rnn", "player.selector.rnn"}
+"""What is kept of the learners' memory: others begin without."""
 PLAYERS = ("player", "starters")
 """What players are called whose memory is kept."""
 
@@ -47,7 +48,7 @@ def check_numbers(
     own = {
         k: x
         for k, x in kept.items()
-        if (not k.startswith(OF_OTHERS) or k.endswith(".rnn")) and (k not in values or k in ranges)
+        if (k in OF_LEARNERS or not k.startswith(OF_OTHERS)) and (k not in values or k in ranges)
     }
     counts = {name: COUNTS for name, x in own.items() if x.dtype == np.int64}
     for name, those in (counts | ranges).items():

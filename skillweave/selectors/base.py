@@ -24,7 +24,7 @@ from skillweave.skills.goal_spaces import alone
 from skillweave.skills.outputs import Wrapped as Wrapped
 from skillweave.skills.outputs import answer, called
 from skillweave.terminal import one_line
-from skillweave.types import Array, Memory, Step
+from skillweave.types import Array, Memory, Memoryless, Step
 
 
 class ReadySelector(Functional, Foreign):
@@ -41,6 +41,7 @@ class ReadySelector(Functional, Foreign):
 
     It is made when it is first needed, so that the skills and their goals are known; it raises a
     SkillError where a fixed goal does not fit its skill."""
+    observe = Memoryless.observe  # it watches instead
 
     def __init__(self, name: str) -> None:
         Foreign.__init__(self, name)

@@ -13,6 +13,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.policies.core import Around, Policy
+from skillweave.selectors import ReadySelector
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.types import Memoryless
 
@@ -203,3 +204,27 @@ def test_a_combinator_forwards_all_that_a_policy_has() -> None:
     for name, value in vars(Policy).items():
         if callable(value):
             assert getattr(Around(probe), name)() == name
+
+
+class Turns(ReadySelector):
+    """A user's own selector, which has no rule of the library."""
+
+    kind = "turns"
+
+    def start(self, n: int) -> Any:
+        return {"calls": np.zeros(n, np.int64)}
+
+    def act(self, memory: Any, obs: Any, mask: Any = None, **how: Any) -> Any:
+        return memory["calls"] % 2, {"calls": memory["calls"] + 1}
+
+    def watch(self, memory: Any, step: sw.Step, last: Any) -> Any:
+        return memory
+
+
+def test_a_selector_of_the_users_own_is_a_policy() -> None:
+    one = Turns("turns")
+    memory = one.start(2)
+    assert one.observe(memory, None) is memory  # type: ignore[arg-type]
+    bound = one.bind(Pays.observation_space, gym.spaces.Discrete(2), "it")
+    skills = SkillSet((First(), Second()), (Fixed(0), Fixed(2)), call_steps=1)
+    assert sw.evaluate(HierarchyPolicy(bound, skills), Pays, episodes=2).returns == (4.0, 4.0)
