@@ -109,9 +109,10 @@ def acting_policy(
         outermost: it remembers the last action, where that counts for a skill; else
             it is in the ``World``.
     """
-    whole, space = hierarchy_of(skills, selector, guide, goals), skills.action_space
-    policy = _overridden(whole, skills.reflexes, space)
-    return _remembering(policy, space) if outermost else policy
+    policy: Policy = hierarchy_of(skills, selector, guide, goals)
+    if skills.reflexes:
+        policy = Reflexes(policy, skills.reflexes, space_of(skills.action_space))
+    return _remembering(policy, skills) if outermost else policy
 
 
 def acting_alone(skills: SkillSet, i: int) -> Policy:
@@ -119,7 +120,7 @@ def acting_alone(skills: SkillSet, i: int) -> Policy:
     skill, space = skills.skills[i], skills.action_space
     policy = acting_apart(skills.policies[i], skill, skills.part(i), skills.reflexes, space)
     goals = goals_of(skill)
-    return _remembering(policy if goals is None else Given(policy, goals), space)
+    return _remembering(policy if goals is None else Given(policy, goals), skills)
 
 
 def hierarchy_of(
@@ -185,7 +186,8 @@ def acting_apart(
         reflexes: in force.
         space: of the environment's actions.
     """
-    return _overridden(_whole(policy, skill, part), reflexes, space)
+    whole = _whole(policy, skill, part)
+    return Reflexes(whole, reflexes, space_of(space)) if reflexes else whole
 
 
 def _whole(policy: Any, skill: Skill | None, part: OwnPart | None) -> Policy:
@@ -205,14 +207,9 @@ def _skill(skills: SkillSet, i: int) -> CalledSkill:
     )
 
 
-def _overridden(policy: Policy, reflexes: tuple[Reflex, ...], space: gym.Space[Any]) -> Policy:
-    """Return a policy with reflexes; ``space`` is of the environment's actions."""
-    return Reflexes(policy, reflexes, space_of(space)) if reflexes else policy
-
-
-def _remembering(policy: Policy, space: gym.Space[Any]) -> Policy:
-    """Return a policy that remembers the last action, of ``space``, where that counts."""
-    return Remembers(policy, space_of(space)) if policy.holds else policy
+def _remembering(policy: Policy, skills: SkillSet) -> Policy:
+    """Return a policy that remembers the last action where that counts."""
+    return Remembers(policy, space_of(skills.action_space)) if policy.holds else policy
 
 
 def policy_of(
