@@ -315,7 +315,7 @@ class Collector:
             self.kept["last_action"][:] = action
         step = raw.seen(obs, action, self.kept["age"].copy()) if self._asks else None
         end = self._ends(raw, step, rows, goal)
-        self.learning.write(out, end)
+        self.learning.write(out, end, whole)
         out.write(
             elapsed=self.elapsed,
             end=end,

@@ -128,8 +128,8 @@ class OneLearner:
         """Return whether a skill below is judged by ``info``."""
         return False
 
-    def write(self, out: TraceWriter, end: Array) -> None:
-        """Write what is remembered after a step; ``end`` (N,) says why episodes ended."""
+    def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
+        """Go on to the next row; see ``LevelLearners.write``."""
         assert self._acting is not None
         self._acting.row = out.row + 1
 
@@ -237,8 +237,14 @@ class LevelLearners:
         judges = [level.skills[i] for level in self.levels for i in (*level.learning, *level.below)]
         return any(s.defines(method) for s in judges for method in ("reward", "termination"))
 
-    def write(self, out: TraceWriter, end: Array) -> None:
-        """Write what is remembered after a step; ``end`` (N,) says why episodes ended."""
+    def write(self, out: TraceWriter, end: Array, whole: bool) -> None:
+        """Write which calls run after a step, and why others ended.
+
+        Args:
+            out: the trace.
+            end: (N,) why episodes ended.
+            whole: steps are recorded as a whole; else only where a selector decides and calls end.
+        """
         for level in self.levels:
             path, memory, guide = level.path, level.memory, level.hierarchy.guide
             call_end = memory["end"]
@@ -247,15 +253,17 @@ class LevelLearners:
                 end_with_episode(call_end, end != RUNNING)
                 if "limit" in memory:
                     out.write(call_limit=memory["limit"])
-            values = {"skill": memory["skill"], "call_elapsed": memory["elapsed"]}
-            for i in level.hierarchy.goals:
-                values[f"{level.skills[i].name}/goal"] = memory["goal"][str(i)]
+            values = {"call_end": call_end}
+            if whole:
+                values |= {"skill": memory["skill"], "call_elapsed": memory["elapsed"]}
+                for i in level.hierarchy.goals:
+                    values[f"{level.skills[i].name}/goal"] = memory["goal"][str(i)]
             if guide is not None and level.selector is not None:
                 every = np.ones((len(end), level.hierarchy.choices), bool)
                 values["guide_allows"] = level.hierarchy.guided(memory, np.arange(len(end)), every)
                 if guide.tells:
                     values["chances"] = memory["chances"]
-            out.write(**{path + name: x for name, x in (values | {"call_end": call_end}).items()})
+            out.write(**{path + name: x for name, x in values.items()})
 
     def views(self, trace: Trace, steps: Batch) -> dict[str, Batch]:
         """Return what each learner did, by path.
