@@ -12,7 +12,8 @@ import skillweave as sw
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
-from skillweave.policies.core import Around, Policy
+from skillweave.policies.core import Around, Policy, flat
+from skillweave.policies.parts import Corrects
 from skillweave.selectors import ReadySelector
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.types import Memoryless
@@ -204,6 +205,14 @@ def test_a_combinator_forwards_all_that_a_policy_has() -> None:
     for name, value in vars(Policy).items():
         if callable(value):
             assert getattr(Around(probe), name)() == name
+
+
+def test_a_correction_says_what_numbers_both_may_remember() -> None:
+    one = type("One", (Policy,), {"start": lambda self, n: {"state": np.zeros(n, np.int64)},
+                                  "values": lambda self: {"state": range(3)}})  # fmt: skip
+    both = Corrects(one(), one(), None)  # type: ignore[arg-type]
+    assert both.values() == {"own.state": range(3), "base.state": range(3)}
+    assert both.values().keys() == flat(both.start(2)).keys()
 
 
 class Turns(ReadySelector):
