@@ -169,9 +169,10 @@ def _made(data: dict[str, Any]) -> gym.Space[Any]:
             box: gym.Space[Any] = gym.spaces.Box(low, high, shape, dtype)
             return box
         case "Discrete":
-            return gym.spaces.Discrete(data["n"], start=data["start"], **_dtype(data))
+            return _discrete(data["n"], data["start"], np.dtype(data.get("dtype", np.int64)))
         case "MultiDiscrete":
-            return gym.spaces.MultiDiscrete(data["nvec"], start=data["start"], **_dtype(data))
+            kind: Any = np.dtype(data.get("dtype", np.int64)).type
+            return gym.spaces.MultiDiscrete(data["nvec"], kind, start=data["start"])
     return gym.spaces.MultiBinary(data["n"])
 
 
@@ -191,7 +192,7 @@ def gym_space(space: Space) -> gym.Space[Any]:
     if space.kind == "MultiBinary":
         return gym.spaces.MultiBinary(space.shape if len(space.shape) > 1 else space.shape[0])
     if space.kind == "Discrete":
-        return gym.spaces.Discrete(int(high - low + 1), start=int(low), dtype=dtype.type)
+        return _discrete(int(high - low + 1), int(low), dtype)
     count = np.broadcast_to(high - low + 1, space.shape).astype(np.int64)
     start = np.broadcast_to(low, space.shape).astype(np.int64)
     return gym.spaces.MultiDiscrete(count, dtype=dtype.type, start=start)
@@ -242,8 +243,10 @@ def _dtype_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     return {} if space.dtype == np.int64 else {"dtype": str(space.dtype)}
 
 
-def _dtype(data: dict[str, Any]) -> dict[str, Any]:
-    return {"dtype": np.dtype(data["dtype"]).type} if "dtype" in data else {}
+def _discrete(n: int, start: int, dtype: np.dtype[Any]) -> gym.Space[Any]:
+    if dtype == np.int64:  # before 1.2, Gymnasium knows no other type here, and no argument for it
+        return gym.spaces.Discrete(n, start=start)
+    return gym.spaces.Discrete(n, start=start, dtype=dtype.type)
 
 
 def _bounds_to_json(bounds: Array) -> Any:

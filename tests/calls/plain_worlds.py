@@ -132,7 +132,7 @@ def resting(rest: Any, space: Any, last: Any) -> Any:
 def corrected(skill: WorldSkill, base: Array, learnt: Array) -> Array:
     """A ready policy's action with a correction, within the bounds; scales are of half a range."""
     space = skill.action_space
-    half = (space.high - space.low) / 2
+    half = np.float64(space.high - space.low) / 2
     both = np.float64(base) + half * np.array(skill.scale) * np.float64(learnt)
     return np.clip(both, space.low, space.high).astype(np.float32)
 

@@ -160,7 +160,7 @@ class Plain:
 
     def infer(self, obs: dict[str, Any], mask: Array | None) -> None:
         model = self.model
-        a = [obs["arm"], np.clip((np.float64(obs["hook"]) - 0.5) * 2, -1, 1)]
+        a = [obs["arm"], np.clip((obs["hook"].astype(np.float64) - 0.5) * 2, -1, 1)]
         b = [np.eye(3)[obs["mode"]]]
         b += [self.last * 0.5] if model.last else []
         b += [np.array(GOAL)] if model.goal else []
@@ -196,7 +196,7 @@ def moments(kind: str, seed: int, count: int) -> list[tuple[dict[str, Any], Arra
     rng, found = np.random.default_rng(seed), []
     for t in range(count):
         obs = {"arm": rng.uniform(-2, 2, 2), "hook": rng.uniform(-2, 2, 1), "mode": t % 3}
-        obs = {k: np.float32(v) if k != "mode" else v for k, v in obs.items()}
+        obs = {k: v if k == "mode" else np.asarray(v, np.float32) for k, v in obs.items()}
         mask = None
         if kind != "box":
             mask = np.ones(width(ACTIONS[kind]), bool)
