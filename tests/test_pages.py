@@ -21,15 +21,6 @@ NEEDS = {
     "docs/tutorials/other-libraries.md": ("stable_baselines3",),
 }
 """What a page's code needs beside the core."""
-FOR_OTHERS = (
-    "docs/reference/",
-    "docs/architecture.md",
-    "docs/contributing.md",
-    "docs/one-gradient.md",
-    "docs/dependencies.md",
-    "docs/changes.md",
-)
-"""The reference and the pages for developers."""
 
 
 def name(page: Path) -> str:
@@ -83,23 +74,11 @@ def test_every_public_name_stands_in_the_reference_once() -> None:
 
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs/suites").glob("*.md")), ids=name)
-def test_a_page_about_a_suite_is_short_and_names_its_command(page: Path) -> None:
-    text = page.read_text()
-    assert len(text.splitlines()) <= 80
-    assert "python -m benchmarks.pay" in text
+def test_a_page_about_a_suite_names_its_command(page: Path) -> None:
+    assert "python -m benchmarks.pay" in page.read_text()
 
 
 def test_every_table_of_results_has_its_command() -> None:
     sections = re.split(r"^## ", (ROOT / "docs/results.md").read_text(), flags=re.M)[1:]
     assert len(sections) >= 6
     assert [s.splitlines()[0] for s in sections if "python -m benchmarks." not in s] == []
-
-
-NOTES = r"not kept|by lot|\banew\b|[†‡]|\b\d+ (?:November|October) 20\d\d|whoever"
-
-
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=name)
-def test_a_page_for_users_is_no_notebook(page: Path) -> None:
-    """No dates of measurements, signs of footnotes, programs that are gone, old words."""
-    if not name(page).startswith(FOR_OTHERS):
-        assert re.findall(NOTES, page.read_text(), flags=re.I) == []

@@ -17,6 +17,7 @@ from pages import BLOCK, train_briefly
 
 import skillweave as sw
 from skillweave import Array, Policy, SkillweaveError
+from skillweave.cli.commands import COMMANDS
 from skillweave.errors import KINDS
 
 ALIASES = ("Array",)
@@ -123,10 +124,13 @@ def test_a_public_name_says_all_that_a_user_needs(name: str) -> None:
     assert found == {}
 
 
-@pytest.mark.parametrize("public", [n for n in NAMES if dataclasses.is_dataclass(getattr(sw, n))])
-def test_every_field_of_a_public_dataclass_is_explained(public: str) -> None:
-    """By the text under it, by the comment beside it, or by the class."""
-    kind, said = getattr(sw, public), set[str]()
+DATACLASSES = [kind for n in NAMES if dataclasses.is_dataclass(kind := getattr(sw, n))]
+
+
+@pytest.mark.parametrize("kind", [*DATACLASSES, *COMMANDS], ids=lambda kind: kind.__name__)
+def test_every_field_of_a_public_dataclass_is_explained(kind: Any) -> None:
+    """By the text under it, by the comment beside it, or by the class; ``--help`` shows it, too."""
+    said = set[str]()
     for base in kind.__mro__:
         if not base.__module__.startswith("skillweave"):
             continue

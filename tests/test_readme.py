@@ -1,4 +1,4 @@
-"""README: its example is one of the examples, its commands exist, and it is short."""
+"""README: its example is one of the examples, and its commands and links exist."""
 
 import re
 
@@ -30,8 +30,7 @@ def test_every_target_of_make_that_the_readme_names_exists() -> None:
     assert [t for t in used if not re.search(rf"^{t}:", makefile, flags=re.M)] == []
 
 
-def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
-    assert len(TEXT.splitlines()) <= 110
+def test_the_links_of_the_readme_lead_somewhere() -> None:
     links = re.findall(r"\]\((?!http)([^)#]+)", TEXT)
     assert links
     assert [link for link in links if not (ROOT / link).exists()] == []

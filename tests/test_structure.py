@@ -1,13 +1,9 @@
-"""The rooms' import order, docstrings and public names, read from the source alone.
-
-Only the last tests import the library: those on what its public names are.
-"""
+"""The rooms' import order, and the public names."""
 
 from __future__ import annotations
 
 import ast
 import inspect
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -276,35 +272,6 @@ def test_no_modules_import_one_another_also_for_types_alone() -> None:
     assert circles(graph) == set()
 
 
-def lone_modules() -> dict[str, str]:
-    """Return the docstring of each module that exactly one other module imports.
-
-    A module that its package imports is public under the package's name. Algorithms and shipped
-    recipes are loaded by their names.
-    """
-    importers: dict[str, set[str]] = {}
-    packages = set()
-    for path in MODULES:
-        module, package = module_of(path), path.name == "__init__.py"
-        packages |= {module} if package else set()
-        for _, name in imported(path.read_text(), module, package):
-            importers.setdefault(name, set()).add(module)
-    return {
-        module: ast.get_docstring(ast.parse(path.read_text())) or ""
-        for path in MODULES
-        if (module := module_of(path)) not in packages
-        and len(importers.get(module, set()) - {module}) == 1
-        and not importers[module] <= packages
-        and not re.match(r"recipes\.[a-z]", module)
-    }
-
-
-def test_a_module_with_one_importer_says_why_it_stands_alone() -> None:
-    """Without a reason of its own, it belongs into the module that imports it."""
-    silent = {name for name, text in lone_modules().items() if "Stands alone because" not in text}
-    assert silent == set()
-
-
 @pytest.mark.parametrize("path", MODULES, ids=module_of)
 def test_a_module_imports_only_what_its_row_names(path: Path) -> None:
     found = violations(path.read_text(), module_of(path), path.name == "__init__.py")
@@ -320,124 +287,6 @@ def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
-
-
-# Lines
-
-
-PACKED_ROOMS = {
-    "api",
-    "buffers",
-    "collecting",
-    "experience",
-    "export",
-    "hierarchy",
-    "planning",
-    "skills",
-    "training",
-    "types",
-}
-"""Rooms in which lines are packed yet; the set may only shrink."""
-
-
-def packed(source: str) -> list[str]:
-    """Return lines that the formatter must skip, and that set several attributes at once."""
-    lines = source.splitlines()
-    numbers = {i + 1 for i, line in enumerate(lines) if "# fmt: " + "skip" in line}
-    for node in ast.walk(ast.parse(source)):
-        if not isinstance(node, ast.Assign) or not isinstance(node.value, ast.Tuple):
-            continue
-        targets = getattr(node.targets[0], "elts", ())
-        if targets and all(isinstance(target, ast.Attribute) for target in targets):
-            numbers.add(node.lineno)
-    return [f"line {number}: {lines[number - 1].strip()}" for number in sorted(numbers)]
-
-
-def test_the_search_for_packed_lines_finds_them() -> None:
-    source = "self.a, self.b = a, b\na, b = b, a\nself.a, self.b = both\n"
-    assert packed(source) == ["line 1: self.a, self.b = a, b"]
-    assert len(packed("x = [\n    1, 2,\n]  # fmt: " + "skip\n")) == 1
-
-
-@pytest.mark.parametrize("path", MODULES, ids=module_of)
-def test_no_lines_are_packed(path: Path) -> None:
-    if room_of(module_of(path)) not in PACKED_ROOMS:
-        assert packed(path.read_text()) == []
-
-
-# Docstrings
-
-
-def is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> bool:
-    """One of the signatures of a function that has its docstring."""
-    return any(ast.unparse(d) == "overload" for d in node.decorator_list)
-
-
-def undocumented(source: str) -> list[str]:
-    """Public modules, classes, functions and methods without a docstring.
-
-    What lies within a function or a private class is not public; of magic methods the class
-    speaks.
-    """
-
-    def within(node: ast.Module | ast.ClassDef, prefix: str) -> Iterator[str]:
-        for child in node.body:
-            if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-                continue
-            if child.name.startswith("_") or is_overload(child):
-                continue
-            if ast.get_docstring(child) is None:
-                yield f"{prefix}{child.name}, line {child.lineno}"
-            if isinstance(child, ast.ClassDef):
-                yield from within(child, f"{prefix}{child.name}.")
-
-    tree = ast.parse(source)
-    found = [] if ast.get_docstring(tree) or not tree.body else ["the module"]
-    return [*found, *within(tree, "")]
-
-
-def test_the_search_for_docstrings_finds_what_has_none() -> None:
-    source = '"""Doc."""\nclass A:\n    """Doc."""\n    def f(self): ...\n    def _g(self): ...\n'
-    assert undocumented(source + "def h(): ...\n") == ["A.f, line 4", "h, line 6"]
-    assert undocumented("x = 1\n") == ["the module"]
-
-
-@pytest.mark.parametrize("path", MODULES, ids=module_of)
-def test_everything_public_has_a_docstring(path: Path) -> None:
-    assert undocumented(path.read_text()) == []
-
-
-def fields_without_a_string(source: str) -> list[str]:
-    """Fields of dataclasses that no string follows."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if not isinstance(node, ast.ClassDef):
-            continue
-        if not any("dataclass" in ast.dump(d) for d in node.decorator_list):
-            continue
-        for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
-            if not isinstance(statement, ast.AnnAssign):
-                continue
-            said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-            if not said or not isinstance(after.value.value, str) or not after.value.value.strip():
-                found.append(f"{node.name}.{ast.unparse(statement.target)}")
-    return found
-
-
-def test_the_search_for_field_strings_finds_what_has_none() -> None:
-    source = '@dataclass(frozen=True)\nclass A:\n    """Doc."""\n    x: int = 1\n    """X."""\n'
-    assert fields_without_a_string(source) == []
-    assert fields_without_a_string(source + "    y: int = 2\n") == ["A.y"]
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["algorithms/config.py", "networks/config.py", "cli/commands.py", "hierarchy/declaration.py"],
-)
-def test_every_field_of_the_settings_is_followed_by_a_string(name: str) -> None:
-    source = (ROOT / name).read_text()
-    assert "@dataclass" in source
-    assert fields_without_a_string(source) == []
 
 
 # Public names
@@ -470,29 +319,3 @@ def test_every_public_name_resolves_and_no_other_does() -> None:
             assert found.__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'PPPO'"):
         _ = skillweave.PPPO
-
-
-@pytest.mark.parametrize("path", MODULES, ids=module_of)
-def test_a_module_with_a_list_of_names_has_them(path: Path) -> None:
-    tree = ast.parse(path.read_text())
-    names: list[str] = []
-    bound: set[str] = set()
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            names = ast.literal_eval(node.value)
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            bound |= {a.asname or a.name for a in node.names}
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            bound.add(node.name)
-        elif isinstance(node, ast.Assign):
-            bound |= {ast.unparse(t) for t in node.targets}
-        elif isinstance(node, ast.AnnAssign):
-            bound.add(ast.unparse(node.target))
-    if module_of(path) != "skillweave":
-        assert set(names) <= bound
-
-
-def test_no_two_files_of_tests_have_one_name() -> None:
-    """Pytest imports a file of tests by its name alone, and cannot collect the second."""
-    names = [path.name for path in (ROOT.parent / "tests").rglob("test_*.py")]
-    assert len(names) == len(set(names))

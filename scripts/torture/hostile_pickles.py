@@ -163,7 +163,7 @@ def _values(rng: random.Random, path: Path) -> tuple[str, str, bool]:
 
 
 def _pickle_bytes(rng: random.Random, path: Path) -> tuple[str, str, bool]:
-    """Some bytes of the pickle are changed; the zip's own checksum is right."""
+    """Change some bytes of the pickle; the zip's own checksum is right."""
     from scripts.torture.mutations import damage
 
     entries = _entries(path)

@@ -47,8 +47,9 @@ class Outcome:
 
     @property
     def cause(self) -> str:
-        """Equal for cases that fail alike: what was done (up to a colon), or where an exception was
-        raised; without numbers and names of files.
+        """What was done, or where an exception was raised: equal for cases that fail alike.
+
+        Without numbers and names of files.
         """
         lines = [line.strip() for line in self.said.splitlines() if line.strip()]
         places = [line for line in lines if line.startswith('File "') and "/skillweave/" in line]

@@ -121,7 +121,7 @@ class Away(Home):
 
 
 def drawn(rng: random.Random, env: Any = Walk, workers: int | None = 2) -> Any:
-    """Some declaration over an environment, and how it is trained."""
+    """Return some declaration over an environment, and how it is trained."""
     spec = EnvSpec(env, engine="sync", workers=workers)
     how: dict[str, Any] = {"seed": rng.randrange(100), "quiet": rng.random() < 0.5}
     kind = rng.choice(("apart", "together", "dqn", "sac", "evolve", "many"))

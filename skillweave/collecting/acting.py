@@ -126,7 +126,7 @@ class Acting:
         action[now] = drawn.action[now]
 
     def _drawn(self, action_repeat: ActionRepeat, span: int) -> _Span:
-        """The repetitions of a span of rows."""
+        """Return the repetitions of a span of rows."""
         times: list[Array] = []  # of each member: chances, first rows, rows after the last one
         actions: list[Array] = []
         for algorithm, count in self.stacks:

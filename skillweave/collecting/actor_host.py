@@ -20,11 +20,10 @@ COMPUTING = "torch", "numpy", "gymnasium", "envpool", "mujoco"
 
 
 def actor_class() -> type:
-    """The class of actors.
+    """Return the class of actors.
 
     It is sent to the nodes by its code, so that it can tell of a node without Skillweave.
     """
-
     packages = COMPUTING
 
     class CollectorActor:

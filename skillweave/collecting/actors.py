@@ -64,7 +64,7 @@ class Actors:
         self._told_versions = set[str]()
 
     def get(self, number: int) -> Any:
-        """An actor; it is made where it does not exist."""
+        """Return an actor; make it where it does not exist."""
         if number not in self._actors:
             where = PlacementGroupSchedulingStrategy(self._group, number)
             self._actors[number] = self._kind.options(scheduling_strategy=where).remote()
@@ -204,7 +204,7 @@ class ActorWorker:
         self._due.append(self._actors.get(self._number).answer.remote(what, task))
 
     def receive(self) -> Any:
-        """The next answer."""
+        """Return the next answer."""
         ref = self._due.popleft()
         try:
             if self._versions is not None:
@@ -274,7 +274,7 @@ def check_versions(there: dict[str, Any]) -> None:
 
 
 def differing_versions(there: dict[str, Any]) -> str:
-    """Packages that a node has in another version, as people say it; empty where there are none."""
+    """Return the packages that a node has in another version, in words; none: an empty text."""
     found = []
     for package in COMPUTING:
         try:

@@ -532,7 +532,7 @@ def joined_from(collectors: Sequence[Collector], engine: Engine, acting: Acting)
 
 
 def parted(joined: Collector, collectors: Sequence[Collector]) -> None:
-    """The inverse of ``joined_from``: each stands where its part of ``joined`` does."""
+    """Invert ``joined_from``: each stands where its part of ``joined`` does."""
     first = 0
     for collector in collectors:
         part = slice(first, first + collector.num_envs)

@@ -82,7 +82,7 @@ class Collectors:
 
 
 def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
-    """The states of several collectors as one; see ``split_states``."""
+    """Return the states of several collectors as one; see ``split_states``."""
     found: dict[str, Array] = {"collectors": np.array([len(states)])}
     for i, state in enumerate(states):
         found |= prefixed(str(i), state)
@@ -90,7 +90,7 @@ def joined_states(states: Sequence[dict[str, Array]]) -> dict[str, Array]:
 
 
 def split_states(state: dict[str, Array], count: int) -> list[dict[str, Array]]:
-    """The states of each of ``count`` collectors.
+    """Return the states of each of ``count`` collectors.
 
     Raises:
         RunError: it is that of another number of collectors.

@@ -143,7 +143,7 @@ class Level:
         return {i: policy for i, policy in policies if isinstance(policy, Learning)}
 
     def all(self) -> Iterator[Level]:
-        """This level and all below it, each before those below it."""
+        """Return this level and all below it, each before those below it."""
         yield self
         for level in self.below.values():
             yield from level.all()

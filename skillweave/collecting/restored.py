@@ -26,7 +26,7 @@ PLAYERS = ("player", "starters")
 
 
 def known(x: Array) -> Array:
-    """A copy in which NaN is 0: who takes a diverged member's place goes on with its open calls."""
+    """Return a copy with 0 for NaN: an heir of a diverged member goes on with its open calls."""
     return np.where(np.isnan(x), np.float32(0), x)
 
 

@@ -62,7 +62,7 @@ def packed(thing: Any, who: str) -> bytes:
 
 
 def unpacked(data: bytes) -> Any:
-    """The inverse of ``packed``."""
+    """Invert ``packed``."""
     registered, algorithms, folders, thing = pickle.loads(data)
     for folder in folders:
         add_folder(Path(folder))

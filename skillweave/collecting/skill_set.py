@@ -81,7 +81,7 @@ class SkillSet:
         return self.parts[i] if self.parts else None
 
     def limit(self, i: int) -> int | None:
-        """Steps after which a call of skill ``i`` is cut, its own limit included; None: never."""
+        """Return the steps after which a call of skill ``i`` is cut, by any limit; None: never."""
         skill = self.skills[i]
         most = self.call_steps if skill.call_steps is None else skill.call_steps
         limits = [x for x in (most, skill.max_steps) if isinstance(x, int)]
@@ -89,7 +89,7 @@ class SkillSet:
 
 
 def skills_below(policy: Any) -> SkillSet | None:
-    """The skills of a policy that is a hierarchy; None: it is none."""
+    """Return the skills of a policy that is a hierarchy; None: it is none."""
     found = getattr(policy, "skills", None)
     return found if isinstance(found, SkillSet) else None
 

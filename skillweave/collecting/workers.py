@@ -63,7 +63,7 @@ class Worker(Protocol):
         ...
 
     def receive(self) -> Any:
-        """The answer to the oldest task that has none.
+        """Return the answer to the oldest task that has none.
 
         Raises:
             WorkerLost: it has ended.
@@ -122,7 +122,7 @@ class LocalWorker:
         self._due.append((what, task))
 
     def receive(self) -> Any:
-        """The answer to the oldest task that has none."""
+        """Return the answer to the oldest task that has none."""
         what, task = self._due.popleft()
         if self._station is None:
             self._station = WorkerHost(self._make, self._each, self._number)
@@ -307,7 +307,7 @@ class WorkerCollectors(Workers, Collectors):
         return found
 
     def _shared(self, task: Any) -> Sequence[Any]:
-        """A task for each worker, where all get the same."""
+        """Return a task for each worker, where all get the same."""
         return [task] * len(self._workers)
 
     def _divided(self, seeds: Seeds) -> list[Seeds]:

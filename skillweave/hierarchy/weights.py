@@ -242,7 +242,6 @@ def _ready_parts(
     roles: Roles, tensors: Mapping[str, Tensor], header: Mapping[str, Any], path: Path
 ) -> dict[str, Policy]:
     """Return the ready policies and selectors as they were when the file was written, by path."""
-
     recorded = header["ready"]
     policies: dict[str, Policy] = {}
     for name, policy in ready_policies(roles).items():

@@ -11,7 +11,7 @@ _CONTROLS = re.compile(
 
 
 def printable(text: str) -> str:
-    """Escape the control characters of a text (``\\x1b`` for the one that terminals obey).
+    r"""Escape the control characters of a text (``\x1b`` for the one that terminals obey).
 
     Tabs and newlines do not change.
     """

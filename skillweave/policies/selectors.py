@@ -474,7 +474,7 @@ class Tree(Rule):
         }
 
     def _place(self, node: Node) -> None:
-        """Number a node and all below it, so that memories can be arrays."""
+        """Give a node and all below it numbers, so that memories can be arrays."""
         alike = self._alike[type(node)]
         if node in self.places:
             raise PolicyError(f"{self.who}: a node stands in two places: {node!r:.100}")

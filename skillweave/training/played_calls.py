@@ -79,7 +79,7 @@ class PlayedCalls:
         return {recorder.path: recorder for recorder in self._feed.recorders}
 
     def logs(self, seeds: Sequence[int]) -> dict[str, CallLog]:
-        """Return the log of each level, by its path; \"\": the outermost.
+        """Return the log of each level, by its path; "": the outermost.
 
         Args:
             seeds: of the episodes, in order.

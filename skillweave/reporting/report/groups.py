@@ -88,6 +88,6 @@ def _distinguishing(groups: Sequence[Group]) -> list[str]:
 
 
 def _letter(number: int) -> str:
-    """Return A to Z, then A2, B2, …"""
+    """Return A to Z, then A2, B2 and so on."""
     turn, at = divmod(number, 26)
     return chr(ord("A") + at) + (str(turn + 1) if turn else "")
