@@ -69,7 +69,6 @@ def plan(**settings: Any) -> Plan:
 
 
 WRONG: list[tuple[Callable[[], Any], str]] = [
-    (lambda: sw.PPO(learning_rat=1), "PPO has no setting 'learning_rat': is 'learning_rate' meant"),
     (lambda: sw.PPO(lr=1), "PPO has no setting 'lr': is 'learning_rate' meant"),
     (lambda: sw.PPO(Gamma=1), "is 'gamma' meant"),
     (
@@ -85,21 +84,8 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: sw.evaluate(), "evaluate() needs policy and env: write evaluate(policy, env)"),
     (lambda: sw.envpool("CartPole-v1"), "envpool() needs num_envs and threads and seed"),
     # Groups of settings
-    (
-        lambda: plan(practice_steps=5),
-        "Plan has no setting 'practice_steps'; it is a setting of budget: write "
-        "budget=Budget(practice_steps=...)",
-    ),
-    (lambda: plan(practice_step=5), "'practice_steps' meant, a setting of budget? Write budget="),
-    (lambda: plan(restrict=False), "a setting of advice: write advice=Advice(restrict=...)"),
-    (lambda: plan(gamma=1.0), "a setting of algorithm: write algorithm=PPO(gamma=...)"),
     (lambda: plan(rnn=1), "write algorithm=PPO(network=Network(rnn=...))"),
     (lambda: plan(call_step=5), "Plan has no setting 'call_step': is 'call_steps' meant"),
-    (lambda: plan(seed=5), "'seed'; it is an argument of train(): write train(seed=...)"),
-    (
-        lambda: plan().train("runs", call_steps=5),
-        "train() has no argument 'call_steps'; it is a setting of Plan: write Plan(call_steps=...)",
-    ),
     (lambda: plan().train("runs", gamma=1.0), "write Plan(algorithm=PPO(gamma=...))"),
     (lambda: plan().train("runs", verbose_=1), "its arguments are run_dir, seed, quiet"),
     # Too few and too many
@@ -107,15 +93,9 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: Plan("CartPole-v1"), "Plan needs skills: write Plan(env, skills)"),
     (lambda: plan().train(), "train() needs run_dir: write train(run_dir)"),
     (lambda: Plan("a", [], 1, sw.PPO(), Budget(), None, 2), "takes at most 6 of its arguments"),
-    (lambda: plan().train("runs", 3), "name the others, seed=... for example"),
     (lambda: plan(env="a"), "was given env twice"),
     # Attributes
     (lambda: setattr(plan(), "spec", 5), "Plan.spec is computed; it cannot be set"),
-    (lambda: setattr(plan(), "call_step", 5), "no setting 'call_step': is 'call_steps' meant"),
-    (
-        lambda: setattr(sw.PPO(), "gamma", 0.9),
-        "PPO cannot be changed: make another one, with dataclasses.replace(..., gamma=0.9)",
-    ),
     (lambda: setattr(sw.PPO(), "gama", 0.9), "PPO has no setting 'gama': is 'gamma' meant"),
 ]  # fmt: skip
 

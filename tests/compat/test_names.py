@@ -110,20 +110,3 @@ def test_both_spellings_mean_the_same():
     for old, today in TODAY.items():
         for place in kinds if old in dir(kinds[0]) else (utils,):
             assert getattr(place, old) is getattr(place, today)
-
-
-def statements(source: str) -> int:
-    """Count statements, docstrings left out: however many lines each of them takes."""
-    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt)]
-    return sum(
-        not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)) for node in nodes
-    )
-
-
-def test_the_count_leaves_out_what_is_no_code():
-    assert statements('"""A\n\nb."""\n\nx = 1  # one\n# two\ndef f():\n    """C."""\n') == 2
-
-
-def test_the_shim_is_thin():
-    files = (ROOT / "skillweave/compat/agilerl").rglob("*.py")
-    assert sum(statements(path.read_text()) for path in files) <= 480

@@ -50,7 +50,6 @@ def third_step(env):
 
 
 WRONG = {
-    "four values": (GOOD[:4], "step.. returned 4 values; Gymnasium needs five"),
     "nothing": (None, "step.. returned a NoneType"),
     "a complex reward": (but(reward=1 + 2j), r"reward is \(1\+2j\); it must be a number"),
     "a text as reward": (but(reward="1.5"), "reward is '1.5'"),

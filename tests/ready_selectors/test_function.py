@@ -44,8 +44,6 @@ WRONG = {
     "a negative number": (lambda obs: np.full(len(obs), -1), "returned -1"),
     "a wrong shape": (lambda obs: np.zeros((len(obs), 1), int), r"returned shape \(1, 1\)"),
     "one name": (lambda obs: "get_key", r"returned shape \(\)"),
-    "fractions": (lambda obs: np.zeros(len(obs)), "returned float64"),
-    "no skill's name": (lambda obs: ["walk"] * len(obs), "names 'walk', which is no skill"),
     "None": (lambda obs: [None] * len(obs), "names None, which is no skill"),
     "an error": (lambda obs: obs[:, 99], "IndexError"),
     "one that may not start": (

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from skillweave.errors import DeclarationError, MissingExtra, SkillweaveError
+from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, trackers_of
 
@@ -23,13 +23,6 @@ def run(tmp_path: Path) -> RunDirectory:
 
 def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
     assert make_trackers((), run) == ()
-
-
-def test_an_unknown_tracker_is_answered_with_those_there_are(run: RunDirectory) -> None:
-    with pytest.raises(
-        DeclarationError, match="'tensorbored'; there are: tensorboard, wandb, mlflow"
-    ):
-        make_trackers(("tensorbored",), run)
 
 
 def uninstall(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
