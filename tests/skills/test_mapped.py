@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
 from typing import Any
 
 import cloudpickle
 import numpy as np
 import pytest
-from skills import mapped_models
 from skills.mapped_models import ACTION, CASES, SPACE, Case, observations
 
 from skillweave.skills.foreign_policy import fitted
@@ -94,16 +91,3 @@ def test_it_acts_the_same_in_another_process(cases: dict[str, Case], name: str) 
         action, memory = policy.act(memory, obs)
         other, memories = sent.act(memories, obs)
         np.testing.assert_array_equal(other, action)
-
-
-def test_each_is_declared_in_a_few_lines() -> None:
-    source = Path(mapped_models.__file__).read_text()
-    lines = {
-        function.name: statement.end_lineno - statement.lineno + 1
-        for function in ast.parse(source).body
-        if isinstance(function, ast.FunctionDef) and function.name.endswith("_case")
-        for statement in function.body
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "policy"
-    }
-    assert len(lines) == len(CASES)
-    assert max(lines.values()) <= 15
