@@ -572,7 +572,7 @@ def test_ctrl_c_ends_with_code_130_and_says_how_to_go_on(interrupted: dict[str, 
 
 @pytest.mark.slow
 def test_the_command_that_ctrl_c_names_is_complete(interrupted: dict[str, Any]) -> None:
-    # A recipe in a user's file must be pointed to (contract 7), so the command must say so.
+    # A recipe in a user's file must be pointed to (contract 14), so the command must say so.
     assert f"--recipe {interrupted['recipe']}" in interrupted["err"]
 
 

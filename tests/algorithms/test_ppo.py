@@ -446,11 +446,6 @@ def test_a_terminal_observation_that_is_not_finite_does_no_harm():
     assert torch.isfinite(state.params).all()
 
 
-def test_a_batch_is_no_larger_than_a_rollout():
-    with pytest.raises(DeclarationError, match=r"PPO\.batch_size is 4097; it must be at most 4096"):
-        PPO(batch_size=64 * 64 + 1)
-
-
 def test_a_small_rollout_needs_no_batch_size_of_its_own():
     assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
 

@@ -265,8 +265,6 @@ def test_when_ffmpeg_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read
 
 
 def test_bad_videos_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DeclarationError, match=r"a\.avi.*\.gif or \.mp4"):
-        VideoWriter(tmp_path / "a.avi", fps=10)
     with pytest.raises(RunError, match="no frames"), VideoWriter(tmp_path / "a.gif", 10):
         pass
     frame = np.zeros((8, 8, 3), np.uint8)
