@@ -1,7 +1,4 @@
-"""The recorded calls of a run: in its directory, or in memory.
-
-Stands alone because it joins run directories and policies, which know nothing of each other.
-"""
+"""The recorded calls of a run: in its directory, or in memory."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Continue the run in a directory, perhaps for more steps.
-
-Stands alone because a new run needs none of it.
-"""
+"""Continue the run in a directory, perhaps for more steps."""
 
 from __future__ import annotations
 

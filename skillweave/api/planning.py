@@ -1,7 +1,4 @@
-"""A hierarchy whose selector is a planner, in an environment that is scored by its task.
-
-Stands alone because nothing of it is trained or written, unlike all else that makes a run.
-"""
+"""A hierarchy whose selector is a planner, in an environment that is scored by its task."""
 
 from __future__ import annotations
 

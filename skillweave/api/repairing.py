@@ -1,7 +1,4 @@
-"""The course of ``Run.repair``: measure a hand-over, train on, measure again, keep the better.
-
-Stands alone because a new run needs none of it.
-"""
+"""The course of ``Run.repair``: measure a hand-over, train on, measure again, keep the better."""
 
 from __future__ import annotations
 

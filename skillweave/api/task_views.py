@@ -1,7 +1,6 @@
 """Skills, reflexes and selectors in an environment whose observations hold a task's state.
 
-They were made for the environment itself, so each sees its observations alone. Stands alone because
-it makes the parts of a hierarchy for other observations, and ``planning`` joins them.
+They were made for the environment itself, so each sees its observations alone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Priorities of replayed transitions in sum trees (Schaul et al. 2016, appendix B.2.1).
-
-Stands alone because sum trees know nothing of transitions.
-"""
+"""Priorities of replayed transitions in sum trees (Schaul et al. 2016, appendix B.2.1)."""
 
 from __future__ import annotations
 

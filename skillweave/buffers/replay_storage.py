@@ -1,7 +1,4 @@
-"""Storage of replayed transitions in columns, one for each environment; no observation twice.
-
-Stands alone because it only stores columns; ``replay`` samples from them.
-"""
+"""Storage of replayed transitions in columns, one for each environment; no observation twice."""
 
 from __future__ import annotations
 

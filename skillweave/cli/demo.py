@@ -1,8 +1,7 @@
 """``skillweave demo``: a task that a flat agent learns, and one where skills pay.
 
-Stands alone because it is a script that trains, compares and explains, with texts of its own. The
-flat agents with all steps would take five minutes. ``python -m benchmarks.demo_flat`` trains them
-and writes their scores to ``demo_flat.json``, which is quoted here.
+The flat agents with all steps would take five minutes. ``python -m benchmarks.demo_flat`` trains
+them and writes their scores to ``demo_flat.json``, which is quoted here.
 """
 
 from __future__ import annotations

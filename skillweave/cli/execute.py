@@ -1,7 +1,4 @@
-"""Carry out each command of the command line.
-
-Stands alone because it imports torch, which parsing and ``--help`` do not need.
-"""
+"""Carry out each command of the command line."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """Jobs side by side, each in a fresh process that ends when this one does, however it ends.
 
-Stands alone because a job may be anything: benchmarks use these processes, too.
-
 ``ProcessPoolExecutor`` does not serve: where each of its processes does one job alone
 (``max_tasks_per_child=1``), it may wait forever at its shutdown.
 """

@@ -1,8 +1,7 @@
 """``sweep``: many runs of a recipe, here in processes or on Ray, and a table of their results.
 
-Stands alone because it schedules runs; ``execute`` only prints its results. Each run is an
-ordinary run directory. A sweep that was stopped, or one of its runs, continues when the same
-command is given again.
+Each run is an ordinary run directory. A sweep that was stopped, or one of its runs, continues when
+the same command is given again.
 """
 
 from __future__ import annotations

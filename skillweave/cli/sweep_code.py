@@ -1,8 +1,7 @@
 """The checksum of a sweep's code, kept in a file of the sweep's directory.
 
-Stands alone because it reads code, and ``sweep`` trains runs. A run's identity covers settings,
-not code. Without this file, an edited recipe would continue the sweep of the recipe as it was, and
-one table would mix both.
+A run's identity covers settings, not code. Without this file, an edited recipe would continue the
+sweep of the recipe as it was, and one table would mix both.
 """
 
 from __future__ import annotations

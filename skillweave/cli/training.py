@@ -1,7 +1,4 @@
-"""Commands that train: a recipe, its flat agent, and the end of a stopped run.
-
-Stands alone because these commands share how a run is trained, summarised and compared.
-"""
+"""Commands that train: a recipe, its flat agent, and the end of a stopped run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Calls of a trace: a selector's decisions, each with the whole call that followed it.
-
-Stands alone because it reads a trace, and a collector writes it.
-"""
+"""Calls of a trace: a selector's decisions, each with the whole call that followed it."""
 
 from __future__ import annotations
 

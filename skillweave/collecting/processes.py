@@ -1,7 +1,5 @@
 """Collectors in processes of their own: environments step and policies act there.
 
-Stands alone because processes are one kind of workers; actors of Ray are the other.
-
 Each request is for a whole rollout (``channel``). A process that dies is started again
 (``workers``). A process whose parent dies ends itself (``worker_process``).
 """

@@ -1,7 +1,4 @@
-"""Sources of experience: environments that are stepped, or batches that were recorded before.
-
-Stands alone because the loop reads environments and recorded batches in the same way.
-"""
+"""Sources of experience: environments that are stepped, or batches that were recorded before."""
 
 from __future__ import annotations
 

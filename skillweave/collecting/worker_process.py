@@ -1,7 +1,4 @@
-"""The main function of a worker process.
-
-Stands alone because it runs in the worker, not in the process of the run.
-"""
+"""The main function of a worker process."""
 
 from __future__ import annotations
 

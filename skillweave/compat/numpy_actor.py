@@ -1,7 +1,6 @@
 """Networks that act on few observations at a time, with NumPy in place of torch.
 
-Stands alone because it repeats layers of ``networks`` in NumPy, for speed. MLPs are copied into
-NumPy. Every other network acts in torch, by the same interface.
+MLPs are copied into NumPy. Every other network acts in torch, by the same interface.
 """
 
 from __future__ import annotations

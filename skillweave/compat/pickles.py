@@ -1,7 +1,5 @@
 """Read checkpoints of ``torch.save`` without running code from them.
 
-Stands alone because it only makes reading safe; ``agilerl_files`` knows what the content means.
-
 A pickle is a program that calls what it names. Here it may name only what builds tensors, NumPy
 numbers and arrays, devices and plain containers, each by a function of this module's or one that
 has no other effect; everything else stops the reading.

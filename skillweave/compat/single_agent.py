@@ -1,7 +1,4 @@
-"""One agent for a user's training loop: it acts, learns and is saved.
-
-Stands alone because modules of ``agilerl`` only translate names.
-"""
+"""One agent for a user's training loop: it acts, learns and is saved."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A replay buffer for a user's training loop.
-
-Stands alone because modules of ``agilerl`` only translate names.
-"""
+"""A replay buffer for a user's training loop."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The engine of EnvPool: C++ threads, the same dynamics, several times the speed.
-
-Stands alone because it is one of the two implementations of ``Engine``.
-"""
+"""The engine of EnvPool: C++ threads, the same dynamics, several times the speed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Notices of images whose bounds do not fit their values, because networks scale by the bounds.
-
-Stands alone because it is one rule with its own state, which ``Watch`` only calls.
-"""
+"""Notices of images whose bounds do not fit their values, because networks scale by the bounds."""
 
 from __future__ import annotations
 

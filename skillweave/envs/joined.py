@@ -1,7 +1,4 @@
-"""Several engines of one kind as one, for a population's members.
-
-Stands alone because it is an engine itself, which implements the stepping part of ``Engine``.
-"""
+"""Several engines of one kind as one, for a population's members."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Networks that grow and shrink: units and layers are added to named parameters, or removed.
 
-Stands alone because it is the mathematics of growth, on tensors alone. Growth does not change the
-function (Net2Net, Chen et al. 2016, with zero outgoing weights): new units are read with weight
-zero, a new layer computes the identity.
+Growth does not change the function (Net2Net, Chen et al. 2016, with zero outgoing weights): new
+units are read with weight zero, a new layer computes the identity.
 
 Letters in shapes: R rows, one per network (a member, or a member's critic).
 """

@@ -1,7 +1,6 @@
 """A population: members that train in stacks, are compared, and become the next generation.
 
-Stands alone because a population has no files, which are the concern of ``stage``. Between
-generations members are independent; ``stacks`` joins them for learning in a ``part``.
+Between generations members are independent; ``stacks`` joins them for learning in a ``part``.
 """
 
 from __future__ import annotations

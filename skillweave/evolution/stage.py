@@ -1,8 +1,7 @@
 """A stage in which a population evolves, generation by generation, in a run directory.
 
-Stands alone because ``plan`` is the declaration of evolving stages, without training. The stage
-also writes a line to ``lineage.jsonl`` for each member of each generation. A killed run resumes
-from the last complete generation.
+The stage also writes a line to ``lineage.jsonl`` for each member of each generation. A killed run
+resumes from the last complete generation.
 """
 
 from __future__ import annotations

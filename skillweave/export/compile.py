@@ -1,7 +1,4 @@
-"""A policy that acts here as one of plain data, with its networks as ONNX files.
-
-Stands alone because ``write`` makes a folder of it, which is another thing.
-"""
+"""A policy that acts here as one of plain data, with its networks as ONNX files."""
 
 from __future__ import annotations
 

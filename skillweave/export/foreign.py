@@ -1,7 +1,4 @@
-"""Models from elsewhere as ONNX files, behind the mapping that is around them.
-
-Stands alone because each kind of model is converted in its own way.
-"""
+"""Models from elsewhere as ONNX files, behind the mapping that is around them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Policies from folders that ``write`` wrote, for skills and evaluations.
-
-Stands alone because no part of an export needs it.
-"""
+"""Policies from folders that ``write`` wrote, for skills and evaluations."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Fit a hierarchy to its environment: algorithms, reflexes, and all that is ready to act.
-
-Stands alone because it needs an environment, and a declaration does not.
-"""
+"""Fit a hierarchy to its environment: algorithms, reflexes, and all that is ready to act."""
 
 from __future__ import annotations
 

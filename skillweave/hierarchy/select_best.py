@@ -1,7 +1,5 @@
 """Choice of the hierarchy that a run ends with: episodes of all candidates are compared.
 
-Stands alone because it plays episodes, and ``training`` runs stages.
-
 The episodes are played by the engine of training, in one process: in a pool, where it has one.
 """
 

@@ -1,8 +1,7 @@
 """The encoder that runs a PyTorch module of the user from the flat parameters of P members.
 
-Stands alone because it implements the ``Encoder`` protocol, as a user's encoder does. The user's
-factory creates a ``torch.nn.Module`` for an observation space, as for a features extractor of
-Stable-Baselines3. Its parameters are columns of the flat tensor, like all others, and
+The user's factory creates a ``torch.nn.Module`` for an observation space, as for a features
+extractor of Stable-Baselines3. Its parameters are columns of the flat tensor, like all others, and
 ``torch.func.functional_call`` runs the module with the values of one member.
 """
 

@@ -1,7 +1,4 @@
-"""Files of call logs: safetensors, read with checks, so that a foreign file cannot do harm.
-
-Stands alone because it is a format of files, with its schema.
-"""
+"""Files of call logs: safetensors, read with checks, so that a foreign file cannot do harm."""
 
 from __future__ import annotations
 

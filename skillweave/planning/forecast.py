@@ -1,7 +1,4 @@
-"""Forecasts of plans: episodes that follow a plan along logged calls, before it is played.
-
-Stands alone because it judges a plan, and the planner makes it.
-"""
+"""Forecasts of plans: episodes that follow a plan along logged calls, before it is played."""
 
 from __future__ import annotations
 

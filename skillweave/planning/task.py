@@ -1,7 +1,4 @@
-"""Every kind of task in one form.
-
-Stands alone because it names all kinds.
-"""
+"""Every kind of task in one form."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""An environment whose reward and ends are those of a task.
-
-Stands alone because it is an environment; all else here plans or judges.
-"""
+"""An environment whose reward and ends are those of a task."""
 
 from __future__ import annotations
 

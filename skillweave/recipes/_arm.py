@@ -1,7 +1,4 @@
-"""The robot's arm of ``pick-and-place``: its task and disturbances.
-
-Stands alone because it is the environment, and the recipe has only skills.
-"""
+"""The robot's arm of ``pick-and-place``: its task and disturbances."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The half-cheetah of ``shuttle``: its task, alone and in EnvPool.
-
-Stands alone because it is the environment, and the recipe has only skills.
-"""
+"""The half-cheetah of ``shuttle``: its task, alone and in EnvPool."""
 
 from __future__ import annotations
 

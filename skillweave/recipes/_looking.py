@@ -1,7 +1,4 @@
-"""A scripted policy that explores rooms until it sees a task.
-
-Stands alone because it is a policy, and the recipe has only skills.
-"""
+"""A scripted policy that explores rooms until it sees a task."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The mazes of the recipe ``mazes``: PointMaze, alone and in EnvPool.
-
-Stands alone because it is the environment, and the recipe has only skills.
-"""
+"""The mazes of the recipe ``mazes``: PointMaze, alone and in EnvPool."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """The lander of ``lander-missions``: up to three legs, and gusts.
 
-Stands alone because it is the environment, and the recipe has only skills.
-
 A mission is defined in one place, ``Progress``, for one environment (``Mission``) as for many
 side by side in EnvPool (``MissionPool``).
 """

@@ -1,7 +1,4 @@
-"""The page of a run on the hub: a model card, written from the run's files.
-
-Stands alone because it only writes text; ``runs.hub`` uploads it.
-"""
+"""The page of a run on the hub: a model card, written from the run's files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Displays of progress: bars on a terminal, a table in a notebook.
-
-Stands alone because it only draws; ``progress`` chooses what is shown, and when.
-"""
+"""Displays of progress: bars on a terminal, a table in a notebook."""
 
 from __future__ import annotations
 

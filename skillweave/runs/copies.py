@@ -1,7 +1,4 @@
-"""A run's copies of policies that were ready when it began.
-
-Stands alone because it joins run directories with foreign policies, which know nothing of runs.
-"""
+"""A run's copies of policies that were ready when it began."""
 
 from __future__ import annotations
 

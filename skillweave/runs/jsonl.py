@@ -1,7 +1,4 @@
-"""Files of JSON lines: a run appends to them, and a resumed run first shortens them.
-
-Stands alone because it is one format of files; ``files`` has the others.
-"""
+"""Files of JSON lines: a run appends to them, and a resumed run first shortens them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The lock of a run, so one process trains it at a time; the system releases it at process end.
-
-Stands alone because locks differ between operating systems.
-"""
+"""The lock of a run, so one process trains it at a time; the system releases it at process end."""
 
 from __future__ import annotations
 

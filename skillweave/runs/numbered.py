@@ -1,7 +1,4 @@
-"""Numbered directories, for runs without a directory from the user.
-
-Stands alone because it only makes directories, and knows nothing of runs.
-"""
+"""Numbered directories, for runs without a directory from the user."""
 
 from __future__ import annotations
 

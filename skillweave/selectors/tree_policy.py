@@ -1,7 +1,4 @@
-"""A behaviour tree as a policy over skills.
-
-Stands alone because ``tree`` is the declaration, which users import.
-"""
+"""A behaviour tree as a policy over skills."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Policies made elsewhere that a skill begins to learn with: their networks, as data.
-
-Stands alone because ``from_sb3`` and ``from_torch`` make them, and neither imports the other's
-library.
-"""
+"""Policies made elsewhere that a skill begins to learn with: their networks, as data."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Search for what the methods of a skill read of a step: keys of ``info``, and the goal.
-
-Stands alone because a skill is declared without it; only what records and judges steps needs it.
-"""
+"""Search for what the methods of a skill read of a step: keys of ``info``, and the goal."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Stable-Baselines3 models as policies.
-
-Stands alone because it is one kind of foreign policy, as ``onnx_file`` and ``torch_module`` are.
-"""
+"""Stable-Baselines3 models as policies."""
 
 from __future__ import annotations
 

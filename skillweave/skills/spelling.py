@@ -1,7 +1,4 @@
-"""Attributes of a user's skill that look misspelt, for the warnings of its declaration.
-
-Stands alone because of its two tables of names from other libraries.
-"""
+"""Attributes of a user's skill that look misspelt, for the warnings of its declaration."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Errors of unsupported action spaces, with wrappers that make supported ones of them.
-
-Stands alone because it writes code for users, not actions.
-"""
+"""Errors of unsupported action spaces, with wrappers that make supported ones of them."""
 
 from __future__ import annotations
 

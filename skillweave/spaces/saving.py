@@ -1,7 +1,4 @@
-"""Spaces as JSON, and the comparison of spaces for policies.
-
-Stands alone because it is a format of files, with its schema.
-"""
+"""Spaces as JSON, and the comparison of spaces for policies."""
 
 from __future__ import annotations
 

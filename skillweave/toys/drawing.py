@@ -1,7 +1,5 @@
 """Shapes with smooth edges by NumPy alone, for pictures of any toy.
 
-Stands alone because any toy can be drawn with it.
-
 A shape is an array of signed distances: for each pixel the distance to the shape's edge, in the
 world's units and negative inside. The union of two shapes is their ``np.minimum``.
 """

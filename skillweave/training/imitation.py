@@ -1,7 +1,4 @@
-"""Imitation: a network learns the choices of another policy, before it learns by itself.
-
-Stands alone because it is a fit to given choices; all else here learns from experience.
-"""
+"""Imitation: a network learns the choices of another policy, before it learns by itself."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A learner of several policies from one stream of steps, each with its own rows.
-
-Stands alone because it learns; ``joint`` runs the stage.
-"""
+"""A learner of several policies from one stream of steps, each with its own rows."""
 
 from __future__ import annotations
 

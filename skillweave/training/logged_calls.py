@@ -1,7 +1,4 @@
-"""The log of calls that a stage keeps while it trains.
-
-Stands alone because it joins a recorder with a run's directory, which no learner needs to know.
-"""
+"""The log of calls that a stage keeps while it trains."""
 
 from __future__ import annotations
 

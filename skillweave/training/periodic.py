@@ -1,7 +1,4 @@
-"""Evaluation of an agent while it trains: whole episodes in separate environments.
-
-Stands alone because it plays episodes, and ``trainer`` trains.
-"""
+"""Evaluation of an agent while it trains: whole episodes in separate environments."""
 
 from __future__ import annotations
 

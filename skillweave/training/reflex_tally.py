@@ -1,7 +1,4 @@
-"""Counts of the steps of an evaluation in which each reflex acted.
-
-Stands alone because it only counts.
-"""
+"""Counts of the steps of an evaluation in which each reflex acted."""
 
 from __future__ import annotations
 

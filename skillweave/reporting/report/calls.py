@@ -1,7 +1,4 @@
-"""The calls of a report's episodes as plain data: timelines, choices.
-
-Stands alone because it has no words; ``single`` writes the page.
-"""
+"""The calls of a report's episodes as plain data: timelines, choices."""
 
 from __future__ import annotations
 

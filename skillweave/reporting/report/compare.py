@@ -1,7 +1,4 @@
-"""The report that compares runs: groups of seeds, with interquartile means and intervals.
-
-Stands alone because it is a page of its own, beside the report of one run (``single``).
-"""
+"""The report that compares runs: groups of seeds, with interquartile means and intervals."""
 
 from __future__ import annotations
 

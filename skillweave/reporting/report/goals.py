@@ -1,7 +1,4 @@
-"""Success over the goals of skills, from played calls: a map, or a bar for each goal.
-
-Stands alone because it is about skills with goals only; ``single`` writes the page.
-"""
+"""Success over the goals of skills, from played calls: a map, or a bar for each goal."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The hand-over section of a report, from the log of calls in the run: a matrix, films, ends.
-
-Stands alone because all of it is about the run's log of calls; ``single`` writes the page.
-"""
+"""The hand-over section of a report, from the log of calls in the run: a matrix, films, ends."""
 
 from __future__ import annotations
 
