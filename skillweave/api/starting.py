@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from gymnasium import Space
@@ -34,16 +34,24 @@ from skillweave.skills.learnable import Learnable
 from skillweave.spaces import same_space
 from skillweave.training.role import Role
 
-Directory = str | Path
-Origin = Directory | Learnable | Learnt
-"""What a learner starts from: a run's directory, or a policy."""
-Directories = Directory | Mapping[str, Origin] | Learnable | None
-"""What to start from: a run, a policy made elsewhere (of a plain agent), or these by learner."""
+
+class InDirectory(Protocol):
+    """A ``Run``."""
+
+    path: Path
+    """Its directory."""
+
+
+Origin = str | Path | InDirectory | Learnable | Learnt
+"""What a learner starts from: a run, its directory, or a policy made elsewhere
+(``from_sb3(..., learn=True)``)."""
+StartFrom = Origin | Mapping[str, Origin] | None
+"""What to start from: that of all learners of these names, or one by learner."""
 
 
 def starts(
     content: dict[str, Any],
-    start_from: Directories,
+    start_from: StartFrom,
     roles: Mapping[str, Role],
 ) -> tuple[dict[str, Learnt], str]:
     """Return the policies that learners start from, by name, and a sentence about them.
@@ -141,7 +149,7 @@ def _config_in(stage: Mapping[str, Any], name: str) -> Any:
     return config_from_json(stage.get("algorithms", {}).get(name, stage["algorithm"]))
 
 
-def _place(run: Directory, argument: str) -> Path:
+def _place(run: Any, argument: str) -> Path:
     """Return the directory of a run.
 
     Raises:
@@ -153,7 +161,7 @@ def _place(run: Directory, argument: str) -> Path:
             f"{argument} is {what}, and a training starts only from what a run of Skillweave has "
             f"learnt: its directory; {way}"
         )
-    return as_path(run, argument)
+    return as_path(getattr(run, "path", run), argument)
 
 
 def _use_of(value: Any) -> tuple[str, str] | None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
 from skillweave.collecting.lengths import Lengths
-from skillweave.envs.make import EnvSpec, Spaces, spec_of
+from skillweave.envs.make import Spaces
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
     check_level,
@@ -27,7 +27,6 @@ from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
-from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue
 from skillweave.settings import AtLeastOne, Check, check_fields, fitted
 from skillweave.skills import Reflex, Skill, is_trained
@@ -35,7 +34,7 @@ from skillweave.skills.own_part import ZERO
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import EnvValue, check_env
 from skillweave.training.defaults import TrainDefaults
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import TOGETHER, Stage, Together
 
 D = TypeVar("D", bound="Declaration")
@@ -59,7 +58,7 @@ SelectorValue = Annotated[
 
 @checked_names
 @dataclass
-class Declaration(Nestable):
+class Declaration(Nestable, Declared):
     """Skills, reflexes and a selector on one environment, with budgets in environment steps.
 
     Raises:
@@ -110,13 +109,7 @@ class Declaration(Nestable):
     (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
-    _caller: ClassVar[Caller] = "hierarchy"
-    """The entry point in lines of Python that messages print."""
-    recorded = False
-    """True for a run that was loaded without its code; some of what was declared is missing."""
-
-    def __post_init__(self) -> None:
-        self.validate()
+    _caller = "hierarchy"
 
     def validate(self) -> None:
         """Check every setting; training and loading call it again, as attributes may be set.
@@ -174,11 +167,6 @@ class Declaration(Nestable):
             guide=self.guide,
             flat=self.train_defaults.flat,
         )
-
-    @property
-    def spec(self) -> EnvSpec:
-        """The environment, fully specified."""
-        return spec_of(self)
 
     def skill(self, name: str) -> Skill:
         """Return the skill of this ``name``, or path.

@@ -31,7 +31,8 @@ from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.joint import agents_of
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.options import CallReports, Reports
+from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
@@ -40,7 +41,7 @@ from skillweave.types import Policy
 
 
 def manifest(
-    declaration: Declaration,
+    declaration: Declared,
     *,
     seed: int,
     flat: bool | AlgorithmConfig = False,
@@ -53,6 +54,9 @@ def manifest(
         how: evaluation and checkpoints; None: the declaration's defaults.
     """
     how = how or declaration.train_defaults
+    if isinstance(declaration, PlainAgent):
+        return declaration.manifest(seed, how)
+    assert isinstance(declaration, Declaration)
     if flat is not False:
         return declaration.plain_agent(None if flat is True else flat).manifest(seed, how)
     roles = roles_of(declaration)
@@ -66,12 +70,7 @@ def manifest(
         "env_kwargs": roles.spec.json_kwargs,
         "code": roles.code,
         "seed": seed,
-        "checkpoint_every": how.checkpoint_every,
-        "eval_every": how.eval_every,
-        "eval_episodes": how.eval_episodes,
-        "keep": how.keep,
-        "log_info": how.log_info,
-        **_calls_entry(stages, how),
+        **_reports(stages, how),
         "skills": [_skill_entry(roles, path) for path in roles.skills],
         **_level_entry(roles, roles.outermost),
         "resume_needs_recipe": learns or not roles.trains_from_data,
@@ -80,8 +79,8 @@ def manifest(
     }
 
 
-def _calls_entry(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
-    """Return the settings of the log of calls, if there is to be one.
+def _reports(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
+    """Return the entries of evaluations, checkpoints and logs, also of calls if they are logged.
 
     Raises:
         DeclarationError: no stage has calls to log.
@@ -91,19 +90,19 @@ def _calls_entry(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
             raise DeclarationError(
                 "log_calls_info names keys for the log of calls: set log_calls, too"
             )
-        return {}
+        return how.entries(Reports)
     if not any(s.level == "" and s.kind in ("selector", "together") for s in stages):
         raise DeclarationError(
             "log_calls is set, but no selector acts while this hierarchy trains, as each skill "
             "learns apart and the selector is ready: leave out log_calls, and record calls "
             "afterwards with run.log_calls()"
         )
-    return {"log_calls": how.log_calls, "log_calls_info": how.log_calls_info}
+    return how.entries(CallReports)
 
 
 @torch_threads(1)  # a loop sets its own; the rest must not depend on the number of threads
 def train(
-    declaration: Declaration | PlainAgent,
+    declaration: Declared,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
     make_learner: MakeLearner = agents_of,
@@ -115,7 +114,7 @@ def train(
         done: the events by which a repair is judged, as for ``planning.hand_over``.
     """
     if run.manifest["kind"] == "agent":
-        agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
+        agent = declaration.plain_agent() if isinstance(declaration, Declaration) else declaration
         (stage,) = agent.stages()
         return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
     assert isinstance(declaration, Declaration)
