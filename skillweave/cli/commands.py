@@ -13,6 +13,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from skillweave.training.options import Continuing, Starting
+
 
 @dataclass(frozen=True)
 class Output:
@@ -36,20 +38,13 @@ class OnRay(Output):
 
 
 @dataclass(frozen=True)
-class Train(OnRay):
+class Train(OnRay, Continuing, Starting):
     """Train a recipe: every skill, then the selector."""
 
     recipe: Positional[str] = tyro.MISSING
     """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
-    resume: bool = False
-    """Continue the run in --out if it has learnt something, else start one. Steps that have grown
-    (--set steps=N, --scale) train a finished run for longer."""
-    overwrite: bool = False
-    """Replace the run in --out, also a finished one."""
-    seed: int = 0
-    """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
@@ -93,7 +88,7 @@ class Demo(Output):
 
 
 @dataclass(frozen=True)
-class Resume(OnRay):
+class Resume(OnRay, Continuing):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
     run: Positional[Path] = tyro.MISSING

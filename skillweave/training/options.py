@@ -28,9 +28,9 @@ class Starting:
 
     resume: bool = False
     """Continue the run in this directory if it has learnt something, else start one. It keeps its
-    settings, and a message lists those that differ. If steps have grown, a finished run continues:
-    in new episodes, with schedules over the new budget. Steps of stages whose learners learn again
-    in a later one go to that stage."""
+    settings, and a message lists those that differ. If steps have grown (on the command line by
+    --set steps=N or --scale), a finished run continues: in new episodes, with schedules over the
+    new budget. Steps of stages whose learners learn again in a later one go to that stage."""
     overwrite: bool = False
     """Replace the run in this directory, also a finished one; not with resume. Files there that no
     run writes stay."""
