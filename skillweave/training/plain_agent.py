@@ -12,7 +12,7 @@ from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
 from skillweave.collecting.user_code import environment_texts
-from skillweave.envs.make import EnvSpec, Spaces, spec_of
+from skillweave.envs.make import EnvSpec, Spaces
 from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
@@ -26,10 +26,17 @@ from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage, target_of
 
 
-class Declared(ABC):
+@dataclass
+class InEnv:
+    """The declaration of something that acts in an environment."""
+
+    env: EnvValue
+    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
+
+
+class Declared(InEnv, ABC):
     """The declaration of a hierarchy, or of a plain agent."""
 
-    env: Any
     train_defaults: TrainDefaults
     _caller: ClassVar[Caller]
     """The entry point in lines of Python that messages print."""
@@ -53,8 +60,13 @@ class Declared(ABC):
 
     @property
     def spec(self) -> EnvSpec:
-        """The environment, fully specified."""
-        return spec_of(self)
+        """The environment, fully specified; the same object while ``env`` does not change."""
+        if isinstance(self.env, EnvSpec):
+            return self.env
+        known: EnvSpec | None = vars(self).get("_spec")
+        if known is None or known.env is not self.env:
+            known = vars(self)["_spec"] = EnvSpec(self.env)
+        return known
 
     @abstractmethod
     def check_spaces(self) -> Spaces:
@@ -78,8 +90,6 @@ class PlainAgent(Declared):
         DeclarationError: a setting is wrong; the message names it.
     """
 
-    env: EnvValue
-    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     algorithm: AlgorithmSettings
     """The algorithm's settings."""
     steps: AtLeastOne
