@@ -36,7 +36,7 @@ from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
-from skillweave.training.trainer import train_stages
+from skillweave.training.trainer import Course
 from skillweave.types import Policy
 
 
@@ -113,10 +113,11 @@ def train(
     Args:
         done: the events by which a repair is judged, as for ``planning.hand_over``.
     """
+    course = Course(run, listeners, make_learner, done)
     if run.manifest["kind"] == "agent":
         agent = declaration.plain_agent() if isinstance(declaration, Declaration) else declaration
         (stage,) = agent.stages()
-        return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
+        return course.train([stage], {})[stage.name]
     assert isinstance(declaration, Declaration)
     roles = _with_recorded_bases(roles_of(declaration), run)
     policies: Policies = _ready(roles, run)
@@ -128,24 +129,17 @@ def train(
         decided = resolve_greedy(roles, run)
         stages = level_stages(decided, decided.levels[level.path], budgets)
         apart = [s for s in stages if s.kind != "together"]
-        policies = train_stages(apart, run, listeners, policies, make_learner)
+        policies = course.train(apart, policies)
         if len(apart) < len(stages):
-            after = train_stages(stages[len(apart) :], run, listeners, policies, make_learner)
-            policies = select_best(roles, level, run, listeners, policies, after)
-    policies = _repaired(roles, run, listeners, policies, make_learner, done)
-    return assembled(resolve_greedy(roles, run), policies)
-
-
-def _repaired(
-    roles: Roles,
-    run: RunDirectory,
-    listeners: tuple[Listener, ...],
-    policies: Policies,
-    make_learner: MakeLearner,
-    done: Mapping[str, Any] | None,
-) -> Policies:
-    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+            after = course.train(stages[len(apart) :], policies)
+            policies = select_best(roles, level, course, policies, after)
     roles = resolve_greedy(roles, run)
+    return assembled(roles, _repaired(roles, course, policies))
+
+
+def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
+    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+    run, done = course.run, course.done
     for entry in run.manifest["stages"]:
         if "repair" not in entry:
             continue
@@ -155,11 +149,8 @@ def _repaired(
                 f"{', '.join(entry['repair']['done'])}, which is code: "
                 f"continue it by {repair_words(entry['repair'], run)}"
             )
-        after = train_stages(
-            [repair_stage(roles, entry, done)], run, listeners, policies, make_learner
-        )
-        later = assembled(roles, after)
-        if judge_repair(roles, run, entry, listeners, later, done):
+        after = course.train([repair_stage(roles, entry, done)], policies)
+        if judge_repair(roles, course, entry, assembled(roles, after)):
             policies = after
     return policies
 

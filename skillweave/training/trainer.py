@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -298,36 +298,56 @@ class _Stopped(Exception):
     """Signal that ends a loop: a callback has returned False."""
 
 
-def train_stage(
-    stage: Stage,
-    run: RunDirectory,
-    seeds: Seeds,
-    listeners: tuple[Listener, ...] = (),
-    policies: Policies | None = None,
-    make_learner: MakeLearner = OneAgent,
-) -> dict[str, AgentPolicy]:
+@dataclass(frozen=True)
+class Course:
+    """The training of a run, stage by stage."""
+
+    run: RunDirectory
+    listeners: tuple[Listener, ...] = ()
+    make_learner: MakeLearner = OneAgent
+    """Makes a stage's learner, by its entry."""
+    done: Mapping[str, Any] | None = None
+    """The events by which a repair is judged, as for ``planning.hand_over``."""
+
+    def tell(self, entry: Mapping[str, Any], text: str) -> None:
+        """Send a message about a stage to the listeners."""
+        for listener in self.listeners:
+            listener.message(f"{entry['name']}: {text}")
+
+    def train(self, stages: Sequence[Stage], policies: Policies) -> dict[str, Policy]:
+        """Train stages one after another; return all policies after them, by path.
+
+        Args:
+            policies: the policies before the first stage.
+        """
+        by_path = dict(policies)
+        for stage in stages:
+            by_path |= train_stage(stage, self, by_path)
+        return by_path
+
+
+def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, AgentPolicy]:
     """Train a stage to its end, or load it if it is done; return its policies, by name.
 
     Args:
-        seeds: the stage's node of the seed tree.
-        policies: the policies so far, by path.
-        make_learner: makes the learner, by the stage's entry.
+        earlier: the policies so far, by path.
 
     Raises:
         TrainingError: training diverged.
         RunError: a checkpoint is damaged.
     """
+    run = course.run
     entry = run.stage(stage.name)
     if entry["status"] == "done":
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
         remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
-    earlier = policies or {}
+    seeds = Seeds(int(run.manifest["seed"])) / stage.name
     learning_task = stage.learning_task(earlier)
     if keys := run.manifest.get("log_info"):
         learning_task = replace(learning_task, log_info=tuple(keys))
     learning_task, recorder = begin_calls(run, entry, learning_task)
-    learner = make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
+    learner = course.make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
     evolves = entry.get("evolution") is not None
     with (
         global_generators(seeds / "global"),
@@ -338,7 +358,7 @@ def train_stage(
             kind = None if fresh is None else type(fresh)
             checkpoint = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
             state, at, extra = checkpoint or (fresh, START, {})
-            log = StageLog(stage.name, run, listeners, at)
+            log = StageLog(stage.name, run, course.listeners, at)
             learner.go_on(state, extra, log)
             policies = learner.train(log)
         finally:
@@ -347,22 +367,3 @@ def train_stage(
     if recorder is not None:
         save_logged(run, entry, recorder, policies)
     return policies
-
-
-def train_stages(
-    stages: Sequence[Stage],
-    run: RunDirectory,
-    listeners: tuple[Listener, ...] = (),
-    policies: Policies | None = None,
-    make_learner: MakeLearner = OneAgent,
-) -> dict[str, Policy]:
-    """Train stages one after another; return all policies after them, by path.
-
-    Args:
-        policies: the policies before the first stage.
-    """
-    by_path = dict(policies or {})
-    root = Seeds(int(run.manifest["seed"]))
-    for stage in stages:
-        by_path |= train_stage(stage, run, root / stage.name, listeners, by_path, make_learner)
-    return by_path
