@@ -29,6 +29,42 @@ class Output:
 
 
 @dataclass(frozen=True)
+class Coded(Output):
+    """A command that may need the code of a hierarchy."""
+
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+@dataclass(frozen=True)
+class OfRun(Output):
+    """A command about a run."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+
+
+@dataclass(frozen=True)
+class Loaded(Coded):
+    """A command that loads a policy."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, a weights file, or with --pretrained a recipe's name."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+
+
+@dataclass(frozen=True)
+class Played(Output):
+    """A command that plays episodes."""
+
+    seed: int = 0
+    """Picks the episodes."""
+    deterministic: bool = True
+    """Act greedily, or (--no-deterministic, --stochastic) sample."""
+
+
+@dataclass(frozen=True)
 class OnRay(Output):
     """A command that can run on Ray."""
 
@@ -88,13 +124,9 @@ class Demo(Output):
 
 
 @dataclass(frozen=True)
-class Resume(OnRay, Continuing):
+class Resume(OnRay, Coded, OfRun, Continuing):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     evaluate: int = 100
     """Episodes of the final evaluation; 0: none."""
 
@@ -126,23 +158,13 @@ class Sweep(OnRay):
 
 
 @dataclass(frozen=True)
-class Watched(Output):
+class Watched(Played, Loaded):
     """A command that loads a policy and lets it act."""
 
-    target: Positional[str] = tyro.MISSING
-    """A run's directory, a weights file, or with --pretrained a recipe's name."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     skill: str | None = None
     """One skill alone, with the hierarchy's reflexes in force."""
     goal: str | None = None
     """Its goal, as JSON, such as --goal "[0.5, 0.8]"; default: its goals() draw one."""
-    seed: int = 0
-    """Picks the episodes."""
-    deterministic: bool = True
-    """Act greedily, or (--no-deterministic, --stochastic) sample."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +188,9 @@ class Render(Watched):
 
 
 @dataclass(frozen=True)
-class Log(Output):
+class Log(Coded, OfRun):
     """Let a run's skills act, and record their calls in the run: for info, report and plan."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     steps: int = 20_000
     """Environment steps to record; they are joined with those that the run has."""
     choose: Literal["random", "explore"] = "random"
@@ -179,12 +199,10 @@ class Log(Output):
     """Record this key of the environment's info, too, for tasks that read it."""
     seed: int | None = None
     """Of the environments and the choices; default: one that the run's log does not have."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Plan(Output):
+class Plan(Loaded):
     """Plan a new mission on a run's recorded calls, and score it; nothing is trained."""
 
     target: Positional[str] = tyro.MISSING
@@ -192,10 +210,6 @@ class Plan(Output):
     mission: Positional[str] = tyro.MISSING
     """Such as "left then hover for 100 steps, avoid crash". A skill's name means its success; a
     recipe may declare more words: Hierarchy(predicates=...)."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     steps: int = 20_000
     """Environment steps to record first, if there is no log of calls."""
     episodes: int = 20
@@ -233,23 +247,15 @@ class Plot(Output):
 
 
 @dataclass(frozen=True)
-class Report(Output):
+class Report(Played, Coded, OfRun):
     """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """The file to write; default: report.html in the run."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     episodes: int = 20
     """Episodes to play, with seeds that training never used."""
     films: int = 3
     """How many of them to film, from the worst to the best; 0: no film."""
-    seed: int = 0
-    """Picks the episodes."""
-    deterministic: bool = True
-    """Act greedily, or (--no-deterministic, --stochastic) sample."""
 
 
 @dataclass(frozen=True)
@@ -278,39 +284,27 @@ class Info(Output):
 
 
 @dataclass(frozen=True)
-class Weights(Output):
+class Weights(Coded, OfRun):
     """Write a run's policies into one weights file."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     out: Annotated[Path, arg(aliases=["-o"])] = Path("weights.safetensors")
     """The file to write."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Export(Output):
+class Export(Loaded):
     """Write a policy for machines without this library: ONNX files and a runner of one file."""
 
-    target: Positional[str] = tyro.MISSING
-    """A run's directory, a weights file, or with --pretrained a recipe's name."""
     onnx: bool = False
     """Choose ONNX, the only format so far; required, so that a later format is a choice, too."""
     out: Annotated[Path | None, arg(aliases=["-o"])] = None
     """The folder to write; default: NAME-onnx here."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Push(Output):
+class Push(OfRun):
     """Put a finished run on the Hugging Face Hub, with a page about it."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     name: Positional[str] = tyro.MISSING
     """OWNER/NAME on the hub; made if it is not there. An older run there is replaced."""
     private: bool = False
@@ -362,26 +356,6 @@ COMMANDS = (
     Push,
     Pull,
     ImportAgilerl,
-)
-Command = (
-    Demo
-    | Train
-    | Resume
-    | Sweep
-    | Evaluate
-    | Render
-    | Log
-    | Plan
-    | Plot
-    | Report
-    | Compare
-    | List
-    | Info
-    | Weights
-    | Export
-    | Push
-    | Pull
-    | ImportAgilerl
 )
 
 
