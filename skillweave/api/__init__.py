@@ -290,15 +290,10 @@ class Hierarchy(Declaration):
         return hierarchy
 
 
-class Run:
-    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+class TrainedPolicy:
+    """A policy with its declaration, of a run or of a planned one: it acts, records and plans."""
 
-    Args:
-        declaration: what was trained.
-        path: its directory, or its weights file.
-        policy: the trained policy.
-    """
-
+    _kind = "Run"
     _mark = ""
     """In names of files, where this is not what is written under ``path``."""
 
@@ -308,7 +303,9 @@ class Run:
         self._player: Player | None = None
 
     def __repr__(self) -> str:
-        return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
+        return printable(
+            f"<{self._kind} {shown_path(self.path)}: {str(self.declaration).strip('<>')}>"
+        )
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration and the stages, for notebooks."""
@@ -534,91 +531,6 @@ class Run:
         return write_export(path, self.policy, self.declaration.spec.name)
 
     @checked_names
-    def report(
-        self,
-        path: str | Path | None = None,
-        *,
-        episodes: int = 20,
-        films: int = 3,
-        seed: int = 0,
-        deterministic: bool = True,
-        quiet: bool = False,
-    ) -> dict[str, Any]:
-        """Write one HTML file about the run: film, calls, skills, curves, settings.
-
-        Args:
-            path: the file; None: ``report.html`` in the run.
-            episodes: to play, with seeds that training never used.
-            films: how many of them to film, from the worst to the best.
-            seed: picks the episodes.
-            deterministic: act greedily, else sample.
-            quiet: no progress; else it is shown where a part takes longer than a second.
-
-        Returns:
-            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
-            ``missing``: sentences on what is not in it.
-
-        Raises:
-            RunError: this is no run but a weights file, or the file cannot be written.
-        """
-        self._check_written()
-        run = RunDirectory.open(self.path)
-        return write_report(
-            run,
-            run.path / "report.html" if path is None else as_path(path, "path"),
-            self.policy,
-            self.declaration.spec,
-            episodes=episodes,
-            filmed=films,
-            seed=seed,
-            deterministic=deterministic,
-            quiet=quiet,
-        )
-
-    @checked_names
-    def save_weights(self, path: str | Path) -> Path:
-        """Write every policy into one file for ``Hierarchy.load_weights``.
-
-        Args:
-            path: the file to write.
-
-        Returns:
-            The path.
-        """
-        self._check_written()
-        path = as_path(path, "path")
-        must_be_own(path.parent)
-        if isinstance(self.policy, AgentPolicy):
-            write_agent(path, self.declaration.spec, self.policy)
-            return path
-        assert isinstance(self.policy, HierarchyPolicy)
-        write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
-        return path
-
-    @checked_names
-    def push(self, name: str, *, private: bool = False, calls: bool = False) -> dict[str, Any]:
-        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
-
-        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
-        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
-        ``hf auth login``, or set ``HF_TOKEN``.
-
-        Args:
-            name: ``owner/name``; made if it is not there. An older run there is replaced.
-            private: others may not read it.
-            calls: with the log of calls, so that others can plan without recording one.
-
-        Returns:
-            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
-
-        Raises:
-            RunError: the run is not finished or damaged, ``name`` may not be written or
-                holds something else, or the hub does not answer.
-        """
-        self._check_written()
-        return push_run(self.path, name, private, calls)
-
-    @checked_names
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """Return the whole policy as one skill of another hierarchy.
 
@@ -632,22 +544,6 @@ class Run:
         kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
         skill: Skill = kind()
         return skill
-
-    @checked_names
-    def info(self) -> dict[str, Any]:
-        """Return its manifest, with the latest saved evaluation under ``evaluation``.
-
-        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
-        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
-        """
-        self._check_written()
-        run = RunDirectory.open(self.path)
-        scores = {
-            "evaluation": load_evaluation(run),
-            "evaluation_sampled": load_evaluation(run, deterministic=False),
-        }
-        known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        return run.manifest | known | hand_over_json(hand_over_of(run))
 
     @checked_names
     def log_calls(
@@ -753,40 +649,6 @@ class Run:
             notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         return run
 
-    @Takes(RepairOptions)
-    def repair(self, options: RepairOptions) -> Run:
-        """Train a skill on from where another one ends, and keep the result if it is better.
-
-        Most episodes begin after a call of the other skill, the others as usual; half of them where
-        it does not rehearse. The skill is paid its own reward, and a bonus in each step in which
-        the event that its calls are for is true: as much per step as calls that were done earned
-        more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
-        earlier policy has a cost in the observations of its calls that were done after other skills
-        (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
-        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
-        and no other one clearly worse. All other weights stay as they are. What was done is in
-        ``Run.repairs``.
-
-        Returns:
-            The new run, with the repaired weights or the earlier ones.
-
-        Raises:
-            DeclarationError: no such skill, one that does not learn, one that may not start after
-                the other, seldom does, or needs no repair; or too few steps.
-            RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
-                something else.
-        """
-        self._check_written()
-        declared = self.hierarchy
-        assert isinstance(self.policy, HierarchyPolicy)
-        return run_of(repair(declared, self.path, self.policy, options))
-
-    @property
-    def repairs(self) -> list[Repair]:
-        """The repairs of its skills, the latest last: both matrices, the reason, the result."""
-        self._check_written()
-        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
-
     def _own_spec(self) -> EnvSpec:
         """Return the environment of the hierarchy's own task."""
         return self.hierarchy.spec
@@ -824,14 +686,156 @@ class Run:
         return SkillAlone(level.skills, name_of(skill), skill)
 
 
-class PlannedRun(Run):
+class Run(TrainedPolicy):
+    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+
+    Args:
+        declaration: what was trained.
+        path: its directory, or its weights file.
+        policy: the trained policy.
+    """
+
+    @checked_names
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 20,
+        films: int = 3,
+        seed: int = 0,
+        deterministic: bool = True,
+        quiet: bool = False,
+    ) -> dict[str, Any]:
+        """Write one HTML file about the run: film, calls, skills, curves, settings.
+
+        Args:
+            path: the file; None: ``report.html`` in the run.
+            episodes: to play, with seeds that training never used.
+            films: how many of them to film, from the worst to the best.
+            seed: picks the episodes.
+            deterministic: act greedily, else sample.
+            quiet: no progress; else it is shown where a part takes longer than a second.
+
+        Returns:
+            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
+            ``missing``: sentences on what is not in it.
+
+        Raises:
+            RunError: this is no run but a weights file, or the file cannot be written.
+        """
+        run = RunDirectory.open(self.path)
+        return write_report(
+            run,
+            run.path / "report.html" if path is None else as_path(path, "path"),
+            self.policy,
+            self.declaration.spec,
+            episodes=episodes,
+            filmed=films,
+            seed=seed,
+            deterministic=deterministic,
+            quiet=quiet,
+        )
+
+    @checked_names
+    def save_weights(self, path: str | Path) -> Path:
+        """Write every policy into one file for ``Hierarchy.load_weights``.
+
+        Args:
+            path: the file to write.
+
+        Returns:
+            The path.
+        """
+        path = as_path(path, "path")
+        must_be_own(path.parent)
+        if isinstance(self.policy, AgentPolicy):
+            write_agent(path, self.declaration.spec, self.policy)
+            return path
+        assert isinstance(self.policy, HierarchyPolicy)
+        write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
+        return path
+
+    @checked_names
+    def push(self, name: str, *, private: bool = False, calls: bool = False) -> dict[str, Any]:
+        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
+
+        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
+        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
+        ``hf auth login``, or set ``HF_TOKEN``.
+
+        Args:
+            name: ``owner/name``; made if it is not there. An older run there is replaced.
+            private: others may not read it.
+            calls: with the log of calls, so that others can plan without recording one.
+
+        Returns:
+            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
+
+        Raises:
+            RunError: the run is not finished or damaged, ``name`` may not be written or
+                holds something else, or the hub does not answer.
+        """
+        return push_run(self.path, name, private, calls)
+
+    @checked_names
+    def info(self) -> dict[str, Any]:
+        """Return its manifest, with the latest saved evaluation under ``evaluation``.
+
+        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
+        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
+        """
+        run = RunDirectory.open(self.path)
+        scores = {
+            "evaluation": load_evaluation(run),
+            "evaluation_sampled": load_evaluation(run, deterministic=False),
+        }
+        known = {k: v.to_json() for k, v in scores.items() if v is not None}
+        return run.manifest | known | hand_over_json(hand_over_of(run))
+
+    @Takes(RepairOptions)
+    def repair(self, options: RepairOptions) -> Run:
+        """Train a skill on from where another one ends, and keep the result if it is better.
+
+        Most episodes begin after a call of the other skill, the others as usual; half of them where
+        it does not rehearse. The skill is paid its own reward, and a bonus in each step in which
+        the event that its calls are for is true: as much per step as calls that were done earned
+        more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
+        earlier policy has a cost in the observations of its calls that were done after other skills
+        (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
+        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
+        and no other one clearly worse. All other weights stay as they are. What was done is in
+        ``Run.repairs``.
+
+        Returns:
+            The new run, with the repaired weights or the earlier ones.
+
+        Raises:
+            DeclarationError: no such skill, one that does not learn, one that may not start after
+                the other, seldom does, or needs no repair; or too few steps.
+            RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
+                something else.
+        """
+        declared = self.hierarchy
+        assert isinstance(self.policy, HierarchyPolicy)
+        return run_of(repair(declared, self.path, self.policy, options))
+
+    @property
+    def repairs(self) -> list[Repair]:
+        """The repairs of its skills, the latest last: both matrices, the reason, the result."""
+        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
+
+
+class PlannedRun(TrainedPolicy):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
+    _kind = "PlannedRun of"
     _mark = "-plan"
     _forecast: Forecast | None = None
 
-    def __repr__(self) -> str:
-        return super().__repr__().replace("<Run", "<PlannedRun of", 1)
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(Run, name):
+            self._check_written()
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @checked_names
     def with_selector(
