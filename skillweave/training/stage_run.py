@@ -45,6 +45,15 @@ class StageRun:
         """Path of the learner, where there is one."""
         return str(self.entry["learns"][0])
 
+    def stages_before(self, name: str) -> list[dict[str, Any]]:
+        """Return the entries of finished stages in which a learner has learnt."""
+        stages = self.run.manifest["stages"]
+        return [s for s in stages if name in s["learns"] and s["status"] == "done"]
+
+    def steps_before(self, name: str) -> int:
+        """Return the environment steps of earlier stages in which a learner has learnt."""
+        return sum(s["steps"] for s in self.stages_before(name))
+
     @property
     def config(self) -> AlgorithmConfig:
         """The algorithm's settings."""

@@ -90,7 +90,7 @@ class OneAgent:
         if stage.continues:
             pass  # its final state holds everything
         elif isinstance(earlier, AgentPolicy):  # it learns again
-            self.start = earlier, _steps_of(stage)
+            self.start = earlier, stage.steps_before(stage.learner)
         else:
             self.start = initial_policy(stage.run, stage.name, stage.name, self.algorithm)
         return self._initial_state()
@@ -269,13 +269,6 @@ class OneAgent:
     def close(self) -> None:
         """Release the environments."""
         self._resources.close()
-
-
-def _steps_of(stage: StageRun) -> int:
-    """Return the environment steps of earlier stages in which the learner has learnt."""
-    stages = stage.run.manifest["stages"]
-    done = [s for s in stages if stage.learner in s["learns"] and s["status"] == "done"]
-    return sum(s["steps"] for s in done)
 
 
 def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Collector:
