@@ -107,7 +107,6 @@ def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
     """
     run = begun(declared, content, run_dir)
     if run is None:
-        content = content | {"recipe": declared.recipe}
         options = AgentOptions(run_dir, seed=content["seed"], quiet=True)
         return run_of(begin(declared, content, options))
     return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)

@@ -245,7 +245,7 @@ def _content(
         ]
         policies = {entry["name"]: run.load_policies(entry["name"]) for entry in entries}
         return content | {"eval_every": None, "keep": "last"}, entries, policies
-    content = training.manifest(declared, seed=0) | {"recipe": declared.recipe}
+    content = training.manifest(declared, seed=0)
     content |= {"eval_every": None, "keep": "last"}
     parts, entries = parts_of(roles, policy), []
     policies = dict[str, dict[str, AgentPolicy]]()

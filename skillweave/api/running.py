@@ -84,7 +84,7 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
     if isinstance(declared, Declaration) and flat is False:
         declared, note = evolving(declared, options.evolve)
     content = training.manifest(declared, seed=options.seed, flat=flat, how=how)
-    return begin(declared, content | {"recipe": declared.recipe}, options, note)
+    return begin(declared, content, options, note)
 
 
 def begin(
@@ -107,7 +107,7 @@ def begin(
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    content = content | recorded(options)
+    content = {**content, "recipe": content.get("recipe", declared.recipe), **recorded(options)}
     with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
         roles = _plan(declared, content, options)

@@ -308,7 +308,7 @@ class JointAgents(OneAgent):
         }
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
-        return None, extra | states | self.best_tensors()
+        return None, extra | states | self.best.tensors()
 
 
 def _collector(

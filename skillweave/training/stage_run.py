@@ -76,11 +76,10 @@ class StageRun:
         return None if target is None else Target(**target)
 
     @property
-    def best(self) -> KeepBest | None:
-        """A new store of the best weights; None: the last ones count."""
-        if self.run.manifest.get("keep") != "best":
-            return None
-        return KeepBest("return" if self.target is None else self.target.of)
+    def best(self) -> KeepBest:
+        """A new store of the best weights."""
+        of = "return" if self.target is None else self.target.of
+        return KeepBest(of, self.run.manifest.get("keep") == "best")
 
 
 class StageLearner(Protocol):

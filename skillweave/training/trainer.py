@@ -26,7 +26,6 @@ from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
-from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.logged_calls import begin_calls, save_logged
@@ -149,15 +148,7 @@ class OneAgent:
     def saved(self, extra: dict[str, Tensor]) -> tuple[Any, dict[str, Tensor]]:
         """Return the state and all other tensors of a checkpoint, ``extra`` included."""
         (stack,) = self.learner.stacks
-        return state_to(stack.state, "cpu"), extra | self.best_tensors()
-
-    def best_tensors(self) -> dict[str, Tensor]:
-        """Return a checkpoint's tensors of the best weights."""
-        return {} if self.best is None else self.best.tensors()
-
-    def best_header(self) -> dict[str, Any]:
-        """Return the header's entries of the best weights."""
-        return {} if self.best is None else self.best.header()
+        return state_to(stack.state, "cpu"), extra | self.best.tensors()
 
     def _save_final(self, log: StageLog, *, spent: bool) -> None:
         """Write the state from which more steps continue, in new episodes.
@@ -169,15 +160,14 @@ class OneAgent:
         needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
         state, extra = self.saved(needed)
         spare = {k: v for k, v in whole.items() if k not in needed}
-        log.save_final(state, extra, spare, self.best_header(), spent=spent)
+        log.save_final(state, extra, spare, self.best.header(), spent=spent)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint."""
         self.learner = self.learner_from(state, extra, log)
         self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         self._steps_before = at.steps
-        if self.best is not None:
-            self.best.load(log.at, extra, self.states(), str(log.run.path))
+        self.best.load(log.at, extra, self.states(), str(log.run.path))
         learner, collectors, episodes = self.learner, self.collectors, self.episodes
         if unprefixed("collector", extra):
             ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
@@ -198,13 +188,12 @@ class OneAgent:
             if tick.since < EARLY * self.stage.budget <= tick.steps:
                 self.tell_early(tick.steps, log)
             # If the best weights count, the last ones must be evaluated, too.
-            last = self.best is not None and tick.steps >= self.stage.budget
+            last = self.best.wanted and tick.steps >= self.stage.budget
             evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
             log.at["evaluation_steps"] += self.evaluation.spent()
             if evaluation:
                 log.tell_slow(self.evaluation.took, self.evaluation.after)
-            if self.best is not None:
-                self.best.see(evaluation, tick.steps, self.states)
+            self.best.see(evaluation, tick.steps, self.states)
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | evaluation)
             # No checkpoint at the end: a run that resumes from the previous one comes here again.
             if target is not None and target.reached(evaluation, self.stage.name) is not None:
@@ -214,7 +203,7 @@ class OneAgent:
 
         def on_checkpoint(saved: Saved) -> None:
             log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
-            log.save(*self.saved(saved.extra), **self.best_header())
+            log.save(*self.saved(saved.extra), **self.best.header())
             if log.stop_requested:
                 raise _Stopped
 
@@ -246,15 +235,11 @@ class OneAgent:
                 log.report_learnt_nothing()
         log.report_absent(self.episodes.tally, over=True)
         log.report_endless(self.episodes.tally)
-        if self.best is not None and self.best.metrics:
-            self._load_best(self.best)
+        if self.best.metrics:
+            for path, stack in self.stacks().items():
+                stack.state = state_to(self.best.states[path], stack.state.params.device)
             log.kept_best(self.best)
         return self.policies()
-
-    def _load_best(self, best: KeepBest) -> None:
-        """Set the learners' states to those of the best evaluation."""
-        for path, stack in self.stacks().items():
-            stack.state = state_to(best.states[path], stack.state.params.device)
 
     def tell_early(self, steps: int, log: StageLog) -> None:
         """Report problems so far, while training can still be stopped; none for one agent."""
