@@ -15,6 +15,15 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from skillweave.training.options import Continuing, Starting
 
+Out = Annotated[Path, arg(aliases=["-o"])]
+"""A place to write to."""
+MaybeOut = Annotated[Path | None, arg(aliases=["-o"])]
+"""The same; None: a default place."""
+Words = UseAppendAction[tuple[str, ...]]
+"""Words of an option that may be given several times."""
+Runs = Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")]
+"""Directories of runs, or of sweeps."""
+
 
 @dataclass(frozen=True)
 class Output:
@@ -79,24 +88,24 @@ class Train(OnRay, Continuing, Starting):
 
     recipe: Positional[str] = tyro.MISSING
     """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
     """Afterwards train the baseline too, on the same number of steps, and print which is better."""
-    set: UseAppendAction[tuple[str, ...]] = ()
+    set: Words = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
-    start_from: UseAppendAction[tuple[str, ...]] = ()
+    start_from: Words = ()
     """Another run: learners of the same names start with what they learnt there (not
     --versus-flat's agent). Several runs: --start-from left=RUN --start-from right=RUN."""
     keep: Literal["last", "best"] | None = None
     """best: end with the weights whose evaluation while training was best, not with the last ones
     (needs --set train.eval_every=STEPS, if the recipe does not set it)."""
-    log_info: UseAppendAction[tuple[str, ...]] = ()
+    log_info: Words = ()
     """A key of info, for example: --log-info distance. Its mean at the ends of episodes is
     info/distance in metrics.jsonl and in trackers."""
-    evolve: UseAppendAction[tuple[str, ...]] = ()
+    evolve: Words = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()
     """Send metrics to a tracker as well."""
@@ -115,7 +124,7 @@ class Train(OnRay, Continuing, Starting):
 class Demo(Output):
     """Train, score and film two tasks in three minutes: where skills pay, and where not."""
 
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("runs/demo")
+    out: Out = Path("runs/demo")
     """A new directory for runs, films and the report."""
     seed: int = 0
     """The root of every random stream."""
@@ -139,12 +148,12 @@ class Sweep(OnRay):
     """A shipped recipe, or a Python file that defines a Hierarchy."""
     seeds: str = "0:5"
     """0:20 for 0 to 19, or 0,3,7."""
-    set_each: UseAppendAction[tuple[str, ...]] = ()
+    set_each: Words = ()
     """Try each of these values: --set-each selector.gamma=0.99,0.995. Of several settings, all
     combinations."""
-    set: UseAppendAction[tuple[str, ...]] = ()
+    set: Words = ()
     """Change a setting in all runs."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A directory for the runs, old or new; default: runs/NAME-sweep. With --ray on several
     machines all must see it."""
     flat: bool = False
@@ -181,7 +190,7 @@ class Evaluate(Watched):
 class Render(Watched):
     """Write a captioned GIF or MP4."""
 
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A .gif or .mp4 file; default: NAME.gif here."""
     episodes: int = 1
     """Whole episodes."""
@@ -195,7 +204,7 @@ class Log(Coded, OfRun):
     """Environment steps to record; they are joined with those that the run has."""
     choose: Literal["random", "explore"] = "random"
     """Choose skills at random, or where they were not tried yet."""
-    info: UseAppendAction[tuple[str, ...]] = ()
+    info: Words = ()
     """Record this key of the environment's info, too, for tasks that read it."""
     seed: int | None = None
     """Of the environments and the choices; default: one that the run's log does not have."""
@@ -214,7 +223,7 @@ class Plan(Loaded):
     """Environment steps to record first, if there is no log of calls."""
     episodes: int = 20
     """Whole episodes to score it in."""
-    film: Annotated[Path | None, arg(aliases=["-o"])] = None
+    film: MaybeOut = None
     """A .gif or .mp4 file to write."""
     seed: int = 0
     """Picks the episodes."""
@@ -227,11 +236,9 @@ class Plot(Output):
     Of one run: how each agent learnt, or how its population evolved.
     """
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
-        tyro.MISSING
-    )
+    runs: Runs = tyro.MISSING
     """Runs or sweeps. Of several, those that differ by their seed alone are one line."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """Of one run a directory; default: plots, in the run. Of several the files, without suffix;
     default: curves."""
     metric: str | None = None
@@ -240,7 +247,7 @@ class Plot(Output):
     """Of several runs: a skill, or selector; default: the whole policy."""
     band: Literal["iqr", "range", "none"] = "iqr"
     """Of several runs: from the 25th to the 75th percentile of the seeds, or lowest to highest."""
-    label: UseAppendAction[tuple[str, ...]] = ()
+    label: Words = ()
     """Of several runs: the name of a line, once for each, in their order."""
     width: float = 3.3
     """Of several runs: inches; a column of a paper has 3.3."""
@@ -250,7 +257,7 @@ class Plot(Output):
 class Report(Played, Coded, OfRun):
     """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
 
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The file to write; default: report.html in the run."""
     episodes: int = 20
     """Episodes to play, with seeds that training never used."""
@@ -262,11 +269,9 @@ class Report(Played, Coded, OfRun):
 class Compare(Output):
     """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
-        tyro.MISSING
-    )
+    runs: Runs = tyro.MISSING
     """Directories of runs, or of sweeps."""
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("compare.html")
+    out: Out = Path("compare.html")
     """The file to write."""
 
 
@@ -287,7 +292,7 @@ class Info(Output):
 class Weights(Coded, OfRun):
     """Write a run's policies into one weights file."""
 
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("weights.safetensors")
+    out: Out = Path("weights.safetensors")
     """The file to write."""
 
 
@@ -297,7 +302,7 @@ class Export(Loaded):
 
     onnx: bool = False
     """Choose ONNX, the only format so far; required, so that a later format is a choice, too."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The folder to write; default: NAME-onnx here."""
 
 
@@ -319,7 +324,7 @@ class Pull(Output):
 
     name: Positional[str] = tyro.MISSING
     """OWNER/NAME on the hub."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A new directory for the run; default: runs/NAME, numbered if taken."""
     revision: str | None = None
     """A branch, a tag or a commit; default: the latest."""
@@ -333,7 +338,7 @@ class ImportAgilerl(Output):
     """The checkpoint."""
     trust: bool = False
     """You trust where it comes from; needed, although it is read without running code from it."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The file to write; default: FILE with the suffix .safetensors."""
 
 
