@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from skillweave.api.applying import D, apply_manifest, check_run, differences
+from skillweave.api.applying import D, apply_manifest, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
 from skillweave.paths import decides, is_below, level_of
@@ -45,9 +45,8 @@ def prepared(
     Raises:
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
-    check_run(declared, run)
-    _check_same(content, run)
     declared = apply_manifest(declared, run)
+    _check_same(content, run)
     stages = content["stages"]
     if run.manifest["kind"] == "hierarchy":
         # As the run learns, apart or together: it may be declared otherwise now.
