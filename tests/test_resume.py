@@ -34,11 +34,10 @@ from skillweave.cli.overrides import apply_overrides
 from skillweave.hierarchy import training
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
-from skillweave.seeding import Seeds
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.stage import Stage
-from skillweave.training.trainer import train_stage
+from skillweave.training.trainer import Course, train_stage
 
 often = reports_every(75)
 pytestmark = pytest.mark.filterwarnings("ignore:.*precision lowered")  # EnvPool's CartPole
@@ -359,7 +358,7 @@ REPORTED_AT = [76, 152, 228, 300, 376, 452, 528, 600, 652]
 
 def train_echo(run: RunDirectory, stage: Stage, *listeners: Any) -> None:
     try:
-        train_stage(stage, run, Seeds(3) / stage.name, listeners)
+        train_stage(stage, Course(run, listeners), {})
     finally:
         run.close()
 

@@ -283,7 +283,9 @@ def test_settings_and_commands_need_neither_torch_nor_a_heavy_room() -> None:
     modules += ["skillweave.types", "skillweave.cli.commands"]
     code = "import importlib, sys\n"
     code += "".join(f"importlib.import_module({name!r})\n" for name in modules)
-    code += "print(sorted({'torch', 'skillweave.api', 'skillweave.training'} & set(sys.modules)))"
+    code += (
+        "print(sorted({'torch', 'skillweave.api', 'skillweave.training.loop'} & set(sys.modules)))"
+    )
     command = [sys.executable, "-c", code]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -10,16 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import (
     Trained,
-    apply_manifest,
-    check_run,
-    differences,
     load_policy,
     spec_of,
 )
@@ -45,16 +41,20 @@ from skillweave.api.planning import (
 from skillweave.api.player import Player
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.repairing import repair
-from skillweave.api.running import begin, evolving, go_on
-from skillweave.api.starting import Directories
+from skillweave.api.running import resume, train
+from skillweave.api.train_options import (
+    AgentOptions,
+    AgentTraining,
+    RepairOptions,
+    ResumeOptions,
+    Takes,
+    TrainOptions,
+)
 from skillweave.arguments import checked_names
-from skillweave.collecting.cluster import Ray
 from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
-from skillweave.evolution.plan import Evolve
 from skillweave.export.write import Export, write_export
-from skillweave.hierarchy import training
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
@@ -86,10 +86,8 @@ from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
-from skillweave.skills.learnable import Learnable
 from skillweave.skills.own_part import ZERO, part_from_json
 from skillweave.terminal import printable
-from skillweave.training.callback import Callback
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.evaluation_file import load_evaluation, save_evaluation
 from skillweave.training.plain_agent import PlainAgent
@@ -99,8 +97,6 @@ from skillweave.types import Memory, Policy
 class Agent(PlainAgent):
     """One plain agent that learns an environment's own reward: declared, trained and watched."""
 
-    recipe: str | None = None
-
     def __repr__(self) -> str:
         return agent_line(self)
 
@@ -108,77 +104,32 @@ class Agent(PlainAgent):
         """Return a table of the declaration, for notebooks."""
         return agent_html(self)
 
-    @checked_names
-    def train(
-        self,
-        run_dir: str | Path | None = None,
-        *,
-        resume: bool = False,
-        overwrite: bool = False,
-        seed: int = 0,
-        eval_every: int | None = None,
-        eval_episodes: int | None = None,
-        checkpoint_every: int | None = None,
-        quiet: bool = False,
-        track: Sequence[str] = (),
-        evolve: Evolve = None,
-        cluster: Ray | None = None,
-        start_from: StartFrom = None,
-        callback: Callback | None = None,
-        keep: Literal["last", "best"] | None = None,
-        log_info: Sequence[str] | None = None,
-    ) -> Run:
+    @Takes(AgentOptions)
+    def train(self, options: AgentOptions) -> Run:
         """Train the agent and write everything to ``run_dir``.
 
-        ``run_dir``, ``resume``, ``overwrite``, ``seed``, ``eval_every``, ``eval_episodes``,
-        ``checkpoint_every``, ``quiet``, ``track``, ``evolve``, ``cluster``, ``start_from``,
-        ``callback``, ``keep`` and ``log_info`` are as in ``Hierarchy.train``.
-        """
-        self.validate()
-        how = self.train_defaults.given(
-            eval_every=eval_every,
-            eval_episodes=eval_episodes,
-            checkpoint_every=checkpoint_every,
-            keep=keep,
-            log_info=log_info,
-        )
-        content = self.manifest(whole_number(seed, "seed", 0), how)
-        trained = begin(
-            self,
-            content | {"recipe": self.recipe},
-            run_dir,
-            quiet,
-            track,
-            evolve,
-            cluster,
-            _directories(start_from),
-            callback=callback,
-            resume=resume,
-            overwrite=overwrite,
-        )
-        return run_of(trained)
+        Of evaluations, checkpoints and logs, None is what ``train_defaults`` says.
 
-    @checked_names
-    def resume(
-        self,
-        run_dir: str | Path,
-        *,
-        quiet: bool = False,
-        evolve: Evolve = None,
-        cluster: Ray | None = None,
-        callback: Callback | None = None,
-    ) -> Run:
-        """Finish the run in ``run_dir``.
+        Returns:
+            The finished run.
 
-        ``quiet``, ``evolve``, ``cluster`` and ``callback`` are as in ``Hierarchy.resume``.
+        Raises:
+            DeclarationError: a setting is wrong, or the algorithm cannot act in the environment.
+            EnvError: the environment cannot be made, or breaks Gymnasium's contract.
+            TrainingError: training diverged, or cannot continue.
+            RunError: ``run_dir`` holds something else, or no learner can start from
+                ``start_from``.
         """
-        self.validate()
-        run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        check_run(self, run)
-        # A recipe's settings are not compared: the command line may have changed them.
-        compared = not self.recorded and self.recipe is None
-        note = differences(self.manifest(run.manifest["seed"]), run) if compared else ""
-        return run_of(go_on(self, run, quiet, evolve, cluster, note, callback))
+        return run_of(train(self, options))
+
+    @Takes(ResumeOptions)
+    def resume(self, options: ResumeOptions) -> Run:
+        """Finish the run in ``run_dir``, as ``Hierarchy.resume`` does.
+
+        Returns:
+            The finished run.
+        """
+        return run_of(resume(self, options))
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
@@ -236,11 +187,6 @@ class Hierarchy(Declaration):
     ```
     """
 
-    recipe: str | None = None
-    """The place of the declaration: a shipped recipe's name or a file; written into runs."""
-    _starts: Any = None
-    """Function that returns the policies with which learners start, by name; None: no function."""
-
     def __repr__(self) -> str:
         names = [skill.name for skill in self.skills]
         return hierarchy_line(type(self).__name__, names, self.spec.name)
@@ -249,83 +195,11 @@ class Hierarchy(Declaration):
         """Return tables of the declaration, for notebooks."""
         return hierarchy_html(roles_of(self), recorded=self.recorded)
 
-    @checked_names
-    def train(
-        self,
-        run_dir: str | Path | None = None,
-        *,
-        resume: bool = False,
-        overwrite: bool = False,
-        seed: int = 0,
-        flat: bool | AlgorithmConfig = False,
-        eval_every: int | None = None,
-        eval_episodes: int | None = None,
-        checkpoint_every: int | None = None,
-        quiet: bool = False,
-        track: Sequence[str] = (),
-        evolve: Evolve = None,
-        cluster: Ray | None = None,
-        start_from: StartFrom = None,
-        callback: Callback | None = None,
-        keep: Literal["last", "best"] | None = None,
-        log_info: Sequence[str] | None = None,
-        log_calls: int | None = None,
-        log_calls_info: Sequence[str] | None = None,
-    ) -> Run:
+    @Takes(TrainOptions)
+    def train(self, options: TrainOptions) -> Run:
         """Train skills and selector and write everything to ``run_dir``.
 
-        Args:
-            run_dir: a new directory; None: the next number of ``runs/<name>-<n>``, named after the
-                recipe, the hierarchy or the environment. A run that has saved nothing yet is
-                replaced, unless a process trains it; any other only with ``overwrite``.
-            resume: continue the run in ``run_dir`` if it has learnt something, else start one. It
-                keeps its settings, and a message lists those that differ. If steps have grown, a
-                finished run continues: in new episodes, with schedules over the new budget. Steps
-                of stages whose learners learn again in a later one go to that stage.
-            overwrite: replace the run in ``run_dir``, also a finished one; not with ``resume``.
-                Files there that no run writes stay.
-            seed: the root of every random stream.
-            flat: train one plain agent for the same number of steps instead: the baseline. True:
-                with the settings of ``train_defaults``; or its settings.
-            eval_every: environment steps between evaluations while training, by the learner's own
-                reward; None: that of ``train_defaults``, by default none.
-            eval_episodes: episodes of each of these evaluations; None: 20.
-            checkpoint_every: environment steps between checkpoints; None: 100,000.
-            quiet: no progress.
-            track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
-            evolve: a population for every stage, or for some by name (a skill's, "selector",
-                "agent"). Its budget is the stage's for each member, measuring fitness included.
-                Skills and selector of a population cannot learn together yet: they learn apart.
-            cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
-                where it pays.
-
-            start_from: another run, or its directory: a learner that has learnt there, by the same
-                name, starts with its policy. Or several runs, by learner:
-                ``{"left": run, "right": other}``; a run of a plain agent fits any name. The policy
-                is copied (of PPO and DQN all networks, of SAC and TD3 the actor). The task may be
-                another one; spaces, networks and the names of a selector's skills must be the same.
-                In place of a run also ``from_sb3(..., learn=True)`` or ``from_torch``'s.
-            callback: a function that is called with a ``TrainEvent`` for each report of training
-                and each checkpoint. Where it returns False, the stage ends with what it has
-                learnt, as at a target, and the next one starts. An exception in it stops the
-                training and leaves ``train`` unchanged; the run can be resumed from its last
-                checkpoint. It is called in this process, and is not stored in the run.
-            keep: "best": each stage ends with the weights whose periodic evaluation was best, by
-                the mean return or by what its target is of; the last weights are evaluated, too.
-                It needs ``eval_every``. A population ends with its best member in any case. None:
-                that of ``train_defaults``, by default "last".
-            log_info: keys of ``info``: the mean of each over the latest 100 episodes is
-                ``info/<key>`` in ``metrics.jsonl`` and in trackers. Each episode counts with the
-                value in its last step (in a skill's own stage, its call's). None, NaN and infinity
-                are left out.
-            log_calls: steps: the calls in the latest so many steps in which the selector acted,
-                alone or together with skills, are the run's log of calls afterwards, as if
-                ``Run.log_calls`` had recorded them; so ``Run.plan`` needs no further steps. Calls
-                that are open at the end are left out. Skills that learnt in these steps have
-                changed since: ``hand_over`` may count their calls, but ``plan`` refuses them. A run
-                that was interrupted logs the calls after it was continued. Nothing else changes.
-                None: that of ``train_defaults``, by default no log.
-            log_calls_info: keys of ``info`` to record with the calls.
+        Of evaluations, checkpoints and logs, None is what ``train_defaults`` says.
 
         Returns:
             The finished run.
@@ -338,68 +212,20 @@ class Hierarchy(Declaration):
             RunError: ``run_dir`` holds something else, or no learner can start from
                 ``start_from``.
         """
-        self.validate()
-        seed = whole_number(seed, "seed", 0)
-        if log_calls is not None and flat is not False:
-            raise DeclarationError(
-                "flat trains one plain agent, which has no skills to call: leave out log_calls"
-            )
-        how = self.train_defaults.given(
-            eval_every=eval_every,
-            eval_episodes=eval_episodes,
-            checkpoint_every=checkpoint_every,
-            keep=keep,
-            log_info=log_info,
-            log_calls=log_calls,
-            log_calls_info=log_calls_info,
-        )
-        declared, note = (self, "") if flat is not False else evolving(self, evolve)
-        content = training.manifest(declared, seed=seed, flat=flat, how=how)
-        trained = begin(
-            declared,
-            content | {"recipe": declared.recipe},
-            run_dir,
-            quiet,
-            track,
-            evolve,
-            cluster,
-            _directories(start_from),
-            note,
-            callback,
-            resume=resume,
-            overwrite=overwrite,
-            own_start=self._starts if flat is False else None,
-        )
-        return run_of(trained)
+        return run_of(train(self, options))
 
-    @checked_names
-    def resume(
-        self,
-        run_dir: str | Path,
-        *,
-        quiet: bool = False,
-        evolve: Evolve = None,
-        cluster: Ray | None = None,
-        callback: Callback | None = None,
-    ) -> Run:
+    @Takes(ResumeOptions)
+    def resume(self, options: ResumeOptions) -> Run:
         """Finish the run in ``run_dir``; the end is the same as if it had not been stopped.
 
         The run's settings count, its steps too, and the code of this hierarchy: methods, functions,
         conditions. A message lists settings that differ, except a population's. To train for more
         steps: ``train(run_dir, resume=True)``.
 
-        ``quiet``: no progress. ``evolve`` is needed only where the population evolves by a
-        selection of your own. ``cluster``: where its collectors run from now on; their number
-        stays. ``callback``: as in ``train``; the one of ``train`` is not stored.
+        Returns:
+            The finished run.
         """
-        self.validate()
-        run = RunDirectory.open(as_path(run_dir, "run_dir"))
-        declared = apply_manifest(self, run)
-        note = ""
-        if not self.recorded and self.recipe is None:  # the command line may change a recipe
-            seed, flat = run.manifest["seed"], run.manifest["kind"] == "agent"
-            note = differences(training.manifest(self, seed=seed, flat=flat), run)
-        return run_of(go_on(declared, run, quiet, evolve, cluster, note, callback))
+        return run_of(resume(self, options))
 
     @checked_names
     def load(self, run_dir: str | Path) -> Run:
@@ -464,15 +290,10 @@ class Hierarchy(Declaration):
         return hierarchy
 
 
-class Run:
-    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+class TrainedPolicy:
+    """A policy with its declaration, of a run or of a planned one: it acts, records and plans."""
 
-    Args:
-        declaration: what was trained.
-        path: its directory, or its weights file.
-        policy: the trained policy.
-    """
-
+    _kind = "Run"
     _mark = ""
     """In names of files, where this is not what is written under ``path``."""
 
@@ -482,7 +303,9 @@ class Run:
         self._player: Player | None = None
 
     def __repr__(self) -> str:
-        return printable(f"<Run {shown_path(self.path)}: {str(self.declaration).strip('<>')}>")
+        return printable(
+            f"<{self._kind} {shown_path(self.path)}: {str(self.declaration).strip('<>')}>"
+        )
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration and the stages, for notebooks."""
@@ -708,91 +531,6 @@ class Run:
         return write_export(path, self.policy, self.declaration.spec.name)
 
     @checked_names
-    def report(
-        self,
-        path: str | Path | None = None,
-        *,
-        episodes: int = 20,
-        films: int = 3,
-        seed: int = 0,
-        deterministic: bool = True,
-        quiet: bool = False,
-    ) -> dict[str, Any]:
-        """Write one HTML file about the run: film, calls, skills, curves, settings.
-
-        Args:
-            path: the file; None: ``report.html`` in the run.
-            episodes: to play, with seeds that training never used.
-            films: how many of them to film, from the worst to the best.
-            seed: picks the episodes.
-            deterministic: act greedily, else sample.
-            quiet: no progress; else it is shown where a part takes longer than a second.
-
-        Returns:
-            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
-            ``missing``: sentences on what is not in it.
-
-        Raises:
-            RunError: this is no run but a weights file, or the file cannot be written.
-        """
-        self._check_written()
-        run = RunDirectory.open(self.path)
-        return write_report(
-            run,
-            run.path / "report.html" if path is None else as_path(path, "path"),
-            self.policy,
-            self.declaration.spec,
-            episodes=episodes,
-            filmed=films,
-            seed=seed,
-            deterministic=deterministic,
-            quiet=quiet,
-        )
-
-    @checked_names
-    def save_weights(self, path: str | Path) -> Path:
-        """Write every policy into one file for ``Hierarchy.load_weights``.
-
-        Args:
-            path: the file to write.
-
-        Returns:
-            The path.
-        """
-        self._check_written()
-        path = as_path(path, "path")
-        must_be_own(path.parent)
-        if isinstance(self.policy, AgentPolicy):
-            write_agent(path, self.declaration.spec, self.policy)
-            return path
-        assert isinstance(self.policy, HierarchyPolicy)
-        write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
-        return path
-
-    @checked_names
-    def push(self, name: str, *, private: bool = False, calls: bool = False) -> dict[str, Any]:
-        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
-
-        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
-        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
-        ``hf auth login``, or set ``HF_TOKEN``.
-
-        Args:
-            name: ``owner/name``; made if it is not there. An older run there is replaced.
-            private: others may not read it.
-            calls: with the log of calls, so that others can plan without recording one.
-
-        Returns:
-            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
-
-        Raises:
-            RunError: the run is not finished or damaged, ``name`` may not be written or
-                holds something else, or the hub does not answer.
-        """
-        self._check_written()
-        return push_run(self.path, name, private, calls)
-
-    @checked_names
     def as_skill(self, name: str, **attributes: Any) -> Skill:
         """Return the whole policy as one skill of another hierarchy.
 
@@ -806,22 +544,6 @@ class Run:
         kind = type(name, (Skill,), {"name": name, "policy": self.policy, **attributes})
         skill: Skill = kind()
         return skill
-
-    @checked_names
-    def info(self) -> dict[str, Any]:
-        """Return its manifest, with the latest saved evaluation under ``evaluation``.
-
-        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
-        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
-        """
-        self._check_written()
-        run = RunDirectory.open(self.path)
-        scores = {
-            "evaluation": load_evaluation(run),
-            "evaluation_sampled": load_evaluation(run, deterministic=False),
-        }
-        known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        return run.manifest | known | hand_over_json(hand_over_of(run))
 
     @checked_names
     def log_calls(
@@ -927,83 +649,6 @@ class Run:
             notice(f"this plan has a chance of {expected.chance:.0%}: {expected.reason}")
         return run
 
-    @checked_names
-    def repair(
-        self,
-        skill: str,
-        *,
-        after: str,
-        steps: int | None = None,
-        run_dir: str | Path | None = None,
-        done: Mapping[str, Any] | None = None,
-        calls: int = 200,
-        seed: int = 0,
-        quiet: bool = False,
-        callback: Callback | None = None,
-        resume: bool = False,
-    ) -> Run:
-        """Train a skill on from where another one ends, and keep the result if it is better.
-
-        Most episodes begin after a call of the other skill, the others as usual; half of them where
-        it does not rehearse. The skill is paid its own reward, and a bonus in each step in which
-        the event that its calls are for is true: as much per step as calls that were done earned
-        more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
-        earlier policy has a cost in the observations of its calls that were done after other skills
-        (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
-        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
-        and no other one clearly worse. All other weights stay as they are. What was done is in
-        ``Run.repairs``.
-
-        Args:
-            skill: the skill that fails, by its path.
-            after: the skill after which it fails, of the same selector.
-            steps: environment steps of training; measuring takes more. None: 200,000.
-            run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
-            done: by skill, the event that a call is for, in place of the skill's ``success``; as
-                for ``planning.hand_over``.
-            calls: calls of the pair to measure at least, before and after; fewer where 500,000
-                steps do not hold them.
-            seed: the root of every random stream.
-            quiet: no progress.
-            callback: as in ``Hierarchy.train``.
-            resume: finish the repair in ``run_dir``, with its own steps and settings.
-
-        Returns:
-            The new run, with the repaired weights or the earlier ones.
-
-        Raises:
-            DeclarationError: no such skill, one that does not learn, one that may not start after
-                the other, seldom does, or needs no repair; or too few steps.
-            RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
-                something else.
-        """
-        self._check_written()
-        declared = self.hierarchy
-        assert isinstance(self.policy, HierarchyPolicy)
-        return run_of(
-            repair(
-                declared,
-                self.path,
-                self.policy,
-                skill,
-                after,
-                None if steps is None else whole_number(steps, "steps", 1),
-                run_dir,
-                done,
-                whole_number(calls, "calls", 1),
-                whole_number(seed, "seed", 0),
-                quiet,
-                callback,
-                resume,
-            )
-        )
-
-    @property
-    def repairs(self) -> list[Repair]:
-        """The repairs of its skills, the latest last: both matrices, the reason, the result."""
-        self._check_written()
-        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
-
     def _own_spec(self) -> EnvSpec:
         """Return the environment of the hierarchy's own task."""
         return self.hierarchy.spec
@@ -1041,14 +686,156 @@ class Run:
         return SkillAlone(level.skills, name_of(skill), skill)
 
 
-class PlannedRun(Run):
+class Run(TrainedPolicy):
+    """A trained policy with its declaration: evaluate, watch or save it, use it as a skill.
+
+    Args:
+        declaration: what was trained.
+        path: its directory, or its weights file.
+        policy: the trained policy.
+    """
+
+    @checked_names
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int = 20,
+        films: int = 3,
+        seed: int = 0,
+        deterministic: bool = True,
+        quiet: bool = False,
+    ) -> dict[str, Any]:
+        """Write one HTML file about the run: film, calls, skills, curves, settings.
+
+        Args:
+            path: the file; None: ``report.html`` in the run.
+            episodes: to play, with seeds that training never used.
+            films: how many of them to film, from the worst to the best.
+            seed: picks the episodes.
+            deterministic: act greedily, else sample.
+            quiet: no progress; else it is shown where a part takes longer than a second.
+
+        Returns:
+            ``path``, ``bytes``, ``seconds``, ``verdict``: a sentence on what the policy does, and
+            ``missing``: sentences on what is not in it.
+
+        Raises:
+            RunError: this is no run but a weights file, or the file cannot be written.
+        """
+        run = RunDirectory.open(self.path)
+        return write_report(
+            run,
+            run.path / "report.html" if path is None else as_path(path, "path"),
+            self.policy,
+            self.declaration.spec,
+            episodes=episodes,
+            filmed=films,
+            seed=seed,
+            deterministic=deterministic,
+            quiet=quiet,
+        )
+
+    @checked_names
+    def save_weights(self, path: str | Path) -> Path:
+        """Write every policy into one file for ``Hierarchy.load_weights``.
+
+        Args:
+            path: the file to write.
+
+        Returns:
+            The path.
+        """
+        path = as_path(path, "path")
+        must_be_own(path.parent)
+        if isinstance(self.policy, AgentPolicy):
+            write_agent(path, self.declaration.spec, self.policy)
+            return path
+        assert isinstance(self.policy, HierarchyPolicy)
+        write_weights(path, roles_of(self.hierarchy), self.policy, self.hierarchy.recipe)
+        return path
+
+    @checked_names
+    def push(self, name: str, *, private: bool = False, calls: bool = False) -> dict[str, Any]:
+        """Put the run on the Hugging Face Hub, where ``from_hub`` finds it; by the extra ``hub``.
+
+        Up go weights, metrics, the saved evaluation, films that lie in the run's folder, figures,
+        and a page about all that: safetensors, JSON and pictures, in one commit. Log in first:
+        ``hf auth login``, or set ``HF_TOKEN``.
+
+        Args:
+            name: ``owner/name``; made if it is not there. An older run there is replaced.
+            private: others may not read it.
+            calls: with the log of calls, so that others can plan without recording one.
+
+        Returns:
+            ``url``, ``commit``, ``files``, and ``missing``: sentences on what is not there.
+
+        Raises:
+            RunError: the run is not finished or damaged, ``name`` may not be written or
+                holds something else, or the hub does not answer.
+        """
+        return push_run(self.path, name, private, calls)
+
+    @checked_names
+    def info(self) -> dict[str, Any]:
+        """Return its manifest, with the latest saved evaluation under ``evaluation``.
+
+        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
+        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
+        """
+        run = RunDirectory.open(self.path)
+        scores = {
+            "evaluation": load_evaluation(run),
+            "evaluation_sampled": load_evaluation(run, deterministic=False),
+        }
+        known = {k: v.to_json() for k, v in scores.items() if v is not None}
+        return run.manifest | known | hand_over_json(hand_over_of(run))
+
+    @Takes(RepairOptions)
+    def repair(self, options: RepairOptions) -> Run:
+        """Train a skill on from where another one ends, and keep the result if it is better.
+
+        Most episodes begin after a call of the other skill, the others as usual; half of them where
+        it does not rehearse. The skill is paid its own reward, and a bonus in each step in which
+        the event that its calls are for is true: as much per step as calls that were done earned
+        more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
+        earlier policy has a cost in the observations of its calls that were done after other skills
+        (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
+        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
+        and no other one clearly worse. All other weights stay as they are. What was done is in
+        ``Run.repairs``.
+
+        Returns:
+            The new run, with the repaired weights or the earlier ones.
+
+        Raises:
+            DeclarationError: no such skill, one that does not learn, one that may not start after
+                the other, seldom does, or needs no repair; or too few steps.
+            RunError: the run was planned, or loaded without its code; or ``run_dir`` holds
+                something else.
+        """
+        declared = self.hierarchy
+        assert isinstance(self.policy, HierarchyPolicy)
+        return run_of(repair(declared, self.path, self.policy, options))
+
+    @property
+    def repairs(self) -> list[Repair]:
+        """The repairs of its skills, the latest last: both matrices, the reason, the result."""
+        return repairs_of(RunDirectory.open(self.path)) if self.path.is_dir() else []
+
+
+class PlannedRun(TrainedPolicy):
     """Skills of a run with a planner for a new task; nothing of it is written."""
 
+    _kind = "PlannedRun of"
     _mark = "-plan"
     _forecast: Forecast | None = None
 
-    def __repr__(self) -> str:
-        return super().__repr__().replace("<Run", "<PlannedRun of", 1)
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(Run, name):
+            self._check_written()
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @checked_names
     def with_selector(
@@ -1121,23 +908,6 @@ class PlannedRun(Run):
         )
 
 
-OneRun = str | Path | Run
-StartFrom = OneRun | Learnable | Mapping[str, OneRun | Learnable] | None
-"""A run from which learners start, or such runs by the learners' names; or policies made elsewhere
-(``from_sb3(..., learn=True)``)."""
-
-
-def _directories(start_from: StartFrom) -> Directories:
-    """Return ``start_from`` with the directory of each run in place of the run."""
-    if isinstance(start_from, Mapping):
-        return {name: _directory(run) for name, run in start_from.items()}
-    return None if start_from is None else _directory(start_from)
-
-
-def _directory(run: OneRun | Learnable) -> str | Path | Learnable:
-    return run.path if isinstance(run, Run) else run
-
-
 def declaration_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
     """Return what a run trained: the hierarchy, or its flat baseline."""
     if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
@@ -1178,58 +948,9 @@ def _labels_of(
     return label
 
 
-@checked_names
-def train_agent(
-    env: str | Callable[[], gym.Env[Any, Any]] | EnvSpec,
-    algorithm: AlgorithmConfig,
-    steps: int,
-    run_dir: str | Path | None = None,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    target_return: float | None = None,
-    target_success: float | None = None,
-    eval_every: int | None = None,
-    eval_episodes: int = 20,
-    checkpoint_every: int = 100_000,
-    seed: int = 0,
-    quiet: bool = False,
-    track: Sequence[str] = (),
-    evolve: Evolve = None,
-    cluster: Ray | None = None,
-    start_from: StartFrom = None,
-    callback: Callback | None = None,
-    keep: Literal["last", "best"] = "last",
-    log_info: Sequence[str] = (),
-) -> Run:
+@Takes(AgentTraining)
+def train_agent(options: AgentTraining) -> Run:
     """Train one plain agent on an environment's own reward; the run is like any other.
-
-    Args:
-        env: a Gymnasium id, a function that makes an environment, or an ``EnvSpec``.
-        algorithm: its settings, ``SAC()`` for example.
-        steps: training budget in environment steps.
-        target_return: stop early at this mean return of the periodic evaluation.
-        target_success: stop early at this share of episodes with a true ``info["success"]``, or
-            ``info["is_success"]`` where that is missing.
-        eval_every: environment steps between these evaluations; None: none.
-        eval_episodes: episodes of each.
-        checkpoint_every: environment steps between checkpoints.
-        run_dir: a new directory; None: the next number of ``runs/<environment>-<n>``.
-        resume: continue the run in ``run_dir`` if it has learnt something, for more ``steps`` if
-            they have grown, else start; see ``Hierarchy.train``.
-        overwrite: replace the run in ``run_dir``; see ``Hierarchy.train``.
-        seed: the root of every random stream.
-        quiet: no progress.
-        track: any of "tensorboard", "wandb" and "mlflow": one, or a list.
-        evolve: an ``Evolution``: a population in place of one agent.
-        cluster: run collectors, or parts of a population, on ``Ray``; None: here, in processes
-            where it pays.
-        start_from: another plain agent's run, or its directory: it starts with that policy; or
-            ``from_sb3(..., learn=True)``; see ``Hierarchy.train``.
-        callback: is called with a ``TrainEvent`` for each report and each checkpoint; returning
-            False ends the training; see ``Hierarchy.train``.
-        keep: "best": end with the weights whose periodic evaluation was best.
-        log_info: keys of ``info`` that are logged; see ``Hierarchy.train``.
 
     Returns:
         The finished run.
@@ -1237,31 +958,10 @@ def train_agent(
     Raises:
         DeclarationError: the algorithm cannot act in the environment; the message names others.
     """
-    agent = Agent(
-        env,
-        algorithm,
-        steps,
-        target_return=target_return,
-        target_success=target_success,
-    )
+    targets = {k: getattr(options, k) for k in ("target_return", "target_success")}
+    agent = Agent(options.env, options.algorithm, options.steps, **targets)
     with called_by("train_agent"):
-        return agent.train(
-            run_dir,
-            resume=resume,
-            overwrite=overwrite,
-            seed=seed,
-            eval_every=eval_every,
-            eval_episodes=eval_episodes,
-            checkpoint_every=checkpoint_every,
-            quiet=quiet,
-            track=track,
-            evolve=evolve,
-            cluster=cluster,
-            start_from=start_from,
-            callback=callback,
-            keep=keep,
-            log_info=log_info,
-        )
+        return run_of(train(agent, options))
 
 
 __all__ = ["Agent", "Hierarchy", "Run", "train_agent"]

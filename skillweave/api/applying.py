@@ -27,13 +27,13 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json
-from skillweave.training.plain_agent import PlainAgent, load_agent_of
+from skillweave.training.plain_agent import Declared, load_agent_of
 from skillweave.types import Policy
 
 MOST_NAMED = 3
 """Settings that a message names."""
 
-D = TypeVar("D", bound=Declaration | PlainAgent)
+D = TypeVar("D", bound=Declared)
 Trained = tuple[D, RunDirectory, Policy]
 """A declaration with a run's manifest applied, the run, and its policy."""
 
@@ -126,16 +126,16 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
     return f"the run continues with its own settings: {', '.join(named)}{more}"
 
 
-def check_run(declared: Declaration | PlainAgent, run: RunDirectory) -> None:
+def check_run(declared: Declared, run: RunDirectory) -> None:
     """Raise a RunError where a run is not one of this declaration; notice other code."""
     code = environment_texts(declared.spec)
     if run.manifest["kind"] == "hierarchy":
-        if isinstance(declared, PlainAgent):
+        if not isinstance(declared, Declaration):
             raise RunError(f"{run.path} is the run of a hierarchy, not of a plain agent")
         roles = roles_of(declared)
         _check_roles(roles, run)
         code = roles.code
-    what = "agent" if isinstance(declared, PlainAgent) else "hierarchy"
+    what = "hierarchy" if isinstance(declared, Declaration) else "agent"
     _check_place(declared.spec, what, run)
     notice_changes(run.manifest.get("code", {}), code, f"{run.path} was trained")
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from skillweave.api.applying import apply_manifest, check_run, differences
+from skillweave.api.applying import D, apply_manifest, differences
 from skillweave.errors import RunError
 from skillweave.evolution.plan import Evolve, plan
-from skillweave.hierarchy.declaration import Declaration
 from skillweave.paths import decides, is_below, level_of
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
-from skillweave.training.plain_agent import PlainAgent
-
-D = TypeVar("D", bound=Declaration | PlainAgent)
 
 EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
@@ -35,7 +31,6 @@ def prepared(
     content: dict[str, Any],
     run: RunDirectory,
     evolve: Evolve,
-    track: Sequence[str],
 ) -> tuple[D, str]:
     """Return a declaration with a run's manifest applied, and sentences; the run is locked.
 
@@ -47,16 +42,15 @@ def prepared(
     Raises:
         RunError: the run is one of another declaration, or a stage cannot continue.
     """
-    check_run(declared, run)
-    _check_same(content, run)
     declared = apply_manifest(declared, run)
+    _check_same(content, run)
     stages = content["stages"]
     if run.manifest["kind"] == "hierarchy":
         # As the run learns, apart or together: it may be declared otherwise now.
         stages = [stage.entry() for stage in declared.stages()]
     budgets = _budgets(stages, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
-    if tuple(track) != tuple(run.manifest.get("track", ())):
+    if content["track"] != tuple(run.manifest.get("track", ())):
         known = ", ".join(run.manifest.get("track", ())) or "none"
         sentences.append(f"the run continues with its own trackers: {known}")
     if content.get("log_calls") != run.manifest.get("log_calls"):

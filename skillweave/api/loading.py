@@ -9,15 +9,15 @@ from skillweave.api import Agent, Hierarchy, Run, run_of
 from skillweave.api.applying import load_policy
 from skillweave.api.recipe_file import hierarchy_in
 from skillweave.api.running import begin, begun
+from skillweave.api.train_options import AgentOptions
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
-from skillweave.hierarchy.declaration import Declaration
 from skillweave.messages import as_path, short
 from skillweave.runs import hub
 from skillweave.runs.command_words import python_string
 from skillweave.runs.directory import RunDirectory
 from skillweave.shipped import names
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.plain_agent import Declared
 
 ASK = "Point to the file that defines it, if you trust it: --recipe FILE.py"
 ASK_FROM_HUB = (
@@ -107,8 +107,8 @@ def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
     """
     run = begun(declared, content, run_dir)
     if run is None:
-        content = content | {"recipe": declared.recipe}
-        return run_of(begin(declared, content, run_dir, True, (), None, None))
+        options = AgentOptions(run_dir, seed=content["seed"], quiet=True)
+        return run_of(begin(declared, content, options))
     return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
 
 
@@ -146,7 +146,7 @@ def declared_in(recipe: str | None, given: str | None, where: str, ask: str = AS
 
 def check_declared(declared: object) -> None:
     """Raise a DeclarationError where ``declared`` is no declaration."""
-    if declared is not None and not isinstance(declared, Declaration | PlainAgent):
+    if declared is not None and not isinstance(declared, Declared):
         raise DeclarationError(
             f"hierarchy is {short(declared)}; it must be the Hierarchy or Agent that was trained"
         )

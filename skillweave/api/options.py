@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skillweave.api import Hierarchy, Run
+from skillweave.api import Hierarchy, Run, TrainedPolicy
 from skillweave.arguments import checked_names
 from skillweave.envs.make import make_engine
 from skillweave.errors import DeclarationError
@@ -37,7 +37,7 @@ def make_options_env(
     real = isinstance(gamma, int | float) and not isinstance(gamma, bool)
     if not real or not 0.0 < gamma <= 1.0:
         raise DeclarationError(f"gamma is {short(gamma)}; it must be over 0 and at most 1")
-    if isinstance(hierarchy, Run):
+    if isinstance(hierarchy, TrainedPolicy):
         if not isinstance(hierarchy.policy, HierarchyPolicy):
             raise DeclarationError("this is the run of a plain agent: it has no skills to call")
         skills, spec = hierarchy.policy.skills, hierarchy.hierarchy.spec

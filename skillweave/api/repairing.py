@@ -12,6 +12,7 @@ from skillweave.algorithms.config import OnPolicy, config_to_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api.applying import Trained, apply_manifest
 from skillweave.api.running import Base, begin, go_on
+from skillweave.api.train_options import RepairOptions
 from skillweave.errors import DeclarationError, RunError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.assembly import parts_of
@@ -31,7 +32,6 @@ from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills.learnable import learn_on
-from skillweave.training.callback import Callback
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
 from skillweave.types import Array
@@ -52,16 +52,7 @@ def repair(
     declared: D,
     source: Path,
     policy: HierarchyPolicy,
-    skill: str,
-    after: str,
-    steps: int | None,
-    run_dir: str | Path | None,
-    done: Mapping[str, Any] | None,
-    calls: int,
-    seed: int,
-    quiet: bool,
-    callback: Callback | None,
-    resume: bool,
+    options: RepairOptions,
 ) -> Trained[D]:
     """Repair a skill of a run in a new run; see ``Run.repair``.
 
@@ -70,15 +61,16 @@ def repair(
         policy: of the run.
     """
     roles = roles_of(declared)
-    skill, after = _checked(roles, skill, after)
-    if resume:
-        return _go_on(declared, skill, after, steps, run_dir, done, quiet, callback)
-    if run_dir is not None and (place := as_path(run_dir, "run_dir") / "run.json").exists():
+    skill, after = _checked(roles, options.skill, options.after)
+    if options.resume:
+        return _go_on(declared, skill, after, options)
+    place = None if options.run_dir is None else as_path(options.run_dir, "run_dir")
+    if place is not None and (place / "run.json").exists():
         raise RunError(
-            f"{shown_path(place.parent)} holds a run: name a new directory; or, if a repair was "
+            f"{shown_path(place)} holds a run: name a new directory; or, if a repair was "
             "stopped there, add resume=True"
         )
-    steps = USUAL_STEPS if steps is None else steps
+    steps, done, calls = options.steps or USUAL_STEPS, options.done, options.calls
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
     content, entries, policies = _content(declared, source, roles, policy)
@@ -101,14 +93,14 @@ def repair(
             f"steps is {steps:,}, but {skill!r} learns for the first time after {one:,}; give more "
             "steps"
         )
-    with Progress(quiet=quiet) as progress:
+    with Progress(quiet=options.quiet) as progress:
         found = _measured(roles, policy, skill, after, done, calls, config.num_envs, progress)
     entry["repair"]["before"] = matrix_to_json(found.matrix)
     reason = str(found.log.blame(name_of(skill), name_of(after), done))
     reason += f" {found.shortage}" if found.shortage else ""
     entry["repair"]["blame"] = reason
     entry["repair"]["bonus"] = found.gain
-    content |= {"stages": [entry], "seed": seed, "code": roles.code}
+    content |= {"stages": [entry], "seed": options.seed, "code": roles.code}
     rehearsal = None
     role = roles[skill]
     assert role.skill is not None
@@ -121,38 +113,17 @@ def repair(
         )
     write = partial(_write, policies=policies, stage=entry["name"], rehearsal=rehearsal)
     base = Base(entries, write, "repair")
-    return begin(
-        declared,
-        content,
-        run_dir,
-        quiet,
-        (),
-        None,
-        None,
-        note=reason,
-        callback=callback,
-        base=base,
-        done=done,
-    )
+    return begin(declared, content, options.training, reason, base, done)
 
 
-def _go_on(
-    declared: D,
-    skill: str,
-    after: str,
-    steps: int | None,
-    run_dir: str | Path | None,
-    done: Mapping[str, Any] | None,
-    quiet: bool,
-    callback: Callback | None,
-) -> Trained[D]:
+def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Trained[D]:
     """Finish a repair that was stopped, with the steps that it was started with."""
-    if run_dir is None:
+    if options.run_dir is None:
         raise DeclarationError(
             "resume=True continues a repair, so name its directory: "
             f'repair({name_of(skill)!r}, after={name_of(after)!r}, run_dir="runs/a", resume=True)'
         )
-    run = RunDirectory.open(as_path(run_dir, "run_dir"))
+    run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
     repairs = [e["repair"] for e in run.manifest["stages"] if "repair" in e]
     if not repairs or (repairs[-1]["skill"], repairs[-1]["after"]) != (skill, after):
         raise RunError(
@@ -160,13 +131,12 @@ def _go_on(
             "resume=True to start one in another directory"
         )
     budget = next(e["budget"] for e in reversed(run.manifest["stages"]) if "repair" in e)
-    if steps not in (None, budget):
+    if options.steps not in (None, budget):
         raise DeclarationError(
-            f"steps is {steps:,}, but this repair was started with {budget:,}: leave out steps"
+            f"steps is {options.steps:,}, but this repair was started with {budget:,}: "
+            "leave out steps"
         )
-    return go_on(
-        apply_manifest(declared, run), run, quiet, None, None, callback=callback, done=done
-    )
+    return go_on(apply_manifest(declared, run), run, options.training, done=options.done)
 
 
 def _checked(roles: Roles, skill: Any, after: Any) -> tuple[str, str]:
@@ -272,7 +242,7 @@ def _content(
         ]
         policies = {entry["name"]: run.load_policies(entry["name"]) for entry in entries}
         return content | {"eval_every": None, "keep": "last"}, entries, policies
-    content = training.manifest(declared, seed=0) | {"recipe": getattr(declared, "recipe", None)}
+    content = training.manifest(declared, seed=0)
     content |= {"eval_every": None, "keep": "last"}
     parts, entries = parts_of(roles, policy), []
     policies = dict[str, dict[str, AgentPolicy]]()

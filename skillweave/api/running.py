@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -11,9 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skillweave.api.applying import Trained
+from skillweave.algorithms.config import AlgorithmConfig
+from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import prepared, to_continue
-from skillweave.api.starting import Directories, starts
+from skillweave.api.starting import starts
+from skillweave.api.train_options import (
+    AgentOptions,
+    Going,
+    ResumeOptions,
+    TrainOptions,
+    recorded,
+)
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.collecting.start_methods import runs_again, why_no_processes
@@ -23,7 +31,7 @@ from skillweave.evolution.plan import Evolve, check_several, make_learner, plan
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.roles import Level, roles_of
-from skillweave.messages import absolute, as_path, short, shown_path
+from skillweave.messages import absolute, as_path, shown_path
 from skillweave.notices import collected_notices, warn
 from skillweave.ops.device import normal_tensors
 from skillweave.paths import AGENT
@@ -38,8 +46,8 @@ from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
-from skillweave.training.callback import Callback, TrainCallback, check_callback
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.callback import TrainCallback
+from skillweave.training.plain_agent import Declared
 from skillweave.training.role import Role, agent_role
 from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
 from skillweave.training.stage_log import Listener
@@ -59,85 +67,74 @@ def _may_train() -> None:
         )
 
 
-D = TypeVar("D", bound=Declaration | PlainAgent)
+def train(declared: D, options: AgentOptions) -> Trained[D]:
+    """Check everything, start a run, or continue the one that is there, and train it."""
+    declared.validate()
+    flat: bool | AlgorithmConfig = False
+    note = ""
+    if (
+        isinstance(options, TrainOptions)
+        and (flat := options.flat)
+        and options.log_calls is not None
+    ):
+        raise DeclarationError(
+            "flat trains one plain agent, which has no skills to call: leave out log_calls"
+        )
+    how = declared.train_defaults.given(options)
+    if isinstance(declared, Declaration) and flat is False:
+        declared, note = evolving(declared, options.evolve)
+    content = training.manifest(declared, seed=options.seed, flat=flat, how=how)
+    return begin(declared, content, options, note)
 
 
 def begin(
     declared: D,
     content: dict[str, Any],
-    run_dir: str | Path | None,
-    quiet: bool,
-    track: Sequence[str],
-    evolve: Evolve,
-    cluster: Ray | None,
-    start_from: Directories = None,
+    options: AgentOptions,
     note: str = "",
-    callback: Callback | None = None,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
     base: Base | None = None,
     done: Mapping[str, Any] | None = None,
-    own_start: Callable[[], Directories] | None = None,
 ) -> Trained[D]:
-    """Check everything, start a run of this manifest, and train it; ``note`` is printed first.
+    """Check everything, start a run, or continue the one that is there, and train it.
 
-    With ``resume``, continue what is in ``run_dir`` instead, if there is something; with
-    ``overwrite``, replace it. With ``base``, the stages of the manifest come after stages that are
-    done. ``done``: as for ``training.train``.
-    ``own_start`` makes what a new run starts from where ``start_from`` names nothing.
+    Args:
+        content: the manifest of a new run, without options of this training alone.
+        note: is printed first.
+        base: stages that are done, after which those of the manifest come.
+        done: as for ``training.train``.
     """
     _may_train()
-    check_callback(callback)
     # An environment may change the working directory as it is made.
-    place = absolute("." if run_dir is None else as_path(run_dir, "run_dir"))
-    run_dir = None if run_dir is None else place
-    for word, value in (("resume", resume), ("overwrite", overwrite)):
-        if not isinstance(value, bool):
-            raise DeclarationError(f"{word} is {short(value)}; it must be True or False")
-        if value and run_dir is None:
-            raise DeclarationError(
-                f'{word}=True needs a run: name its directory, train("runs/a", {word}=True)'
-            )
-    if resume and overwrite:
-        raise DeclarationError(
-            "resume continues the run in run_dir, and overwrite replaces it: leave out one of them"
-        )
-    if not isinstance(track, Sequence):
-        raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
-    track = (track,) if isinstance(track, str) else tuple(track)
+    given = options.run_dir
+    place = absolute("." if given is None else as_path(given, "run_dir"))
+    content = {**content, "recipe": content.get("recipe", declared.recipe), **recorded(options)}
     with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
-        roles = _plan(declared, content, evolve, cluster)
-        if resume and run_dir is not None and (run := to_continue(run_dir)) is not None:
-            declared, sentences = prepared(declared, content, run, evolve, track)
+        roles = _plan(declared, content, options)
+        if options.resume and (run := to_continue(place)) is not None:
+            declared, note = prepared(declared, content, run, options.evolve)
             stack.callback(run.close)
-            return go_on(declared, run, quiet, evolve, cluster, sentences, callback)
-        if start_from is None and own_start is not None:
-            start_from = own_start()
+            return go_on(declared, run, options, note)
+        start_from = options.start_from
+        if start_from is None and content["kind"] == "hierarchy" and declared._starts is not None:
+            start_from = declared._starts()
         learnt, origin = starts(content, start_from, roles)
         first: First = partial(copy_initial_policies, learnt=learnt)
         note = " ".join(filter(None, (note, origin, _kept_by_populations(content))))
-        make_trackers(track, None)  # a missing extra is reported before anything is written
-        if cluster is not None:
-            cluster.check()
-        content = content | {"track": track}
-        if run_dir is None:
-            name, flat = declared.spec.name, False
-            if isinstance(declared, Declaration):
-                flat = content["kind"] == "agent"
-                name = name if declared.name == Declaration.name else declared.name
-            stem = _run_name(content.get("recipe"), name, flat)
-            stem += "" if base is None else f"-{base.name}"
-            run_dir = make_numbered(stem, place)
-            note = "; ".join(filter(None, (f"run: {shown_path(run_dir)}", note)))
-            stack.callback(_remove_if_empty, run_dir)
+        make_trackers(options.track, None)  # a missing extra is reported before anything is written
+        if options.cluster is not None:
+            options.cluster.check()
+        if given is None:
+            stem = _run_name(declared, content) + ("" if base is None else f"-{base.name}")
+            place = make_numbered(stem, place)
+            note = "; ".join(filter(None, (f"run: {shown_path(place)}", note)))
+            stack.callback(_remove_if_empty, place)
         if base is not None:
             content["stages"] = [*base.stages, *content["stages"]]
             first = base.write
-        run = RunDirectory.create(run_dir, content, first, hold=True, overwrite=overwrite)
+        run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
-        return go_on(declared, run, quiet, evolve, cluster, note, callback, done)
+        return go_on(declared, run, options, note, done)
 
 
 @dataclass(frozen=True)
@@ -160,16 +157,13 @@ def _kept_by_populations(content: dict[str, Any]) -> str:
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
-def _run_name(recipe: str | None, name: str, flat: bool) -> str:
-    """Return the stem of a numbered directory.
-
-    Args:
-        recipe: the declaration's place; its name comes first.
-        name: of the hierarchy, or of the environment.
-        flat: the flat baseline of a hierarchy is trained.
-    """
-    stem = "" if recipe is None else Path(recipe).stem
-    return (stem or name) + ("-flat" if flat else "")
+def _run_name(declared: Declared, content: Mapping[str, Any]) -> str:
+    """Return the stem of a numbered directory: of the recipe, the hierarchy or the environment."""
+    name, flat = declared.spec.name, ""
+    if isinstance(declared, Declaration):
+        flat = "-flat" if content["kind"] == "agent" else ""
+        name = name if declared.name == Declaration.name else declared.name
+    return (Path(content.get("recipe") or "").stem or name) + flat
 
 
 def _remove_if_empty(path: Path) -> None:
@@ -186,7 +180,7 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
     if not (run_dir / "run.json").exists():
         return None
     run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
-    _plan(declared, content, None, None)
+    _plan(declared, content, Going())
     grown = any(stage.get("continued") for stage in run.manifest["stages"])
     if grown or run.manifest.get("id") != identity(content):
         raise RunError(
@@ -197,34 +191,31 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
 
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
-def _plan(
-    declared: Declaration | PlainAgent, content: dict[str, Any], evolve: Evolve, cluster: Ray | None
-) -> Mapping[str, Role]:
+def _plan(declared: Declared, content: dict[str, Any], options: Going) -> Mapping[str, Role]:
     """Check everything, and complete the entries of a manifest's stages; return the roles."""
+    stages, spec, cluster = content["stages"], declared.spec, options.cluster
     declared.check_spaces()
-    plan(content["stages"], evolve)
-    check_several(content["stages"], declared.spec)
-    check_stages(content["stages"], content["eval_every"], content["keep"])
-    if content.get("log_calls") and any(s.get("evolution") for s in content["stages"]):
-        raise DeclarationError(
-            "log_calls is set, but members of a population have policies of their own, so no log "
-            "of calls is kept while they evolve: leave out log_calls or evolve, and record calls "
-            "afterwards with run.log_calls()"
-        )
-    spec = declared.spec
+    plan(stages, options.evolve)
+    check_several(stages, spec)
+    check_stages(stages, content["eval_every"], content["keep"])
     if steps := content.get("log_calls"):
+        if any(stage.get("evolution") for stage in stages):
+            raise DeclarationError(
+                "log_calls is set, but members of a population have policies of their own, so no "
+                "log of calls is kept while they evolve: leave out log_calls or evolve, and record "
+                "calls afterwards with run.log_calls()"
+            )
         check_size(steps, (spec.spaces.observation, spec.spaces.action))
-    _check(cluster)
     if cluster is not None and cluster.collectors is not None:
         spec = replace(spec, workers=cluster.collectors)
-    assign_workers(content["stages"], spec, declared)
-    if cluster is None and any(stage["workers"] > 1 for stage in content["stages"]):
+    assign_workers(stages, spec, declared)
+    if cluster is None and any(stage["workers"] > 1 for stage in stages):
         _must_not_run_again(spec)
     roles: Mapping[str, Role] = {AGENT: agent_role(declared.spec)}
     if content["kind"] == "hierarchy":
         assert isinstance(declared, Declaration)
         roles = roles_of(declared).by_path
-    for stage in content["stages"]:
+    for stage in stages:
         for path in stage["learns"]:
             config = stage.get("algorithms", {}).get(path, stage["algorithm"])
             if roles[path].kind != "critic":  # it has no replay
@@ -248,18 +239,25 @@ def _must_not_run_again(spec: EnvSpec) -> None:
         )
 
 
+def resume(declared: D, options: ResumeOptions) -> Trained[D]:
+    """Finish a run with its own settings; a message lists those that differ."""
+    declared.validate()
+    run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
+    applied, note = apply_manifest(declared, run), ""
+    if not declared.recorded and declared.recipe is None:  # the command line may change a recipe
+        flat = run.manifest["kind"] == "agent"
+        note = differences(training.manifest(declared, seed=run.manifest["seed"], flat=flat), run)
+    return go_on(applied, run, options, note)
+
+
 def go_on(
     declared: D,
     run: RunDirectory,
-    quiet: bool,
-    evolve: Evolve,
-    cluster: Ray | None,
+    options: Going,
     note: str = "",
-    callback: Callback | None = None,
     done: Mapping[str, Any] | None = None,
 ) -> Trained[D]:
     """Train what is left of a run; ``note`` is printed first. ``done``: as of ``begin``."""
-    check_callback(callback)
     if not run.finished:
         _may_train()
     must_be_own(run.path)
@@ -268,22 +266,22 @@ def go_on(
         stack.callback(run.close)
         run.begin()
         notices = stack.enter_context(collected_notices())
-        progress = stack.enter_context(Progress(quiet=quiet))
+        progress = stack.enter_context(Progress(quiet=options.quiet))
         progress.plan(run.manifest["stages"])
         if note:
             progress.message(note)
-        notices.tell_by(warn if quiet else progress.message)
-        trackers = make_trackers(run.manifest.get("track", ()), run)
-        for tracker in trackers:
+        notices.tell_by(warn if options.quiet else progress.message)
+        listeners: list[Listener] = [progress]
+        for tracker in make_trackers(run.manifest.get("track", ()), run):
             stack.callback(tracker.close)
-        listeners: tuple[Listener, ...] = (progress, *trackers)
-        if callback is not None:  # last: the report that it receives is written by then
-            listeners = (*listeners, TrainCallback(callback, run))
-        make = _where(cluster, run, progress, stack)
-        learner = make_learner(run.manifest["stages"], evolve, make)
+            listeners.append(tracker)
+        if options.callback is not None:  # last: the report that it receives is written by then
+            listeners.append(TrainCallback(options.callback, run))
+        make = _where(options.cluster, run, progress, stack)
+        learner = make_learner(run.manifest["stages"], options.evolve, make)
         try:
             with global_generators(Seeds(int(run.manifest["seed"])) / "global"):
-                policy = training.train(declared, run, listeners, learner, done)
+                policy = training.train(declared, run, tuple(listeners), learner, done)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
     return declared, run, policy
@@ -333,7 +331,6 @@ def _where(
     Raises:
         RunError: the run was started with another number of collectors.
     """
-    _check(cluster)
     if cluster is None or run.finished:
         return LOCAL
     left = [s for s in run.manifest["stages"] if s["status"] != "done"]
@@ -351,8 +348,3 @@ def _where(
             "collectors was given: Ray(collectors=4), --collectors 4"
         )
     return stack.enter_context(cluster.connected(max(counts, default=1), progress.message))
-
-
-def _check(cluster: Any) -> None:
-    if not isinstance(cluster, Ray | None):
-        raise DeclarationError(f"cluster is {short(cluster)}; write cluster=Ray(collectors=8)")

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-from gymnasium import Space
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.config import config_from_json
@@ -34,16 +33,24 @@ from skillweave.skills.learnable import Learnable
 from skillweave.spaces import same_space
 from skillweave.training.role import Role
 
-Directory = str | Path
-Origin = Directory | Learnable | Learnt
-"""What a learner starts from: a run's directory, or a policy."""
-Directories = Directory | Mapping[str, Origin] | Learnable | None
-"""What to start from: a run, a policy made elsewhere (of a plain agent), or these by learner."""
+
+class InDirectory(Protocol):
+    """A ``Run``."""
+
+    path: Path
+    """Its directory."""
+
+
+Origin = str | Path | InDirectory | Learnable | Learnt
+"""What a learner starts from: a run, its directory, or a policy made elsewhere
+(``from_sb3(..., learn=True)``)."""
+StartFrom = Origin | Mapping[str, Origin] | None
+"""What to start from: that of all learners of these names, or one by learner."""
 
 
 def starts(
     content: dict[str, Any],
-    start_from: Directories,
+    start_from: StartFrom,
     roles: Mapping[str, Role],
 ) -> tuple[dict[str, Learnt], str]:
     """Return the policies that learners start from, by name, and a sentence about them.
@@ -63,19 +70,16 @@ def starts(
     if isinstance(start_from, Mapping):
         if not start_from:
             raise DeclarationError('start_from is {}; name the run of each learner: {"left": run}')
-        learnt, places = _learnt_by_name(content, {**declared, **start_from}, roles)
+        learnt = _learnt_by_name(content, {**declared, **start_from}, roles)
     else:
-        learnt, places = _learnt_by_name(content, declared, roles)
+        learnt = _learnt_by_name(content, declared, roles)
         if start_from is not None:
-            place = _place(start_from, "start_from")
-            found = learners_of_run(place)
-            learnt |= found
-            places |= dict.fromkeys(found, place)
+            learnt |= learners_of_run(_place(start_from, "start_from"))
     # A dict rather than a set: the runs in the order in which they were given.
-    where = ", ".join(dict.fromkeys(map(str, places.values())))
+    where = ", ".join(dict.fromkeys(one.where for one in learnt.values()))
     started = record_initial_policies(content["stages"], learnt, where)
-    for origin in dict.fromkeys(places[name] for name in sorted(started)):
-        names = [name for name in started if places[name] == origin]
+    for origin in dict.fromkeys(learnt[name].where for name in sorted(started)):
+        names = [name for name in started if learnt[name].where == origin]
         ends = tuple(f"skill {name!r}" for name in names)
         code: dict[str, str] = content["code"]
         now = {k: v for k, v in code.items() if " skill " not in k or k.endswith(ends)}
@@ -87,10 +91,7 @@ def starts(
             algorithm = make_algorithm(
                 _config_in(stage, name), role.observation_space, role.action_space
             )
-            chooses = options_of(content, name)
-            goal_space = None if role.skill is None else role.skill.goal_space
-            _check_start(name, algorithm, chooses, learnt[name], places[name], goal_space)
-            _check_part(name, recorded_part(content, name), learnt[name].part, places[name])
+            _check_start(role, algorithm, content, learnt[name])
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 
@@ -133,7 +134,7 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
             f"{short(role.action_space, 200)} have"
         )
     policy = AgentPolicy(algorithm, fresh | weights)
-    return Learnt(policy, origin.sha256(), origin.steps, None, ((), ()))
+    return Learnt(policy, origin.sha256(), origin.steps, origin.name, None, ((), ()))
 
 
 def _config_in(stage: Mapping[str, Any], name: str) -> Any:
@@ -141,7 +142,7 @@ def _config_in(stage: Mapping[str, Any], name: str) -> Any:
     return config_from_json(stage.get("algorithms", {}).get(name, stage["algorithm"]))
 
 
-def _place(run: Directory, argument: str) -> Path:
+def _place(run: Any, argument: str) -> Path:
     """Return the directory of a run.
 
     Raises:
@@ -153,7 +154,7 @@ def _place(run: Directory, argument: str) -> Path:
             f"{argument} is {what}, and a training starts only from what a run of Skillweave has "
             f"learnt: its directory; {way}"
         )
-    return as_path(run, argument)
+    return as_path(getattr(run, "path", run), argument)
 
 
 def _use_of(value: Any) -> tuple[str, str] | None:
@@ -201,8 +202,8 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 def _learnt_by_name(
     content: dict[str, Any], start_from: Mapping[str, Origin], roles: Mapping[str, Role]
-) -> tuple[dict[str, Learnt], dict[str, Path | str]]:
-    """Return the policy that each named learner starts from, and where it is from, in words.
+) -> dict[str, Learnt]:
+    """Return the policy that each named learner starts from.
 
     Raises:
         DeclarationError: a name does not learn here.
@@ -210,7 +211,6 @@ def _learnt_by_name(
     """
     here = sorted({name for entry in content["stages"] for name in entry["learns"]})
     learnt: dict[str, Learnt] = {}
-    places: dict[str, Path | str] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     for name, run in start_from.items():
         if name not in here:
@@ -220,11 +220,10 @@ def _learnt_by_name(
                 f"{', '.join(here)}.{near}"
             )
         if isinstance(run, Learnt):
-            learnt[name], places[name] = run, "the plan"
+            learnt[name] = run
             continue
         if isinstance(run, Learnable):
             learnt[name] = _learnt_elsewhere(name, run, roles[name], content)
-            places[name] = run.name
             continue
         place = _place(run, f"start_from[{name!r}]")
         if place not in known:
@@ -238,20 +237,15 @@ def _learnt_by_name(
                 f"{', '.join(there) or 'no one: no stage was finished'}"
             )
         learnt[name] = policy
-        places[name] = place
-    return learnt, places
+    return learnt
 
 
 def _check_start(
-    name: str,
-    algorithm: Algorithm,
-    chooses: Chooses,
-    learnt: Learnt,
-    where: Path | str,
-    goal_space: Space[Any] | None,
+    role: Role, algorithm: Algorithm, content: Mapping[str, Any], learnt: Learnt
 ) -> None:
     """Raise a RunError where a learner cannot start from its policy in another run."""
-    before = learnt.policy.algorithm
+    before, chooses = learnt.policy.algorithm, options_of(content, role.path)
+    goal_space = None if role.skill is None else role.skill.goal_space
     kinds = [type(a.config).__name__ for a in (before, algorithm)]
     what = ""
     if before.weight_shapes().keys() != algorithm.weight_shapes().keys() and len(set(kinds)) > 1:
@@ -270,26 +264,17 @@ def _check_start(
         what = "its actions are others here"
     elif _networks(before) != _networks(algorithm) or not same_shapes(before, algorithm):
         what = "it has other networks here (network, critic, normalize_obs, or kinds of cells)"
+    cannot = f"start_from: {role.path!r} cannot start with what it learnt in {learnt.where}: "
     if what:
-        raise RunError(f"start_from: {name!r} cannot start with what it learnt in {where}: {what}")
-
-
-def _check_part(
-    name: str,
-    now: Mapping[str, Any] | None,
-    then: Mapping[str, Any] | None,
-    where: Path | str,
-) -> None:
-    """Raise a RunError where a skill had another part of observations or actions."""
-    if now is None or then is None:
-        return
+        raise RunError(cannot + what)
+    now = recorded_part(content, role.path) or {}
+    then = learnt.part or now
     for field in now:
         if now[field] != then[field]:
             raise RunError(
-                f"start_from: {name!r} cannot start with what it learnt in {where}: there its "
-                f"{field} was {shown(then[field])}, and here it is {shown(now[field])}. Declare it "
-                "as it was, or name the other learners alone, start_from={name: run}, and "
-                f"{name!r} begins new"
+                f"{cannot}there its {field} was {shown(then[field])}, and here it is "
+                f"{shown(now[field])}. Declare it as it was, or name the other learners alone, "
+                f"start_from={{name: run}}, and {role.path!r} begins new"
             )
 
 

@@ -13,6 +13,17 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from skillweave.training.options import Continuing, Starting
+
+Out = Annotated[Path, arg(aliases=["-o"])]
+"""A place to write to."""
+MaybeOut = Annotated[Path | None, arg(aliases=["-o"])]
+"""The same; None: a default place."""
+Words = UseAppendAction[tuple[str, ...]]
+"""Words of an option that may be given several times."""
+Runs = Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")]
+"""Directories of runs, or of sweeps."""
+
 
 @dataclass(frozen=True)
 class Output:
@@ -27,6 +38,42 @@ class Output:
 
 
 @dataclass(frozen=True)
+class Coded(Output):
+    """A command that may need the code of a hierarchy."""
+
+    recipe: str | None = None
+    """The file that declares the hierarchy, unless it is a shipped recipe."""
+
+
+@dataclass(frozen=True)
+class OfRun(Output):
+    """A command about a run."""
+
+    run: Positional[Path] = tyro.MISSING
+    """The run's directory."""
+
+
+@dataclass(frozen=True)
+class Loaded(Coded):
+    """A command that loads a policy."""
+
+    target: Positional[str] = tyro.MISSING
+    """A run's directory, a weights file, or with --pretrained a recipe's name."""
+    pretrained: bool = False
+    """Take the shipped weights of a shipped recipe."""
+
+
+@dataclass(frozen=True)
+class Played(Output):
+    """A command that plays episodes."""
+
+    seed: int = 0
+    """Picks the episodes."""
+    deterministic: bool = True
+    """Act greedily, or (--no-deterministic, --stochastic) sample."""
+
+
+@dataclass(frozen=True)
 class OnRay(Output):
     """A command that can run on Ray."""
 
@@ -36,36 +83,29 @@ class OnRay(Output):
 
 
 @dataclass(frozen=True)
-class Train(OnRay):
+class Train(OnRay, Continuing, Starting):
     """Train a recipe: every skill, then the selector."""
 
     recipe: Positional[str] = tyro.MISSING
     """A shipped recipe (skillweave list), or a Python file that defines a Hierarchy."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A new directory for the run; default: the next number of runs/NAME-N."""
-    resume: bool = False
-    """Continue the run in --out if it has learnt something, else start one. Steps that have grown
-    (--set steps=N, --scale) train a finished run for longer."""
-    overwrite: bool = False
-    """Replace the run in --out, also a finished one."""
-    seed: int = 0
-    """The root of every random stream."""
     flat: bool = False
     """Train one plain agent on the same number of steps instead: the baseline."""
     versus_flat: bool = False
     """Afterwards train the baseline too, on the same number of steps, and print which is better."""
-    set: UseAppendAction[tuple[str, ...]] = ()
+    set: Words = ()
     """Change a setting, for example: --set selector.gamma=0.99 (skillweave info RECIPE)."""
-    start_from: UseAppendAction[tuple[str, ...]] = ()
+    start_from: Words = ()
     """Another run: learners of the same names start with what they learnt there (not
     --versus-flat's agent). Several runs: --start-from left=RUN --start-from right=RUN."""
     keep: Literal["last", "best"] | None = None
     """best: end with the weights whose evaluation while training was best, not with the last ones
     (needs --set train.eval_every=STEPS, if the recipe does not set it)."""
-    log_info: UseAppendAction[tuple[str, ...]] = ()
+    log_info: Words = ()
     """A key of info, for example: --log-info distance. Its mean at the ends of episodes is
     info/distance in metrics.jsonl and in trackers."""
-    evolve: UseAppendAction[tuple[str, ...]] = ()
+    evolve: Words = ()
     """Evolve a population: --evolve population=8; of one agent: --evolve selector.population=8."""
     track: UseAppendAction[tuple[Literal["tensorboard", "wandb", "mlflow"], ...]] = ()
     """Send metrics to a tracker as well."""
@@ -84,7 +124,7 @@ class Train(OnRay):
 class Demo(Output):
     """Train, score and film two tasks in three minutes: where skills pay, and where not."""
 
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("runs/demo")
+    out: Out = Path("runs/demo")
     """A new directory for runs, films and the report."""
     seed: int = 0
     """The root of every random stream."""
@@ -93,13 +133,9 @@ class Demo(Output):
 
 
 @dataclass(frozen=True)
-class Resume(OnRay):
+class Resume(OnRay, Coded, OfRun, Continuing):
     """Finish a run that was stopped; the end is the same as if it had not been."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     evaluate: int = 100
     """Episodes of the final evaluation; 0: none."""
 
@@ -112,12 +148,12 @@ class Sweep(OnRay):
     """A shipped recipe, or a Python file that defines a Hierarchy."""
     seeds: str = "0:5"
     """0:20 for 0 to 19, or 0,3,7."""
-    set_each: UseAppendAction[tuple[str, ...]] = ()
+    set_each: Words = ()
     """Try each of these values: --set-each selector.gamma=0.99,0.995. Of several settings, all
     combinations."""
-    set: UseAppendAction[tuple[str, ...]] = ()
+    set: Words = ()
     """Change a setting in all runs."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A directory for the runs, old or new; default: runs/NAME-sweep. With --ray on several
     machines all must see it."""
     flat: bool = False
@@ -131,23 +167,13 @@ class Sweep(OnRay):
 
 
 @dataclass(frozen=True)
-class Watched(Output):
+class Watched(Played, Loaded):
     """A command that loads a policy and lets it act."""
 
-    target: Positional[str] = tyro.MISSING
-    """A run's directory, a weights file, or with --pretrained a recipe's name."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     skill: str | None = None
     """One skill alone, with the hierarchy's reflexes in force."""
     goal: str | None = None
     """Its goal, as JSON, such as --goal "[0.5, 0.8]"; default: its goals() draw one."""
-    seed: int = 0
-    """Picks the episodes."""
-    deterministic: bool = True
-    """Act greedily, or (--no-deterministic, --stochastic) sample."""
 
 
 @dataclass(frozen=True)
@@ -164,32 +190,28 @@ class Evaluate(Watched):
 class Render(Watched):
     """Write a captioned GIF or MP4."""
 
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A .gif or .mp4 file; default: NAME.gif here."""
     episodes: int = 1
     """Whole episodes."""
 
 
 @dataclass(frozen=True)
-class Log(Output):
+class Log(Coded, OfRun):
     """Let a run's skills act, and record their calls in the run: for info, report and plan."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     steps: int = 20_000
     """Environment steps to record; they are joined with those that the run has."""
     choose: Literal["random", "explore"] = "random"
     """Choose skills at random, or where they were not tried yet."""
-    info: UseAppendAction[tuple[str, ...]] = ()
+    info: Words = ()
     """Record this key of the environment's info, too, for tasks that read it."""
     seed: int | None = None
     """Of the environments and the choices; default: one that the run's log does not have."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Plan(Output):
+class Plan(Loaded):
     """Plan a new mission on a run's recorded calls, and score it; nothing is trained."""
 
     target: Positional[str] = tyro.MISSING
@@ -197,15 +219,11 @@ class Plan(Output):
     mission: Positional[str] = tyro.MISSING
     """Such as "left then hover for 100 steps, avoid crash". A skill's name means its success; a
     recipe may declare more words: Hierarchy(predicates=...)."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     steps: int = 20_000
     """Environment steps to record first, if there is no log of calls."""
     episodes: int = 20
     """Whole episodes to score it in."""
-    film: Annotated[Path | None, arg(aliases=["-o"])] = None
+    film: MaybeOut = None
     """A .gif or .mp4 file to write."""
     seed: int = 0
     """Picks the episodes."""
@@ -218,11 +236,9 @@ class Plot(Output):
     Of one run: how each agent learnt, or how its population evolved.
     """
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
-        tyro.MISSING
-    )
+    runs: Runs = tyro.MISSING
     """Runs or sweeps. Of several, those that differ by their seed alone are one line."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """Of one run a directory; default: plots, in the run. Of several the files, without suffix;
     default: curves."""
     metric: str | None = None
@@ -231,41 +247,31 @@ class Plot(Output):
     """Of several runs: a skill, or selector; default: the whole policy."""
     band: Literal["iqr", "range", "none"] = "iqr"
     """Of several runs: from the 25th to the 75th percentile of the seeds, or lowest to highest."""
-    label: UseAppendAction[tuple[str, ...]] = ()
+    label: Words = ()
     """Of several runs: the name of a line, once for each, in their order."""
     width: float = 3.3
     """Of several runs: inches; a column of a paper has 3.3."""
 
 
 @dataclass(frozen=True)
-class Report(Output):
+class Report(Played, Coded, OfRun):
     """Write one HTML file about a run: film, timeline of calls, curves, skills, settings."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The file to write; default: report.html in the run."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
     episodes: int = 20
     """Episodes to play, with seeds that training never used."""
     films: int = 3
     """How many of them to film, from the worst to the best; 0: no film."""
-    seed: int = 0
-    """Picks the episodes."""
-    deterministic: bool = True
-    """Act greedily, or (--no-deterministic, --stochastic) sample."""
 
 
 @dataclass(frozen=True)
 class Compare(Output):
     """Write one HTML file that compares runs; those that differ by their seed alone are a group."""
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(one or more)")] = (
-        tyro.MISSING
-    )
+    runs: Runs = tyro.MISSING
     """Directories of runs, or of sweeps."""
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("compare.html")
+    out: Out = Path("compare.html")
     """The file to write."""
 
 
@@ -283,39 +289,27 @@ class Info(Output):
 
 
 @dataclass(frozen=True)
-class Weights(Output):
+class Weights(Coded, OfRun):
     """Write a run's policies into one weights file."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
-    out: Annotated[Path, arg(aliases=["-o"])] = Path("weights.safetensors")
+    out: Out = Path("weights.safetensors")
     """The file to write."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Export(Output):
+class Export(Loaded):
     """Write a policy for machines without this library: ONNX files and a runner of one file."""
 
-    target: Positional[str] = tyro.MISSING
-    """A run's directory, a weights file, or with --pretrained a recipe's name."""
     onnx: bool = False
     """Choose ONNX, the only format so far; required, so that a later format is a choice, too."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The folder to write; default: NAME-onnx here."""
-    pretrained: bool = False
-    """Take the shipped weights of a shipped recipe."""
-    recipe: str | None = None
-    """The file that declares the hierarchy, unless it is a shipped recipe."""
 
 
 @dataclass(frozen=True)
-class Push(Output):
+class Push(OfRun):
     """Put a finished run on the Hugging Face Hub, with a page about it."""
 
-    run: Positional[Path] = tyro.MISSING
-    """The run's directory."""
     name: Positional[str] = tyro.MISSING
     """OWNER/NAME on the hub; made if it is not there. An older run there is replaced."""
     private: bool = False
@@ -330,7 +324,7 @@ class Pull(Output):
 
     name: Positional[str] = tyro.MISSING
     """OWNER/NAME on the hub."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """A new directory for the run; default: runs/NAME, numbered if taken."""
     revision: str | None = None
     """A branch, a tag or a commit; default: the latest."""
@@ -344,7 +338,7 @@ class ImportAgilerl(Output):
     """The checkpoint."""
     trust: bool = False
     """You trust where it comes from; needed, although it is read without running code from it."""
-    out: Annotated[Path | None, arg(aliases=["-o"])] = None
+    out: MaybeOut = None
     """The file to write; default: FILE with the suffix .safetensors."""
 
 
@@ -367,26 +361,6 @@ COMMANDS = (
     Push,
     Pull,
     ImportAgilerl,
-)
-Command = (
-    Demo
-    | Train
-    | Resume
-    | Sweep
-    | Evaluate
-    | Render
-    | Log
-    | Plan
-    | Plot
-    | Report
-    | Compare
-    | List
-    | Info
-    | Weights
-    | Export
-    | Push
-    | Pull
-    | ImportAgilerl
 )
 
 

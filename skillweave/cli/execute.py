@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -40,46 +40,9 @@ from skillweave.terminal import one_line, say
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
 
-def run(command: commands.Command) -> int:
-    """Carry a command out and print its result."""
-    match command:
-        case commands.Demo():
-            demo(command)
-        case commands.Train():
-            train(command)
-        case commands.Resume():
-            resume(command)
-        case commands.Sweep():
-            return _sweep(command)
-        case commands.Evaluate():
-            _evaluate(command)
-        case commands.Render():
-            _render(command)
-        case commands.Log():
-            _log(command)
-        case commands.Plan():
-            _plan(command)
-        case commands.Plot():
-            _plot(command)
-        case commands.Report():
-            _report(command)
-        case commands.Compare():
-            _compare(command)
-        case commands.List():
-            _list(command)
-        case commands.Info():
-            _info(command)
-        case commands.Weights():
-            _weights(command)
-        case commands.Export():
-            _export(command)
-        case commands.Push():
-            print_result(command, *_push(command))
-        case commands.Pull():
-            print_result(command, *_pull(command))
-        case commands.ImportAgilerl():
-            _import_agilerl(command)
-    return 0
+def run(command: commands.Output) -> int:
+    """Carry a command out and print its result; return the exit code."""
+    return WAYS[type(command)](command) or 0
 
 
 def _sweep(command: commands.Sweep) -> int:
@@ -374,21 +337,19 @@ def _export(command: commands.Export) -> None:
     print_result(command, result, str(export))
 
 
-def _push(command: commands.Push) -> tuple[dict[str, Any], str]:
-    """Put a run on the hub; return the result as JSON and for people."""
+def _push(command: commands.Push) -> None:
     _no_bars()
     pushed = push_run(command.run, command.name, command.private, command.calls)
     lines = [f"{pushed['url']}: {len(pushed['files'])} files", *pushed["missing"]]
     lines.append(f"load it: skillweave.from_hub({command.name!r})")
-    return pushed, "\n".join(lines)
+    print_result(command, pushed, "\n".join(lines))
 
 
-def _pull(command: commands.Pull) -> tuple[dict[str, Any], str]:
-    """Copy a run from the hub; return its new place as JSON and for people."""
+def _pull(command: commands.Pull) -> None:
     _no_bars()
     name = PurePosixPath(check_name(command.name)).name
     path = pull_run(command.name, command.out or _free_path(Path("runs") / name), command.revision)
-    return {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path)))
+    print_result(command, {"path": str(path)}, "\n".join(run_words(RunDirectory.open(path))))
 
 
 def _free_path(path: Path) -> Path:
@@ -464,3 +425,26 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
 def _load_run(path: Path, recipe: str | None) -> Run:
     """Load the finished run at ``path``, with the code of a ``recipe`` if one is given."""
     return load_from(path, recipe=recipe, ask=ASK)
+
+
+WAYS: dict[type, Callable[[Any], int | None]] = {
+    commands.Demo: demo,
+    commands.Train: train,
+    commands.Resume: resume,
+    commands.Sweep: _sweep,
+    commands.Evaluate: _evaluate,
+    commands.Render: _render,
+    commands.Log: _log,
+    commands.Plan: _plan,
+    commands.Plot: _plot,
+    commands.Report: _report,
+    commands.Compare: _compare,
+    commands.List: _list,
+    commands.Info: _info,
+    commands.Weights: _weights,
+    commands.Export: _export,
+    commands.Push: _push,
+    commands.Pull: _pull,
+    commands.ImportAgilerl: _import_agilerl,
+}
+"""By command, the function that carries it out."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
 from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.options import Continuing, Starting
 
 
 def train(command: commands.Train) -> None:
@@ -62,7 +63,7 @@ def resume(command: commands.Resume) -> None:
     declared = declared_by(run, command.recipe, "resume_needs_recipe")
     cluster = None if command.ray is None else Ray(address=command.ray or None)
     try:
-        trained = declared.resume(command.run, quiet=command.quiet, cluster=cluster)
+        trained = declared.resume(command.run, **_options(command, Continuing), cluster=cluster)
     except KeyboardInterrupt as error:
         raise _interrupted(error, command.ray) from None
     result, lines = _summary(command, trained)
@@ -82,11 +83,8 @@ def _trained(
         cluster = None if command.ray is None else Ray(command.collectors, command.ray or None)
         return hierarchy.train(
             out,
-            resume=command.resume,
-            overwrite=command.overwrite,
-            seed=command.seed,
+            **_options(command, Starting, Continuing),
             flat=flat,
-            quiet=command.quiet,
             track=command.track,
             evolve=evolve,
             cluster=cluster,
@@ -96,6 +94,11 @@ def _trained(
         )
     except KeyboardInterrupt as error:
         raise _interrupted(error, command.ray) from None
+
+
+def _options(command: Any, *kinds: Any) -> dict[str, Any]:
+    """Return the options of training that a command takes as they are."""
+    return {f.name: getattr(command, f.name) for kind in kinds for f in fields(kind)}
 
 
 def _start_from(words: Sequence[str]) -> str | dict[str, str] | None:

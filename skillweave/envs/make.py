@@ -270,16 +270,6 @@ class EnvSpec:
         return isinstance(self.env, str) and ":" not in self.env and plain
 
 
-def spec_of(declared: Any) -> EnvSpec:
-    """Return the ``EnvSpec`` of a declaration; the same object while ``env`` does not change."""
-    if isinstance(declared.env, EnvSpec):
-        return declared.env
-    known: EnvSpec | None = vars(declared).get("_spec")
-    if known is None or known.env is not declared.env:
-        known = vars(declared)["_spec"] = EnvSpec(declared.env)
-    return known
-
-
 def make_engine(spec: EnvSpec, num_envs: int, threads: int | None = None, first: int = 0) -> Engine:
     """Return the engine for ``num_envs`` environments of this kind.
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Any, TypeVar
 
-from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
+from skillweave.algorithms.config import AlgorithmConfig, AlgorithmSettings
 from skillweave.arguments import checked_names
-from skillweave.collecting.lengths import Lengths
-from skillweave.envs.make import EnvSpec, Spaces, spec_of
+from skillweave.envs.make import Spaces
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
     check_level,
@@ -21,85 +20,34 @@ from skillweave.hierarchy.checks import (
 from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_selectors
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
 from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
-from skillweave.hierarchy.settings import Apart, Guide, Selection
+from skillweave.hierarchy.settings import Settings, settings_in
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
-from skillweave.runs.command_words import Caller
-from skillweave.selectors.ready import ReadyValue
-from skillweave.settings import AtLeastOne, Check, check_fields, fitted
-from skillweave.skills import Reflex, Skill, is_trained
-from skillweave.skills.own_part import ZERO
+from skillweave.settings import check_fields, fitted
+from skillweave.skills import Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
-from skillweave.training.checks import EnvValue, check_env
+from skillweave.training.checks import check_env
 from skillweave.training.defaults import TrainDefaults
-from skillweave.training.plain_agent import PlainAgent
-from skillweave.training.stage import TOGETHER, Stage, Together
+from skillweave.training.plain_agent import Declared, PlainAgent
+from skillweave.training.stage import TOGETHER, Stage
 
 D = TypeVar("D", bound="Declaration")
 RESERVED = (SELECTOR, CRITIC, TOGETHER, AGENT)
 """Names of stages that are not skills."""
-CallSteps = Annotated[
-    AtLeastOne | Lengths | None,
-    Check("a whole number of at least 1, Lengths(1, ..., 128), or None"),
-]
-"""Limits of a call's length."""
-SelectorValue = Annotated[
-    AlgorithmConfig | ReadyValue,
-    Check(
-        "the settings of an algorithm, such as PPO(), or a ready selector: a function of "
-        "observations, an Automaton or a tree",
-        lambda x: not isinstance(x, type),
-    ),
-]
-"""A selector that is trained, or a ready one."""
 
 
 @checked_names
 @dataclass
-class Declaration(Nestable):
+class Declaration(Settings, Nestable, Declared):
     """Skills, reflexes and a selector on one environment, with budgets in environment steps.
 
     Raises:
         DeclarationError: the declaration is wrong; the message names the skill and the field.
     """
 
-    env: EnvValue
-    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
-    skills: Sequence[Skill]
-    """The skills that the selector chooses from; a hierarchy among them is trained inside."""
-    call_steps: CallSteps = 40
-    """Steps of a skill before the selector decides again; None: until the skill ends by itself."""
-    steps: AtLeastOne | None = None
-    """Training steps in all, split by ``learn``; None: 1,000,000. A budget that a skill, ``apart``
-    or ``together`` sets replaces that part and leaves the others as they are; where all parts are
-    set, leave this out."""
-    learn: Literal["together", "apart", "apart, then together"] = "together"
-    """Train skills and selector from the same steps ("together"); or skills one by one, then the
-    selector ("apart"); or one after the other, half of the steps each. Where no skill learns, the
-    selector trains alone."""
-    algorithm: AlgorithmSettings = field(default_factory=PPO)
-    """The algorithm of every skill that sets no other."""
-    selector: SelectorValue = field(default_factory=PPO)
-    """The algorithm of the selector; its γ and n_steps count environment steps. Or a ready
-    selector, not trained: a function of observations, an ``Automaton``, or a ``tree.Sequence``."""
-    reflexes: Sequence[Reflex] = ()
-    """Rules that override the running skill's action, also while skills train."""
-    rest: Any = ZERO
-    """The numbers of an action that the running skill does not write (``Skill.acts``): "zero";
-    "hold", as they were in the last action, zero in an episode's first; a number; or a list with a
-    number or "hold" for each number of the action, a dict of these for a Dict action. Zero is what
-    pushes nothing where actions are forces or speeds; hold what is a place, or a grip."""
-    apart: Apart = field(default_factory=Apart)
-    """Settings of learning apart: budgets, and the start of skills."""
-    together: Together = field(default_factory=Together)
-    """Settings of learning together: budget, the task's weight, interruption, exploration."""
-    selection: Selection = field(default_factory=Selection)
-    """Settings of the selector's choices: cost of a call, greedy or sampling."""
-    guide: Guide | None = None
-    """A ready selector that guides one that learns."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
     predicates: Mapping[str, Any] = field(default_factory=dict)
@@ -110,13 +58,7 @@ class Declaration(Nestable):
     (n, …) to numbers (n, F), or a dict of these by skill. Skills that see images need it."""
     name: str = "hierarchy"
     """Its name where it is a skill of another hierarchy."""
-    _caller: ClassVar[Caller] = "hierarchy"
-    """The entry point in lines of Python that messages print."""
-    recorded = False
-    """True for a run that was loaded without its code; some of what was declared is missing."""
-
-    def __post_init__(self) -> None:
-        self.validate()
+    _caller = "hierarchy"
 
     def validate(self) -> None:
         """Check every setting; training and loading call it again, as attributes may be set.
@@ -161,24 +103,9 @@ class Declaration(Nestable):
             as_skill=as_skill,
             spec=self.spec,
             skills={join(path, skill.name): skill for skill in self.skills},
-            call_steps=self.call_steps,
-            steps=self.steps,
-            learn=self.learn,
-            algorithm=self.algorithm,
-            selector=self.selector,
-            reflexes=tuple(self.reflexes),
-            rest=self.rest,
-            apart=self.apart,
-            together=self.together,
-            selection=self.selection,
-            guide=self.guide,
+            **settings_in(self),
             flat=self.train_defaults.flat,
         )
-
-    @property
-    def spec(self) -> EnvSpec:
-        """The environment, fully specified."""
-        return spec_of(self)
 
     def skill(self, name: str) -> Skill:
         """Return the skill of this ``name``, or path.
@@ -280,10 +207,5 @@ def with_roles(declared: D, roles: Roles) -> D:
                 skill.policy = copies[skill_path]
         copies[path] = whole = copy.copy(hierarchy)
         whole.skills = tuple(skills.values())
-        whole.call_steps = level.call_steps
-        whole.learn = level.learn
-        whole.apart = level.apart
-        whole.together = level.together
-        whole.selection = level.selection
-        whole.guide = level.guide
+        vars(whole).update(settings_in(level))
     return copies[""]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
 from skillweave.training.learning_task import LearningTask, skill_task
 from skillweave.training.stage import Policies, Stage
-from skillweave.training.stage_log import Listener
+from skillweave.training.trainer import Course
 from skillweave.types import Array, Step
 
 START_CALLS = 1
@@ -327,36 +328,28 @@ def matrix_from_json(entry: Mapping[str, Any]) -> HandOver:
 
 
 def judge_repair(
-    roles: Roles,
-    run: RunDirectory,
-    entry: dict[str, Any],
-    listeners: tuple[Listener, ...],
-    later: HierarchyPolicy,
-    done: Mapping[str, Any] | None,
+    roles: Roles, course: Course, entry: dict[str, Any], later: HierarchyPolicy
 ) -> bool:
     """Measure a repaired skill once, and record whether it is kept; return that.
 
     Args:
         later: the hierarchy with the repaired weights.
-        done: as for ``hand_over``.
     """
     if "kept" not in entry:
         repair = entry["repair"]
         level = parts_of(roles, later)[level_of(repair["skill"])]
         assert isinstance(level, HierarchyPolicy)
         names = name_of(repair["skill"]), name_of(repair["after"])
-
-        def tell(sentence: str) -> None:
-            for listener in listeners:
-                listener.message(f"{entry['name']}: {sentence}")
-
+        tell = partial(course.tell, entry)
         num_envs = int(entry["algorithm"]["num_envs"])
-        found = measure(roles.spec, level.skills, *names, done, repair["calls"], num_envs, tell)
+        found = measure(
+            roles.spec, level.skills, *names, course.done, repair["calls"], num_envs, tell
+        )
         is_kept, sentence = verdict(matrix_from_json(repair["before"]), found.matrix, *names)
         repair["later"] = matrix_to_json(found.matrix)
         sentence += f". {found.shortage}" if found.shortage else ""
         entry["kept"] = {"kept": "repaired" if is_kept else "before", "sentence": sentence}
-        run.save()
+        course.run.save()
         tell(sentence)
     kept: bool = entry["kept"]["kept"] == "repaired"
     return kept

@@ -8,10 +8,10 @@ table, with choices as a run records them for example, is another table.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from gymnasium import Space
 
@@ -21,17 +21,15 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.user_code import Texts, environment_texts, skill_texts
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.hierarchy.settings import Apart, Guide, Selection
+from skillweave.hierarchy.settings import Settings
 from skillweave.messages import short
 from skillweave.paths import CRITIC, SELECTOR, is_below, join, level_of, levels_to, name_of
 from skillweave.selectors import ReadySelector, ready_selector
-from skillweave.selectors.ready import ReadyValue
-from skillweave.skills import Reflex, Skill, is_trained
+from skillweave.skills import Skill, is_trained
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.own_part import OwnPart, declared_sees
 from skillweave.skills.residual import Residual
 from skillweave.training.role import Role
-from skillweave.training.stage import Together
 from skillweave.types import Policy
 
 H = TypeVar("H", bound="Nestable")
@@ -41,14 +39,21 @@ _OF_SKILL = ("call_steps", "max_steps", "color")
 """Attributes of a skill that a hierarchy may be given."""
 
 
-class Nestable:
+@dataclass
+class OfSkills:
+    """The declaration of something that has skills."""
+
+    skills: Sequence[Skill]
+    """The skills that the selector chooses from; a hierarchy among them is trained inside."""
+
+
+class Nestable(OfSkills):
     """The declaration of a hierarchy, as the table is made from it; it may be a skill of another.
 
     ``Declaration`` has the settings.
     """
 
     name: str
-    skills: Any
 
     def as_skill(self, name: str | None = None, **attributes: Any) -> Skill:
         """Return this hierarchy as a skill that is trained inside another hierarchy.
@@ -78,8 +83,8 @@ class Nestable:
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class Level:
+@dataclass(kw_only=True)
+class Level(Settings):
     """A hierarchy's own settings: of the outermost one, or of one that is a skill of another."""
 
     path: str
@@ -90,17 +95,6 @@ class Level:
     """The environment that it declares; equal at all levels."""
     skills: Mapping[str, Skill]
     """Its skills by path, in the order of a selector's choices."""
-    call_steps: int | Lengths | None
-    steps: int | None
-    learn: Literal["together", "apart", "apart, then together"]
-    algorithm: AlgorithmConfig
-    selector: AlgorithmConfig | ReadyValue
-    reflexes: tuple[Reflex, ...]
-    rest: Any
-    apart: Apart
-    together: Together
-    selection: Selection
-    guide: Guide | None
     flat: AlgorithmConfig | None
     """Settings of the flat baseline; None: those of ``algorithm``."""
 
@@ -167,7 +161,7 @@ class Level:
         return SkillSet(
             tuple(skills.values()),
             tuple(policies[path] for path in skills),
-            self.reflexes,
+            tuple(self.reflexes),
             self.call_steps,
             self.selection.greedy_skills is not False,
             self.selection.call_cost,

@@ -20,7 +20,7 @@ from skillweave.training.episodes import standard_error
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.skill_text import stuck_selector, useless_skills
 from skillweave.training.stage import TOGETHER, Policies
-from skillweave.training.stage_log import Listener
+from skillweave.training.trainer import Course
 
 SEEDS = 1_000
 """Seeds of these episodes start here: people use smaller ones."""
@@ -42,8 +42,7 @@ users expect a greedy one; and training episodes better than all, so that it is 
 def select_best(
     roles: Roles,
     level: Level,
-    run: RunDirectory,
-    listeners: tuple[Listener, ...],
+    course: Course,
     before: Policies,
     after: Policies,
 ) -> Policies:
@@ -51,6 +50,7 @@ def select_best(
 
     The run records the choice.
     """
+    run = course.run
     entry = run.stage(join(level.path, TOGETHER))
     if "kept" not in entry and needs_comparison(entry):
         episodes = _episodes(entry)
@@ -58,22 +58,22 @@ def select_best(
             entry["kept"] = {"kept": "skills_sample"}  # as they did while they learnt
             run.save()
             return after
-        for listener in listeners:
-            listener.message(
-                f"{entry['name']}: playing {episodes} episodes of each kind, to decide whether "
-                "skills and selector should be greedy"
-            )
+        course.tell(
+            entry,
+            f"playing {episodes} episodes of each kind, to decide whether skills and selector "
+            "should be greedy",
+        )
         scores = _scores(roles, level, run, before, after, episodes)
         means = {name: score.mean for name, score in scores.items()}
         entry["kept"] = means | {"episodes": episodes, "kept": _best(scores)}
         entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
         run.save()
-        for listener in listeners:
-            listener.message(f"{entry['name']}: {comparison_words(entry['kept'])}")
-            best = scores[entry["kept"]["kept"]].skills
-            learns = level.ready_selector is None
-            hints = _exploration(entry, scores) if learns else []
-            for hint in hints or useless_skills(best, episodes, selector_learns=learns):
+        course.tell(entry, comparison_words(entry["kept"]))
+        best = scores[entry["kept"]["kept"]].skills
+        learns = level.ready_selector is None
+        hints = _exploration(entry, scores) if learns else []
+        for hint in hints or useless_skills(best, episodes, selector_learns=learns):
+            for listener in course.listeners:
                 listener.message(hint)
     return before if entry.get("kept", {}).get("kept") == "before" else after
 

@@ -31,16 +31,17 @@ from skillweave.skills.residual import Residual
 from skillweave.spaces import space_to_json
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.joint import agents_of
-from skillweave.training.plain_agent import PlainAgent
+from skillweave.training.options import CallReports, Reports
+from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
 from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
-from skillweave.training.trainer import train_stages
+from skillweave.training.trainer import Course
 from skillweave.types import Policy
 
 
 def manifest(
-    declaration: Declaration,
+    declaration: Declared,
     *,
     seed: int,
     flat: bool | AlgorithmConfig = False,
@@ -53,6 +54,9 @@ def manifest(
         how: evaluation and checkpoints; None: the declaration's defaults.
     """
     how = how or declaration.train_defaults
+    if isinstance(declaration, PlainAgent):
+        return declaration.manifest(seed, how)
+    assert isinstance(declaration, Declaration)
     if flat is not False:
         return declaration.plain_agent(None if flat is True else flat).manifest(seed, how)
     roles = roles_of(declaration)
@@ -66,12 +70,7 @@ def manifest(
         "env_kwargs": roles.spec.json_kwargs,
         "code": roles.code,
         "seed": seed,
-        "checkpoint_every": how.checkpoint_every,
-        "eval_every": how.eval_every,
-        "eval_episodes": how.eval_episodes,
-        "keep": how.keep,
-        "log_info": how.log_info,
-        **_calls_entry(stages, how),
+        **_reports(stages, how),
         "skills": [_skill_entry(roles, path) for path in roles.skills],
         **_level_entry(roles, roles.outermost),
         "resume_needs_recipe": learns or not roles.trains_from_data,
@@ -80,8 +79,8 @@ def manifest(
     }
 
 
-def _calls_entry(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
-    """Return the settings of the log of calls, if there is to be one.
+def _reports(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
+    """Return the entries of evaluations, checkpoints and logs, also of calls if they are logged.
 
     Raises:
         DeclarationError: no stage has calls to log.
@@ -91,19 +90,19 @@ def _calls_entry(stages: Sequence[Stage], how: TrainDefaults) -> dict[str, Any]:
             raise DeclarationError(
                 "log_calls_info names keys for the log of calls: set log_calls, too"
             )
-        return {}
+        return how.entries(Reports)
     if not any(s.level == "" and s.kind in ("selector", "together") for s in stages):
         raise DeclarationError(
             "log_calls is set, but no selector acts while this hierarchy trains, as each skill "
             "learns apart and the selector is ready: leave out log_calls, and record calls "
             "afterwards with run.log_calls()"
         )
-    return {"log_calls": how.log_calls, "log_calls_info": how.log_calls_info}
+    return how.entries(CallReports)
 
 
 @torch_threads(1)  # a loop sets its own; the rest must not depend on the number of threads
 def train(
-    declaration: Declaration | PlainAgent,
+    declaration: Declared,
     run: RunDirectory,
     listeners: tuple[Listener, ...] = (),
     make_learner: MakeLearner = agents_of,
@@ -114,10 +113,11 @@ def train(
     Args:
         done: the events by which a repair is judged, as for ``planning.hand_over``.
     """
+    course = Course(run, listeners, make_learner, done)
     if run.manifest["kind"] == "agent":
-        agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()
+        agent = declaration.plain_agent() if isinstance(declaration, Declaration) else declaration
         (stage,) = agent.stages()
-        return train_stages([stage], run, listeners, {}, make_learner)[stage.name]
+        return course.train([stage], {})[stage.name]
     assert isinstance(declaration, Declaration)
     roles = _with_recorded_bases(roles_of(declaration), run)
     policies: Policies = _ready(roles, run)
@@ -129,24 +129,17 @@ def train(
         decided = resolve_greedy(roles, run)
         stages = level_stages(decided, decided.levels[level.path], budgets)
         apart = [s for s in stages if s.kind != "together"]
-        policies = train_stages(apart, run, listeners, policies, make_learner)
+        policies = course.train(apart, policies)
         if len(apart) < len(stages):
-            after = train_stages(stages[len(apart) :], run, listeners, policies, make_learner)
-            policies = select_best(roles, level, run, listeners, policies, after)
-    policies = _repaired(roles, run, listeners, policies, make_learner, done)
-    return assembled(resolve_greedy(roles, run), policies)
-
-
-def _repaired(
-    roles: Roles,
-    run: RunDirectory,
-    listeners: tuple[Listener, ...],
-    policies: Policies,
-    make_learner: MakeLearner,
-    done: Mapping[str, Any] | None,
-) -> Policies:
-    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+            after = course.train(stages[len(apart) :], policies)
+            policies = select_best(roles, level, course, policies, after)
     roles = resolve_greedy(roles, run)
+    return assembled(roles, _repaired(roles, course, policies))
+
+
+def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
+    """Train, or finish training, the repairs of a run; return the policies that it ends with."""
+    run, done = course.run, course.done
     for entry in run.manifest["stages"]:
         if "repair" not in entry:
             continue
@@ -156,11 +149,8 @@ def _repaired(
                 f"{', '.join(entry['repair']['done'])}, which is code: "
                 f"continue it by {repair_words(entry['repair'], run)}"
             )
-        after = train_stages(
-            [repair_stage(roles, entry, done)], run, listeners, policies, make_learner
-        )
-        later = assembled(roles, after)
-        if judge_repair(roles, run, entry, listeners, later, done):
+        after = course.train([repair_stage(roles, entry, done)], policies)
+        if judge_repair(roles, course, entry, assembled(roles, after)):
             policies = after
     return policies
 

@@ -36,6 +36,8 @@ class Learnt:
     """Checksum of its file there."""
     steps: int
     """Environment steps of its training."""
+    where: str
+    """The other run's directory, or a name."""
     run: str | None
     """The other run's ``id``."""
     chooses: Chooses
@@ -73,7 +75,7 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
             steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
             chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
             of_run = run.manifest.get("id"), chooses, part, run.manifest.get("code", {})
-            learnt[name] = Learnt(policy, sha256, steps, *of_run)
+            learnt[name] = Learnt(policy, sha256, steps, str(path), *of_run)
     return learnt
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from skillweave.algorithms.config import AlgorithmSettings
 from skillweave.settings import AtLeastOne, Check, annotations_of, checked_settings, fitted
+from skillweave.training.options import CallReports, Reports
 
 InfoKeys = Annotated[
     Sequence[Annotated[str, Check("a key of info, such as 'distance'", bool)]],
@@ -18,7 +19,7 @@ InfoKeys = Annotated[
 
 @checked_settings
 @dataclass(frozen=True)
-class TrainDefaults:
+class TrainDefaults(CallReports):
     """Values that ``train`` uses for arguments that its caller leaves out.
 
     A recipe sets them: ``train_defaults=TrainDefaults(eval_every=50_000)``.
@@ -28,21 +29,12 @@ class TrainDefaults:
     """
 
     eval_every: AtLeastOne | None = None
-    """Environment steps between evaluations while training; None: no evaluations. Their results
-    are ``eval_return`` and ``eval_success`` in ``metrics.jsonl``."""
     eval_episodes: AtLeastOne = 20
-    """Episodes of each of these evaluations."""
     checkpoint_every: AtLeastOne = 100_000
-    """Environment steps between checkpoints."""
     keep: Literal["last", "best"] = "last"
-    """What each stage ends with: its last weights, or those with the best periodic evaluation."""
     log_info: InfoKeys = ()
-    """Keys of ``info`` whose values at the ends of episodes are logged."""
     log_calls: AtLeastOne | None = None
-    """Steps of the log of calls, the latest ones of a stage in which a selector acts; None: no
-    log."""
     log_calls_info: InfoKeys = ()
-    """Keys of ``info`` in the log of calls."""
     flat: AlgorithmSettings | None = None
     """Settings of the flat baseline; None: the hierarchy's ``algorithm``."""
 
@@ -50,12 +42,22 @@ class TrainDefaults:
         for name in ("log_info", "log_calls_info"):
             object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
 
-    def given(self, **arguments: Any) -> TrainDefaults:
-        """Return these values, replaced by the ``arguments`` that are not None.
+    def given(self, options: Reports) -> TrainDefaults:
+        """Return these values, replaced by the ``options`` that are not None.
 
         Raises:
             DeclarationError: one of them is wrong; the message calls it by its name alone.
         """
         kinds = annotations_of(TrainDefaults)
-        given = {k: fitted(kinds[k], v, k) for k, v in arguments.items() if v is not None}
-        return replace(self, **given)
+        return replace(
+            self,
+            **{
+                f.name: fitted(kinds[f.name], value, f.name)
+                for f in fields(CallReports)
+                if (value := getattr(options, f.name, None)) is not None
+            },
+        )
+
+    def entries(self, kind: type[Reports]) -> dict[str, Any]:
+        """Return the entries of a run's manifest for the options of a ``kind``."""
+        return {f.name: getattr(self, f.name) for f in fields(kind)}

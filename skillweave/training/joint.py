@@ -166,7 +166,7 @@ class JointAgents(OneAgent):
         """
         policy = self.stage.policies.get(name)
         if isinstance(policy, AgentPolicy):
-            return policy, self._steps_of(name)
+            return policy, self.stage.steps_before(name)
         if self.stage.continues:
             return None  # its final state holds everything
         return initial_policy(self.stage.run, self.stage.name, name, self.algorithms[name])
@@ -199,7 +199,7 @@ class JointAgents(OneAgent):
         rollouts = algorithm.store == "rollout"
         if self.together.reference_kl is None or decides(name) or not rollouts:
             return None
-        if not self._stages_of(name):
+        if not self.stage.stages_before(name):
             return None  # it starts from another run, to learn the task of this one
         rate = success_rate(self._latest_stage(name))
         if rate == 0.0:
@@ -235,18 +235,9 @@ class JointAgents(OneAgent):
             learner.act_from_the_start()
         return learner
 
-    def _stages_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the entries of finished stages in which ``name`` has learnt."""
-        stages = self.stage.run.manifest["stages"]
-        return [s for s in stages if name in s["learns"] and s["status"] == "done"]
-
     def _latest_stage(self, name: str) -> dict[str, Any]:
         """Return the latest entry of a finished stage in which ``name`` has learnt, or {}."""
-        return next(reversed(self._stages_of(name)), {})
-
-    def _steps_of(self, name: str) -> int:
-        """Return the environment steps of earlier stages in which ``name`` has learnt."""
-        return sum(s.get("steps", 0) for s in self._stages_of(name))
+        return next(reversed(self.stage.stages_before(name)), {})
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the stage is over, and report skills that learnt nothing."""
@@ -317,7 +308,7 @@ class JointAgents(OneAgent):
         }
         for name, state in self.states().items():
             states |= prefixed(f"state.{name}", vars(state))
-        return None, extra | states | self.best_tensors()
+        return None, extra | states | self.best.tensors()
 
 
 def _collector(

@@ -18,10 +18,11 @@ class KeepBest:
     Args:
         of: the criterion: the mean return, or the share of episodes that succeed (then the mean
             return). Of equal evaluations the latest counts, as it learnt from more steps.
+        wanted: keep the best weights; False: none, as the last ones count.
     """
 
-    def __init__(self, of: Literal["return", "success"]) -> None:
-        self.of = of
+    def __init__(self, of: Literal["return", "success"], wanted: bool = True) -> None:
+        self.of, self.wanted = of, wanted
         self.steps = 0
         """Environment steps of the stage at this evaluation."""
         self.metrics: dict[str, float] = {}
@@ -45,7 +46,9 @@ class KeepBest:
             states: returns the present states of the learners.
         """
         value = evaluation.get(f"eval_{self.of}", math.nan)
-        if math.isnan(value):  # no evaluation, or none of its episodes could start
+        if not self.wanted or math.isnan(
+            value
+        ):  # no evaluation, or none of its episodes could start
             return
         if self.metrics and self._rank(evaluation) < self._rank(self.metrics):
             return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -10,7 +12,7 @@ from skillweave.algorithms.config import AlgorithmSettings, check_spaces
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.arguments import checked_names
 from skillweave.collecting.user_code import environment_texts
-from skillweave.envs.make import EnvSpec, Spaces, spec_of
+from skillweave.envs.make import EnvSpec, Spaces
 from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
@@ -19,21 +21,75 @@ from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
 from skillweave.training.defaults import TrainDefaults
 from skillweave.training.learning_task import skill_task
+from skillweave.training.options import Reports
 from skillweave.training.role import agent_role
 from skillweave.training.stage import Stage, target_of
 
 
+@dataclass
+class InEnv:
+    """The declaration of something that acts in an environment."""
+
+    env: EnvValue
+    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
+
+
+class Declared(InEnv, ABC):
+    """The declaration of a hierarchy, or of a plain agent."""
+
+    train_defaults: TrainDefaults
+    _caller: ClassVar[Caller]
+    """The entry point in lines of Python that messages print."""
+    recipe: str | None = None
+    """The place of the declaration: a shipped recipe's name or a file; written into runs."""
+    recorded = False
+    """True for a run that was loaded without its code; some of what was declared is missing."""
+    _starts: Callable[[], Any] | None = None
+    """Function that returns the policies with which learners start, by name; None: no function."""
+
+    def __post_init__(self) -> None:
+        self.validate()
+
+    @abstractmethod
+    def validate(self) -> None:
+        """Check every setting; training and loading call it again, as attributes may be set.
+
+        Raises:
+            DeclarationError: a setting is wrong; the message names it.
+        """
+
+    @property
+    def spec(self) -> EnvSpec:
+        """The environment, fully specified; the same object while ``env`` does not change."""
+        if isinstance(self.env, EnvSpec):
+            return self.env
+        known: EnvSpec | None = vars(self).get("_spec")
+        if known is None or known.env is not self.env:
+            known = vars(self)["_spec"] = EnvSpec(self.env)
+        return known
+
+    @abstractmethod
+    def check_spaces(self) -> Spaces:
+        """Make the environment once, and return its spaces.
+
+        Raises:
+            DeclarationError: a space, a setting or a policy does not fit.
+        """
+
+    @abstractmethod
+    def stages(self) -> list[Stage]:
+        """Return all stages of training, in their order."""
+
+
 @checked_names
 @dataclass
-class PlainAgent:
+class PlainAgent(Declared):
     """An agent that learns an environment's own reward, with a budget in environment steps.
 
     Raises:
         DeclarationError: a setting is wrong; the message names it.
     """
 
-    env: EnvValue
-    """A Gymnasium id, a function that makes an environment, or an ``EnvSpec`` for more."""
     algorithm: AlgorithmSettings
     """The algorithm's settings."""
     steps: AtLeastOne
@@ -44,13 +100,7 @@ class PlainAgent:
     """Training ends early at this share of successful episodes (``info["success"]``)."""
     train_defaults: TrainDefaults = field(default_factory=TrainDefaults)
     """Values for arguments of ``train`` that its caller leaves out."""
-    _caller: ClassVar[Caller] = "agent"
-    """The entry point in lines of Python that messages print."""
-    recorded = False
-    """True for a run that was loaded without its code; some of what was declared is missing."""
-
-    def __post_init__(self) -> None:
-        self.validate()
+    _caller = "agent"
 
     def validate(self) -> None:
         """Check every setting; training and loading call it again, as attributes may be set.
@@ -61,11 +111,6 @@ class PlainAgent:
         check_env(self.env)
         check_fields(self)
         target_of(self.target_return, self.target_success, AGENT)
-
-    @property
-    def spec(self) -> EnvSpec:
-        """The environment, fully specified."""
-        return spec_of(self)
 
     def check_spaces(self) -> Spaces:
         """Make the environment once, and return its spaces.
@@ -109,11 +154,7 @@ class PlainAgent:
             "env_kwargs": self.spec.json_kwargs,
             "code": environment_texts(self.spec),
             "seed": seed,
-            "checkpoint_every": how.checkpoint_every,
-            "eval_every": how.eval_every,
-            "eval_episodes": how.eval_episodes,
-            "keep": how.keep,
-            "log_info": how.log_info,
+            **how.entries(Reports),
             "needs_recipe": code,
             "resume_needs_recipe": code or stage.learns_by_code or self.spec.engine != "auto",
             "stages": [stage.entry()],

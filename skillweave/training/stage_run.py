@@ -45,6 +45,15 @@ class StageRun:
         """Path of the learner, where there is one."""
         return str(self.entry["learns"][0])
 
+    def stages_before(self, name: str) -> list[dict[str, Any]]:
+        """Return the entries of finished stages in which a learner has learnt."""
+        stages = self.run.manifest["stages"]
+        return [s for s in stages if name in s["learns"] and s["status"] == "done"]
+
+    def steps_before(self, name: str) -> int:
+        """Return the environment steps of earlier stages in which a learner has learnt."""
+        return sum(s["steps"] for s in self.stages_before(name))
+
     @property
     def config(self) -> AlgorithmConfig:
         """The algorithm's settings."""
@@ -67,11 +76,10 @@ class StageRun:
         return None if target is None else Target(**target)
 
     @property
-    def best(self) -> KeepBest | None:
-        """A new store of the best weights; None: the last ones count."""
-        if self.run.manifest.get("keep") != "best":
-            return None
-        return KeepBest("return" if self.target is None else self.target.of)
+    def best(self) -> KeepBest:
+        """A new store of the best weights."""
+        of = "return" if self.target is None else self.target.of
+        return KeepBest(of, self.run.manifest.get("keep") == "best")
 
 
 class StageLearner(Protocol):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -26,7 +26,6 @@ from skillweave.runs.manifest import Checkpoint
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
-from skillweave.training.keep_best import KeepBest
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.logged_calls import begin_calls, save_logged
@@ -90,7 +89,7 @@ class OneAgent:
         if stage.continues:
             pass  # its final state holds everything
         elif isinstance(earlier, AgentPolicy):  # it learns again
-            self.start = earlier, _steps_of(stage)
+            self.start = earlier, stage.steps_before(stage.learner)
         else:
             self.start = initial_policy(stage.run, stage.name, stage.name, self.algorithm)
         return self._initial_state()
@@ -149,15 +148,7 @@ class OneAgent:
     def saved(self, extra: dict[str, Tensor]) -> tuple[Any, dict[str, Tensor]]:
         """Return the state and all other tensors of a checkpoint, ``extra`` included."""
         (stack,) = self.learner.stacks
-        return state_to(stack.state, "cpu"), extra | self.best_tensors()
-
-    def best_tensors(self) -> dict[str, Tensor]:
-        """Return a checkpoint's tensors of the best weights."""
-        return {} if self.best is None else self.best.tensors()
-
-    def best_header(self) -> dict[str, Any]:
-        """Return the header's entries of the best weights."""
-        return {} if self.best is None else self.best.header()
+        return state_to(stack.state, "cpu"), extra | self.best.tensors()
 
     def _save_final(self, log: StageLog, *, spent: bool) -> None:
         """Write the state from which more steps continue, in new episodes.
@@ -169,15 +160,14 @@ class OneAgent:
         needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
         state, extra = self.saved(needed)
         spare = {k: v for k, v in whole.items() if k not in needed}
-        log.save_final(state, extra, spare, self.best_header(), spent=spent)
+        log.save_final(state, extra, spare, self.best.header(), spent=spent)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint."""
         self.learner = self.learner_from(state, extra, log)
         self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
         self._steps_before = at.steps
-        if self.best is not None:
-            self.best.load(log.at, extra, self.states(), str(log.run.path))
+        self.best.load(log.at, extra, self.states(), str(log.run.path))
         learner, collectors, episodes = self.learner, self.collectors, self.episodes
         if unprefixed("collector", extra):
             ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
@@ -198,13 +188,12 @@ class OneAgent:
             if tick.since < EARLY * self.stage.budget <= tick.steps:
                 self.tell_early(tick.steps, log)
             # If the best weights count, the last ones must be evaluated, too.
-            last = self.best is not None and tick.steps >= self.stage.budget
+            last = self.best.wanted and tick.steps >= self.stage.budget
             evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
             log.at["evaluation_steps"] += self.evaluation.spent()
             if evaluation:
                 log.tell_slow(self.evaluation.took, self.evaluation.after)
-            if self.best is not None:
-                self.best.see(evaluation, tick.steps, self.states)
+            self.best.see(evaluation, tick.steps, self.states)
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | evaluation)
             # No checkpoint at the end: a run that resumes from the previous one comes here again.
             if target is not None and target.reached(evaluation, self.stage.name) is not None:
@@ -214,7 +203,7 @@ class OneAgent:
 
         def on_checkpoint(saved: Saved) -> None:
             log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
-            log.save(*self.saved(saved.extra), **self.best_header())
+            log.save(*self.saved(saved.extra), **self.best.header())
             if log.stop_requested:
                 raise _Stopped
 
@@ -246,15 +235,11 @@ class OneAgent:
                 log.report_learnt_nothing()
         log.report_absent(self.episodes.tally, over=True)
         log.report_endless(self.episodes.tally)
-        if self.best is not None and self.best.metrics:
-            self._load_best(self.best)
+        if self.best.metrics:
+            for path, stack in self.stacks().items():
+                stack.state = state_to(self.best.states[path], stack.state.params.device)
             log.kept_best(self.best)
         return self.policies()
-
-    def _load_best(self, best: KeepBest) -> None:
-        """Set the learners' states to those of the best evaluation."""
-        for path, stack in self.stacks().items():
-            stack.state = state_to(best.states[path], stack.state.params.device)
 
     def tell_early(self, steps: int, log: StageLog) -> None:
         """Report problems so far, while training can still be stopped; none for one agent."""
@@ -269,13 +254,6 @@ class OneAgent:
     def close(self) -> None:
         """Release the environments."""
         self._resources.close()
-
-
-def _steps_of(stage: StageRun) -> int:
-    """Return the environment steps of earlier stages in which the learner has learnt."""
-    stages = stage.run.manifest["stages"]
-    done = [s for s in stages if stage.learner in s["learns"] and s["status"] == "done"]
-    return sum(s["steps"] for s in done)
 
 
 def _seeded(make: MakeCollector, seeds: Seeds, num_envs: int, first: int) -> Collector:
@@ -298,36 +276,56 @@ class _Stopped(Exception):
     """Signal that ends a loop: a callback has returned False."""
 
 
-def train_stage(
-    stage: Stage,
-    run: RunDirectory,
-    seeds: Seeds,
-    listeners: tuple[Listener, ...] = (),
-    policies: Policies | None = None,
-    make_learner: MakeLearner = OneAgent,
-) -> dict[str, AgentPolicy]:
+@dataclass(frozen=True)
+class Course:
+    """The training of a run, stage by stage."""
+
+    run: RunDirectory
+    listeners: tuple[Listener, ...] = ()
+    make_learner: MakeLearner = OneAgent
+    """Makes a stage's learner, by its entry."""
+    done: Mapping[str, Any] | None = None
+    """The events by which a repair is judged, as for ``planning.hand_over``."""
+
+    def tell(self, entry: Mapping[str, Any], text: str) -> None:
+        """Send a message about a stage to the listeners."""
+        for listener in self.listeners:
+            listener.message(f"{entry['name']}: {text}")
+
+    def train(self, stages: Sequence[Stage], policies: Policies) -> dict[str, Policy]:
+        """Train stages one after another; return all policies after them, by path.
+
+        Args:
+            policies: the policies before the first stage.
+        """
+        by_path = dict(policies)
+        for stage in stages:
+            by_path |= train_stage(stage, self, by_path)
+        return by_path
+
+
+def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, AgentPolicy]:
     """Train a stage to its end, or load it if it is done; return its policies, by name.
 
     Args:
-        seeds: the stage's node of the seed tree.
-        policies: the policies so far, by path.
-        make_learner: makes the learner, by the stage's entry.
+        earlier: the policies so far, by path.
 
     Raises:
         TrainingError: training diverged.
         RunError: a checkpoint is damaged.
     """
+    run = course.run
     entry = run.stage(stage.name)
     if entry["status"] == "done":
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
         remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
-    earlier = policies or {}
+    seeds = Seeds(int(run.manifest["seed"])) / stage.name
     learning_task = stage.learning_task(earlier)
     if keys := run.manifest.get("log_info"):
         learning_task = replace(learning_task, log_info=tuple(keys))
     learning_task, recorder = begin_calls(run, entry, learning_task)
-    learner = make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
+    learner = course.make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
     evolves = entry.get("evolution") is not None
     with (
         global_generators(seeds / "global"),
@@ -338,7 +336,7 @@ def train_stage(
             kind = None if fresh is None else type(fresh)
             checkpoint = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
             state, at, extra = checkpoint or (fresh, START, {})
-            log = StageLog(stage.name, run, listeners, at)
+            log = StageLog(stage.name, run, course.listeners, at)
             learner.go_on(state, extra, log)
             policies = learner.train(log)
         finally:
@@ -347,22 +345,3 @@ def train_stage(
     if recorder is not None:
         save_logged(run, entry, recorder, policies)
     return policies
-
-
-def train_stages(
-    stages: Sequence[Stage],
-    run: RunDirectory,
-    listeners: tuple[Listener, ...] = (),
-    policies: Policies | None = None,
-    make_learner: MakeLearner = OneAgent,
-) -> dict[str, Policy]:
-    """Train stages one after another; return all policies after them, by path.
-
-    Args:
-        policies: the policies before the first stage.
-    """
-    by_path = dict(policies or {})
-    root = Seeds(int(run.manifest["seed"]))
-    for stage in stages:
-        by_path |= train_stage(stage, run, root / stage.name, listeners, by_path, make_learner)
-    return by_path
