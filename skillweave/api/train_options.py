@@ -228,6 +228,7 @@ class Takes(Generic[P, Options]):
     def __call__(self, function: Callable[[S, Options], R]) -> Callable[Concatenate[S, P], R]: ...
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function with options as its arguments."""
         signature = inspect.signature(function)
         owner = list(signature.parameters.values())[:-1]
         taken = inspect.signature(self._options).parameters.values()
