@@ -13,7 +13,7 @@ from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec, Run
 from skillweave.planning import CallLog
-from skillweave.reporting.report import hand_over
+from skillweave.reporting.report import film, hand_over
 from skillweave.reporting.report.film import HOLD
 from skillweave.reporting.report.hand_over import hand_over_section
 from skillweave.runs.directory import CALLS
@@ -67,23 +67,25 @@ def test_the_matrix_and_the_ends(log: CallLog) -> None:
 
 
 def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> None:
-    reached: list[tuple[int, list[Any]]] = []
-    replay = hand_over._replay
+    reached: list[tuple[Any, Any]] = []
+    play = film._play
 
-    def watch(log: CallLog, env: Any, engine: Any, clip: Any, video: Any, every: int) -> None:
+    def watch(shot: Any, env: Any, engine: Any, video: Any, every: int, progress: Any) -> None:
         before = video.frames
-        replay(log, env, engine, clip, video, every)
-        assert video.frames - before == -(-(clip.lead + clip.steps) // every) + HOLD
-        reached.append((clip.row, env.unwrapped._seen().tolist()))
+        play(shot, env, engine, video, every, progress)
+        assert video.frames - before == -(-(len(shot.actions) - shot.first) // every) + HOLD
+        reached.append((shot, env.unwrapped._seen()))
 
-    monkeypatch.setattr(hand_over, "_replay", watch)
+    monkeypatch.setattr(film, "_play", watch)
     log = replace(log, succeeded=np.random.default_rng(0).random(len(log)) < 0.7)
     made = section(log)
     assert made.missing == []
     assert made.film is not None
     assert len(reached) > 4
-    for row, seen in reached:
-        assert seen == log.end[row].tolist()
+    ends = {(int(log.seed[row]), int(log.age[row] + log.tau[row])): log.end[row].tolist()
+            for row in range(len(log))}  # fmt: skip
+    for shot, seen in reached:
+        assert seen.tolist() == ends[shot.seed, len(shot.actions)]
     cells = made.data["hand_over"]["cells"]
     assert {clip["done"] for cell in cells.values() for clip in cell["clips"]} == {True, False}
     for cell in cells.values():

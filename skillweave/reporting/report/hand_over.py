@@ -6,15 +6,13 @@ Stands alone because all of it is about the run's log of calls; ``single`` write
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skillweave.envs.engine import GymnasiumEngine
+from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError, SkillweaveError
@@ -28,12 +26,9 @@ from skillweave.reporting.report.calls import (
     names_misfit,
     rounded,
 )
-from skillweave.reporting.report.film import HOLD, USUAL_FPS, Film
+from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
 from skillweave.reporting.report.numbers import number, percent, scale_of
 from skillweave.reporting.report.skills_table import WHY, end_cells
-from skillweave.reporting.screen import without_screen
-from skillweave.reporting.video import enlarged, frame_of
-from skillweave.reporting.video_file import VideoWriter
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
@@ -283,7 +278,6 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
 # The film
 
 
-@without_screen()
 @global_generators(Seeds(0) / "hand-over film")
 def _film(
     log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
@@ -297,22 +291,16 @@ def _film(
     clips = _choose_clips(log, cells, matrix)
     if not clips:
         return None
-    every = max(2, -(-sum(clip.lead + clip.steps for clip in clips) // MOST_FRAMES))
-    frames = sum((clip.lead + clip.steps) // every + HOLD + 1 for clip in clips)
-    env = spec.make(render_mode="rgb_array")
-    engine = GymnasiumEngine(lambda number: env, 1, spec.name)
-    fps = (env.metadata.get("render_fps") or USUAL_FPS) / 2
-    try:
-        log.check_spaces(engine.observation_space, engine.action_space)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "film.mp4"
-            with VideoWriter(path, fps, int(8 * MOST_BYTES * fps / frames)) as video:
-                for clip in clips:
-                    clip.frame = video.frames
-                    _replay(log, env, engine, clip, video, every)
-            return Film(path.read_bytes(), fps, every, {})
-    finally:
-        engine.close()
+    film = make_film(
+        spec,
+        {clip.row: _shot(log, clip) for clip in clips},
+        most_frames=MOST_FRAMES,
+        most_bytes=MOST_BYTES,
+        check_spaces=log.check_spaces,
+    )
+    for clip in clips:
+        clip.frame = film.first[clip.row]
+    return film
 
 
 def _choose_clips(
@@ -368,39 +356,24 @@ def _playable(log: CallLog) -> Array:
     return playable
 
 
-def _until(log: CallLog, row: int) -> Iterator[int]:
-    """Yield the calls of an episode up to ``row``, in their order."""
+def _shot(log: CallLog, clip: _Clip) -> Shot:
+    """Return the shot of a clip, with the observations of the log.
+
+    Raises:
+        EnvError: the log has an action that does not exist.
+    """
+    row, space = clip.row, log.action_space
     calls = np.flatnonzero((log.episode == log.episode[row]) & (log.order <= log.order[row]))
-    yield from calls[np.argsort(log.order[calls])].tolist()
+    calls = calls[np.argsort(log.order[calls])]
+    before = int(log.age[row])
+    steps = [np.arange(log.offset[call], log.offset[call + 1]) for call in calls]
+    actions = log.action[np.concatenate(steps)[: before + clip.steps]]
+    logged = np.concatenate([log.start[calls[:1]], log.next_obs[np.concatenate(steps)]])
+    for action in actions:
+        if not space.contains(env_form(space, action)):
+            raise EnvError(f"the log has the action {short(action)}, which does not exist")
 
+    def same(t: int, obs: Array, step: RawStep | None) -> bool:
+        return np.array_equal(obs, logged[t])
 
-def _replay(
-    log: CallLog, env: Any, engine: GymnasiumEngine, clip: _Clip, video: VideoWriter, every: int
-) -> None:
-    row = np.arange(1)
-    obs = engine.reset_some(row, [int(log.seed[clip.row])])
-    first = int(log.age[clip.row]) - clip.lead
-    t = 0
-    for call in _until(log, clip.row):
-        _check_same(obs[0], log.start[call], t)
-        for step in range(int(log.offset[call]), int(log.offset[call + 1])):
-            if t >= first + clip.lead + clip.steps:
-                break
-            if t >= first and (t - first) % every == 0:
-                video.add(enlarged(frame_of(env)))
-            action = np.asarray(log.action[step])
-            if not engine.action_space.contains(env_form(engine.action_space, action)):
-                raise EnvError(f"the log has the action {short(action)}, which does not exist")
-            obs = engine.step(action[None], row).next_obs
-            t += 1
-            _check_same(obs[0], log.next_obs[step], t)
-    for _ in range(HOLD):
-        video.add(enlarged(frame_of(env)))
-
-
-def _check_same(here: Array, logged: Array, t: int) -> None:
-    if not np.array_equal(here, logged):
-        raise EnvError(
-            f"from the same seed and with the same actions, the environment did another thing in "
-            f"step {t}: it does not repeat itself"
-        )
+    return Shot(int(log.seed[row]), actions, same, "the same seed", before - clip.lead)

@@ -34,7 +34,7 @@ from skillweave.reporting.report.curves import (
     read_curves,
     thinned,
 )
-from skillweave.reporting.report.film import Film, make_film
+from skillweave.reporting.report.film import Film, episode_shot, make_film
 from skillweave.reporting.report.goals import goal_pictures
 from skillweave.reporting.report.hand_over import Section, hand_over_section
 from skillweave.reporting.report.numbers import number, percent, scale_of
@@ -119,7 +119,7 @@ def play_episodes(
     if filmed:
         try:
             chosen = chosen_episodes(log.episodes, filmed)
-            film = make_film(spec, log.episodes, chosen, quiet=quiet)
+            film = make_film(spec, {i: episode_shot(log.episodes[i]) for i in chosen}, quiet=quiet)
         except SkillweaveError as error:
             missing.append(f"There is no film: {_sentence(error)}")
     if any(isinstance(skill, RecordedSkill) for skill in log.skills):
