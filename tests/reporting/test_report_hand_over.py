@@ -16,6 +16,7 @@ from skillweave.planning import CallLog
 from skillweave.reporting.report import film, hand_over
 from skillweave.reporting.report.film import HOLD
 from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.page import Section
 from skillweave.runs.directory import CALLS
 
 pytest.importorskip("imageio_ffmpeg")
@@ -42,7 +43,7 @@ def log(run: Run) -> CallLog:
     return run.log_calls(400, num_envs=4)
 
 
-def section(log: CallLog, spec: Any = None, filmed: bool = True) -> hand_over.Section:
+def section(log: CallLog, spec: Any = None, filmed: bool = True) -> Section:
     spec = EnvSpec(Ragged) if spec is None else spec
     return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
 
@@ -80,7 +81,7 @@ def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> 
     log = replace(log, succeeded=np.random.default_rng(0).random(len(log)) < 0.7)
     made = section(log)
     assert made.missing == []
-    assert made.film is not None
+    assert made.context["hand_film"] is not None
     assert len(reached) > 4
     ends = {(int(log.seed[row]), int(log.age[row] + log.tau[row])): log.end[row].tolist()
             for row in range(len(log))}  # fmt: skip
@@ -101,7 +102,7 @@ def test_only_calls_whose_episodes_are_whole_are_played_again(log: CallLog) -> N
     assert (playable == (without_first.episode > 0)).all()
     unknown = replace(log, seed=np.full(len(log), -1))
     made = section(unknown)
-    assert (made.film, made.missing) == (None, [])
+    assert (made.context["hand_film"], made.missing) == (None, [])
     assert all(cell["clips"] == [] for cell in made.data["hand_over"]["cells"].values())
 
 
@@ -110,7 +111,7 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
 ) -> None:
     monkeypatch.setattr(Ragged, "mood", 1)
     made = section(log)
-    assert made.film is None
+    assert made.context["hand_film"] is None
     assert "it does not repeat itself" in made.missing[0]
     assert made.missing[0].startswith("There is no film of hand-overs: ")
 
@@ -118,7 +119,7 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
 def test_a_log_from_elsewhere_may_hold_anything(log: CallLog) -> None:
     made = section(replace(log, action=log.action + 7))
     assert "the log has the action" in made.missing[0]
-    assert made.film is None
+    assert made.context["hand_film"] is None
     other = gym.spaces.Discrete(3)
     assert (
         "the log has actions of Discrete(3)" in section(replace(log, action_space=other)).missing[0]

@@ -52,7 +52,7 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     keys = [group.key for group in groups]
     curves = _curves(groups, curves_of, colors)
     everything = [c for curves in curves_of.values() for c in curves]
-    data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
+    data: dict[str, Any] = {"curves": curves, "charts": {}}
     scores = [_scores(group, saved) for group in groups]
     say = _sayer(saved)
     if any(scores):
@@ -76,10 +76,10 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
         "curves": [c["label"] for c in curves],
-        "metrics": data["metrics"],
+        "metrics": metrics_of(everything),
         "missing": missing,
     }
-    written = write_page(path, "compare.html", context, data, None)
+    written = write_page(path, "compare.html", context, data)
     return written | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
 
 

@@ -28,6 +28,7 @@ from skillweave.reporting.report.calls import (
 )
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
 from skillweave.reporting.report.numbers import number, percent, scale_of
+from skillweave.reporting.report.page import Section
 from skillweave.reporting.report.skills_table import WHY, end_cells
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
@@ -48,18 +49,6 @@ LONGEST = 300
 """The most steps that a clip shows of the call."""
 MOST_POINTS = 2_000
 """The most calls in the chart, of all cells."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """The hand-over section of a page."""
-
-    context: dict[str, Any]
-    """What its words are made of."""
-    data: dict[str, Any]
-    """What its chart and film need, as plain JSON."""
-    film: Film | None
-    missing: list[str]
 
 
 @dataclass
@@ -132,7 +121,8 @@ def hand_over_section(
     }
     if film is not None:
         data["film"] = {"fps": film.fps}
-    return Section({"hand_over": _words(log, matrix, named)}, {"hand_over": data}, film, missing)
+    context = {"hand_over": _words(log, matrix, named), "hand_film": film}
+    return Section(context, {"hand_over": data}, missing)
 
 
 def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, Any]:
