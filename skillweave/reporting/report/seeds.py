@@ -5,7 +5,7 @@ Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,14 @@ class OverSeeds:
     """None: one seed alone has no interval."""
     high: Array | None
 
+    def interval(self, say: Callable[[float], str]) -> str:
+        """Return a single number's interval in words; empty: it has none."""
+        if self.low is None or self.high is None:
+            return ""
+        return f"{say(float(self.low))} to {say(float(self.high))}"
 
-def over_seeds(values: Array) -> OverSeeds:
+
+def over_seeds(values: Array | Sequence[float]) -> OverSeeds:
     """Compute interquartile means of values (seeds, …), and their intervals; always the same."""
     x = np.asarray(values, float)
     n = len(x)
