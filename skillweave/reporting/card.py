@@ -15,8 +15,7 @@ from urllib.parse import quote
 
 from skillweave.planning.run_log import hand_over_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
-from skillweave.reporting.report.skills_table import WHY, skill_rows
+from skillweave.reporting.report.facts import WHY, facts, plain, settings, skill_rows, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation

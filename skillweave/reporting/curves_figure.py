@@ -14,8 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.reporting.report.curves import read_curves
-from skillweave.reporting.report.groups import grouped
-from skillweave.reporting.report.seeds import on_one_grid
+from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.reporting.report.verdict import is_binary
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own

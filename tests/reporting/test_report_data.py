@@ -19,10 +19,9 @@ from skillweave.reporting.palette import hex_of
 from skillweave.reporting.report import calls, charts
 from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
+from skillweave.reporting.report.facts import transition_rows, transitions
 from skillweave.reporting.report.film import HOLD, episode_shot, make_film
-from skillweave.reporting.report.groups import grouped
-from skillweave.reporting.report.seeds import on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import transition_rows, transitions
+from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.played_calls import PlayedCalls

@@ -17,11 +17,23 @@ from skillweave.reporting.palette import color_of, hex_of
 from skillweave.reporting.report import charts, facts
 from skillweave.reporting.report.calls import rounded
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
-from skillweave.reporting.report.groups import Group, differences, grouped
-from skillweave.reporting.report.numbers import NOTHING, number, percent, scale_of
+from skillweave.reporting.report.facts import (
+    NOTHING,
+    number,
+    percent,
+    scale_of,
+    transition_rows,
+    transitions,
+)
+from skillweave.reporting.report.groups import (
+    Group,
+    OverSeeds,
+    differences,
+    grouped,
+    on_one_grid,
+    over_seeds,
+)
 from skillweave.reporting.report.page import library, write_page
-from skillweave.reporting.report.seeds import OverSeeds, on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import transition_rows, transitions
 from skillweave.reporting.report.verdict import is_binary, solved
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory

@@ -26,10 +26,9 @@ from skillweave.reporting.report.calls import (
     names_misfit,
     rounded,
 )
+from skillweave.reporting.report.facts import WHY, end_cells, number, percent, scale_of
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
-from skillweave.reporting.report.numbers import number, percent, scale_of
 from skillweave.reporting.report.page import Section
-from skillweave.reporting.report.skills_table import WHY, end_cells
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal

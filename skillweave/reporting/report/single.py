@@ -34,19 +34,21 @@ from skillweave.reporting.report.curves import (
     read_curves,
     thinned,
 )
-from skillweave.reporting.report.film import Film, episode_shot, make_film
-from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.hand_over import hand_over_section
-from skillweave.reporting.report.numbers import number, percent, scale_of
-from skillweave.reporting.report.page import Section, library, write_page
-from skillweave.reporting.report.skills_table import (
+from skillweave.reporting.report.facts import (
     WHY,
     about,
+    number,
+    percent,
     reflex_rows,
+    scale_of,
     skill_rows,
     transition_rows,
     transitions,
 )
+from skillweave.reporting.report.film import Film, episode_shot, make_film
+from skillweave.reporting.report.goals import goal_pictures
+from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.page import Section, library, write_page
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
