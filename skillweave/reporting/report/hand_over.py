@@ -21,10 +21,10 @@ from skillweave.planning import CallLog, HandOver
 from skillweave.planning.hand_over import before_each
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
-    MOST_COORDINATES,
     coordinates,
     names_misfit,
     rounded,
+    varying,
 )
 from skillweave.reporting.report.facts import WHY, end_cells, number, percent, scale_of
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
@@ -131,16 +131,19 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
         cells: list[dict[str, Any] | None] = []
         for j in range(len(matrix.skills)):
             calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-            share = done / calls if calls else 0.0
-            cell = {"id": f"{i}-{j}", "share": share, "percent": percent(share)}
-            cell |= {"count": f"{done:,} of {calls:,}"}
-            cell |= {"words": _interval(matrix, i, j), "weak": (i, j) in weak}
-            cells.append(cell if calls else None)
+            if not calls:
+                cells.append(None)
+                continue
+            cell = {"id": f"{i}-{j}", "share": done / calls, "percent": percent(done / calls)}
+            cell |= {"count": f"{done:,} of {calls:,}", "weak": (i, j) in weak}
+            cells.append(cell | {"words": _interval(matrix, i, j)})
         rows.append({"name": name if i else "start of an episode", "cells": cells})
+    # Names between backticks, and percents as the page writes them.
+    prose = [re.sub(r"'([^']+)'", r"`\1`", sentence) for sentence in matrix.weakest()]
     return {
         "columns": list(matrix.skills),
         "rows": rows,
-        "weakest": [_as_prose(sentence) for sentence in matrix.weakest()],
+        "weakest": [re.sub(r"(\d)%", r"\1 %", sentence) + "." for sentence in prose],
         "weak": bool(weak),
         "meaning": matrix.meaning,
         "calls": f"{len(log):,}",
@@ -151,23 +154,20 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
     }
 
 
-def _as_prose(sentence: str) -> str:
-    """Return a sentence with names between backticks, and percents as the page writes them."""
-    named = re.sub(r"'([^']+)'", r"`\1`", sentence)
-    return re.sub(r"(\d)%", r"\1 %", named) + "."
-
-
 def _interval(matrix: HandOver, i: int, j: int) -> str:
     low, high = (percent(float(bound[i, j])) for bound in matrix.interval)
     return f"{low} to {high}"
 
 
+def _called(log: CallLog) -> list[str]:
+    """Return the skills with calls."""
+    return [name for i, name in enumerate(log.skills) if (log.skill == i).any()]
+
+
 def _end_rows(log: CallLog) -> list[dict[str, Any]]:
     """Return a row for each skill: how its calls end."""
     rows = []
-    for name in log.skills:
-        if not (log.skill == log.number(name)).any():
-            continue
+    for name in _called(log):
         ends = log.call_ends(name)
         rows.append(
             {
@@ -183,8 +183,8 @@ def _end_rows(log: CallLog) -> list[dict[str, Any]]:
 
 def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
     """Return the middle 80 % of each coordinate where calls end, by skill."""
-    columns = _varying(coordinates(log.end, named))
-    skills = [name for i, name in enumerate(log.skills) if (log.skill == i).any()]
+    columns = varying(coordinates(log.end, named))
+    skills = _called(log)
     rows = []
     for name, values in columns.items():
         scale, cells = scale_of(np.quantile(values, (0.05, 0.95)).tolist()), []
@@ -198,16 +198,12 @@ def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
     return {"skills": skills, "rows": rows}
 
 
-def _varying(columns: Mapping[str, Array]) -> dict[str, Array]:
-    return dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
-
-
 def _points(
     log: CallLog, cells: Mapping[tuple[int, int], _Cell], named: ObsNames | None
 ) -> dict[str, Any]:
     """Return names of coordinates, and rows of each cell: at start and end of a call, if done."""
     both = {when: coordinates(obs, named) for when, obs in (("start", log.start), ("end", log.end))}
-    names = list(_varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
+    names = list(varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
     if not names:
         return {"names": [], "points": {}}
     most = max(10, MOST_POINTS // max(1, len(cells)))
