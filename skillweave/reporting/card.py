@@ -103,14 +103,11 @@ def _use(run: RunDirectory, name: str) -> str:
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
     ]
-    if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
+    skills = run.manifest.get("skills", ())
+    if stays := [s for s in skills if s.get("policy", {}).get("kind") == "onnx"]:
         names = ", ".join(text(s["name"]) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)
-
-
-def _is_onnx(skill: Mapping[str, Any]) -> bool:
-    return bool(skill.get("policy", {}).get("kind") == "onnx")
 
 
 def _measured(saved: SavedEvaluation | None) -> str:

@@ -34,7 +34,7 @@ from skillweave.reporting.report.groups import (
     over_seeds,
 )
 from skillweave.reporting.report.page import library, write_page
-from skillweave.reporting.report.verdict import is_binary, solved
+from skillweave.reporting.report.verdict import is_binary, solved_share
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
@@ -220,20 +220,10 @@ def _run_row(
         "seconds": f"{sum(s.get('seconds', 0.0) for s in stages):,.0f}",
         "mean": say(None if score is None else score["mean"]),
         "iqm": say(None if score is None else score["iqm"]),
-        "solved": percent(_solved(saved)),
+        "solved": percent(None if saved is None else solved_share(saved.evaluation)),
         "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
         "episodes": NOTHING if score is None else str(score["episodes"]),
     }
-
-
-def _solved(saved: SavedEvaluation | None) -> float | None:
-    """Return the share of episodes that are solved, or else at the environment's threshold."""
-    if saved is None:
-        return None
-    count = solved(saved.evaluation)
-    if count is None:
-        return saved.evaluation.solved_fraction
-    return count / len(saved.evaluation.returns)
 
 
 def _curves(
