@@ -21,16 +21,7 @@ from skillweave.api.applying import (
 )
 from skillweave.api.calls import RunCalls
 from skillweave.api.hub import push_run
-from skillweave.api.notebook_tables import (
-    agent_facts,
-    agent_html,
-    agent_line,
-    hierarchy_facts,
-    hierarchy_html,
-    hierarchy_line,
-    run_html,
-    skills_table,
-)
+from skillweave.api.notebook_tables import declared_html, declared_line, run_html
 from skillweave.api.planning import (
     mission_words,
     planned,
@@ -98,11 +89,11 @@ class Agent(PlainAgent):
     """One plain agent that learns an environment's own reward: declared, trained and watched."""
 
     def __repr__(self) -> str:
-        return agent_line(self)
+        return declared_line(self)
 
     def _repr_html_(self) -> str:
         """Return a table of the declaration, for notebooks."""
-        return agent_html(self)
+        return declared_html(self)
 
     @Takes(AgentOptions)
     def train(self, options: AgentOptions) -> Run:
@@ -188,12 +179,11 @@ class Hierarchy(Declaration):
     """
 
     def __repr__(self) -> str:
-        names = [skill.name for skill in self.skills]
-        return hierarchy_line(type(self).__name__, names, self.spec.name)
+        return declared_line(self)
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration, for notebooks."""
-        return hierarchy_html(roles_of(self), recorded=self.recorded)
+        return declared_html(self)
 
     @Takes(TrainOptions)
     def train(self, options: TrainOptions) -> Run:
@@ -309,11 +299,7 @@ class TrainedPolicy:
 
     def _repr_html_(self) -> str:
         """Return tables of the declaration and the stages, for notebooks."""
-        if isinstance(self.declaration, PlainAgent):
-            return run_html(self.path, agent_facts(self.declaration))
-        roles = roles_of(self.declaration)
-        known = hierarchy_facts(roles, recorded=self.declaration.recorded)
-        return run_html(self.path, known, skills_table(roles))
+        return run_html(self.path, self.declaration)
 
     @property
     def hierarchy(self) -> Hierarchy:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.errors import SkillweaveError
-from skillweave.hierarchy.roles import Roles
+from skillweave.hierarchy.declaration import Declaration
+from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.schedule import budgets_of
 from skillweave.notebooks import Markup, facts, joined, paragraph, table
 from skillweave.runs.directory import RunDirectory
@@ -17,39 +17,25 @@ from skillweave.training.evaluation_file import load_evaluation
 from skillweave.training.plain_agent import PlainAgent
 
 
-def hierarchy_line(kind: str, skills: Iterable[str], env: str) -> str:
-    """Return the ``repr`` of a hierarchy, from the names of its class, skills and environment."""
-    return printable(f"<{kind} of {', '.join(skills)} on {env}>")
+def declared_line(declared: PlainAgent | Declaration) -> str:
+    """Return the ``repr`` of a hierarchy or a plain agent."""
+    if isinstance(declared, PlainAgent):
+        what = _kind(declared.algorithm)
+    else:
+        what = ", ".join(skill.name for skill in declared.skills)
+    return printable(f"<{type(declared).__name__} of {what} on {declared.spec.name}>")
 
 
-def agent_line(declared: PlainAgent) -> str:
-    """Return the ``repr`` of a plain agent."""
-    kind = _kind(declared.algorithm)
-    return printable(f"<{type(declared).__name__} of {kind} on {declared.spec.name}>")
+def declared_html(declared: PlainAgent | Declaration) -> str:
+    """Return tables of a plain agent, or of a hierarchy and its skills at all levels."""
+    known, tables = _declared(declared)
+    return joined([facts(known), *tables])
 
 
-def hierarchy_html(roles: Roles, *, recorded: bool) -> str:
-    """Return tables of a hierarchy, and of its skills at all levels.
-
-    Args:
-        recorded: it is of a run that was loaded without its code.
-    """
-    return joined([facts(hierarchy_facts(roles, recorded=recorded)), skills_table(roles)])
-
-
-def agent_html(declared: PlainAgent) -> str:
-    """Return a table of a plain agent."""
-    return joined([facts(agent_facts(declared))])
-
-
-def run_html(path: Path, known: Iterable[tuple[str, object]], *tables: Markup) -> str:
-    """Return tables of a run: its declaration, its stages, and its latest saved evaluation.
-
-    Args:
-        known: the facts of the declaration.
-        tables: further ones of the declaration.
-    """
+def run_html(path: Path, declared: PlainAgent | Declaration) -> str:
+    """Return tables of a run: its declaration, its stages, and its latest saved evaluation."""
     kind = "run" if path.is_dir() else "weights"
+    known, tables = _declared(declared)
     shown = [facts([(kind, path), *known]), *tables]
     try:
         run = RunDirectory.open(path) if path.is_dir() else None
@@ -63,27 +49,28 @@ def run_html(path: Path, known: Iterable[tuple[str, object]], *tables: Markup) -
     return joined(shown)
 
 
-def hierarchy_facts(roles: Roles, *, recorded: bool) -> Iterator[tuple[str, object]]:
-    """Yield names and values of a hierarchy's settings, for its table."""
+def _declared(declared: PlainAgent | Declaration) -> tuple[list[tuple[str, object]], list[Markup]]:
+    """Return the names and values of settings, and a hierarchy's table of skills."""
+    known: list[tuple[str, object]]
+    if isinstance(declared, PlainAgent):
+        known = [("agent on", declared.spec.name), ("algorithm", _kind(declared.algorithm))]
+        return known + ([] if declared.recorded else [_steps(declared.steps)]), []
+    roles = roles_of(declared)
     level = roles.outermost
-    yield "hierarchy on", roles.spec.name
-    if not recorded:
-        yield "selector", _kind(level.selector)
-        yield "learns", level.learn
-        yield "training steps", f"{sum(budgets_of(roles).values()):,}"
-    if level.reflexes:
-        yield "reflexes", ", ".join(str(reflex.name) for reflex in level.reflexes)
-
-
-def agent_facts(declared: PlainAgent) -> Iterator[tuple[str, object]]:
-    """Yield names and values of a plain agent's settings, for its table."""
-    yield "agent on", declared.spec.name
-    yield "algorithm", _kind(declared.algorithm)
+    known = [("hierarchy on", roles.spec.name)]
     if not declared.recorded:
-        yield "training steps", f"{declared.steps:,}"
+        known += [("selector", _kind(level.selector)), ("learns", level.learn)]
+        known.append(_steps(sum(budgets_of(roles).values())))
+    if level.reflexes:
+        known.append(("reflexes", ", ".join(str(reflex.name) for reflex in level.reflexes)))
+    return known, [_skills_table(roles)]
 
 
-def skills_table(roles: Roles) -> Markup:
+def _steps(steps: int) -> tuple[str, str]:
+    return "training steps", f"{steps:,}"
+
+
+def _skills_table(roles: Roles) -> Markup:
     """Return a table of a hierarchy's skills; empty columns are left out."""
     head = ["skill", "policy", "defines", "about", "max_steps"]
     rows = []

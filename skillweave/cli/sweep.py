@@ -33,7 +33,7 @@ from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.messages import error_text, short, whole_number
-from skillweave.reporting.report.seeds import over_seeds
+from skillweave.reporting.report.groups import over_seeds
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
 

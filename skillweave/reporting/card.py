@@ -5,16 +5,14 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
 from skillweave.planning.run_log import hand_over_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import facts, plain, settings, stage_rows
-from skillweave.reporting.report.numbers import percent
-from skillweave.reporting.report.skills_table import WHY, skill_rows
+from skillweave.reporting.report.facts import WHY, facts, plain, settings, skill_rows, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
@@ -71,7 +69,7 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
 
 def _about(run: RunDirectory) -> str:
     what = "hierarchy of skills" if run.manifest["kind"] == "hierarchy" else "plain agent"
-    rows = [f"| {text(k)} | {text(v)} |" for k, v in facts(run)]
+    _, _, *rows = _table(("", ""), facts(run))
     return "\n".join([f"A {what}, trained with Skillweave.", "", "| | |", "|---|---|", *rows])
 
 
@@ -102,14 +100,11 @@ def _use(run: RunDirectory, name: str) -> str:
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
     ]
-    if stays := [s for s in run.manifest.get("skills", ()) if _is_onnx(s)]:
+    skills = run.manifest.get("skills", ())
+    if stays := [s for s in skills if s.get("policy", {}).get("kind") == "onnx"]:
         names = ", ".join(text(s["name"]) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)
-
-
-def _is_onnx(skill: Mapping[str, Any]) -> bool:
-    return bool(skill.get("policy", {}).get("kind") == "onnx")
 
 
 def _measured(saved: SavedEvaluation | None) -> str:
@@ -121,19 +116,16 @@ def _measured(saved: SavedEvaluation | None) -> str:
     whole = str(score).partition("; skills:")[0]
     lines = ["## Measured", "", f"Return {text(whole)} ({how}, seed {saved.seed})."]
     if score.skills:
-        head = (
-            "skill",
-            "of all steps",
-            "calls",
-            "steps of a call",
-            *(f"ends {w}" for w in WHY.values()),
-            "success",
-            "own return of a call",
-        )
-        lines += ["", "What each skill did:", "", _row(head), _row(["---"] * len(head))]
-        for row in skill_rows(score.skills):
-            cells = [row["name"], percent(row["share"]), row["calls"], row["length"], *row["ends"]]
-            lines.append(_row([*cells, row["success"], row["return"]]))
+        ends = (f"ends {w}" for w in WHY.values())
+        head = ("skill", "of all steps", "calls", "steps of a call", *ends, "success")
+        rows = [
+            [
+                *(row["name"], row["percent"], row["calls"], row["length"], *row["ends"]),
+                *(row["success"], row["return"]),
+            ]
+            for row in skill_rows(score.skills)
+        ]
+        lines += ["", "What each skill did:", "", *_table((*head, "own return of a call"), rows)]
     return "\n".join(lines)
 
 
@@ -142,35 +134,36 @@ def _handed_over(run: RunDirectory) -> list[str]:
     matrix = hand_over_of(run)
     if matrix is None or isinstance(matrix, str):
         return []
-    head = ("after", *matrix.skills)
     lines = [
         "## Hand-over",
         "",
         "The share of each skill's calls that are done, by the skill before.",
+        text(matrix.meaning),
+        "",
+        *_table(("after", *matrix.skills), matrix.rows()),
+        *(f"\n{text(sentence)}" for sentence in matrix.weakest()),
     ]
-    lines += [text(matrix.meaning), "", _row(head), _row(["---"] * len(head))]
-    lines += [_row(row) for row in matrix.rows()]
-    lines += [f"\n{text(sentence)}" for sentence in matrix.weakest()]
     return ["\n".join(lines)]
 
 
 def _training(run: RunDirectory) -> str:
     keys = ("name", "algorithm", "steps", "seconds", "return", "notes")
     head = ("stage", "algorithm", "steps", "seconds", "return at its end", "")
-    lines = ["## Training", "", _row(head), _row(["---"] * len(head))]
-    for row in stage_rows(run, reached_steps(read_curves(run))):
-        lines.append(_row([row[key] for key in keys]))
-    return "\n".join(lines)
+    stages = stage_rows(run, reached_steps(read_curves(run)))
+    rows = ([row[key] for key in keys] for row in stages)
+    return "\n".join(["## Training", "", *_table(head, rows)])
 
 
 def _folded(title: str, head: tuple[str, str], rows: Mapping[str, Any]) -> str:
     """Return a table that is folded until a reader opens it."""
-    lines = [f"<details><summary>{title}</summary>", "", _row(head), _row(["---"] * 2)]
-    return "\n".join([*lines, *(_row([k, plain(v)]) for k, v in rows.items()), "", "</details>"])
+    shown = _table(head, ([k, plain(v)] for k, v in rows.items()))
+    return "\n".join([f"<details><summary>{title}</summary>", "", *shown, "", "</details>"])
 
 
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(c if c == "---" else text(c) for c in cells) + " |"
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table."""
+    lines = ["| " + " | ".join(map(text, cells)) + " |" for cells in (head, *rows)]
+    return [lines[0], "|" + " --- |" * len(head), *lines[1:]]
 
 
 def text(value: str) -> str:

@@ -14,8 +14,7 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.reporting.report.curves import read_curves
-from skillweave.reporting.report.groups import grouped
-from skillweave.reporting.report.seeds import on_one_grid
+from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.reporting.report.verdict import is_binary
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
@@ -120,7 +119,11 @@ def plot_curves(
     everyone = [run for group in groups.values() for run in group]
     metric = _metric(everyone, metric, agent)
     lines = tuple(_line(label, group, metric, agent, band) for label, group in groups.items())
-    binary = metric.endswith("success") or (metric in AXES and agent is None and _binary(everyone))
+    binary = metric.endswith("success")
+    if metric in AXES and agent is None:
+        saved = [load_evaluation(run) for run in everyone]
+        returns = [r for e in saved if e is not None for r in e.evaluation.returns]
+        binary |= bool(returns) and is_binary(returns)
     paths = _draw(lines, out, metric, agent, binary, width, height)
     return CurvesFigure(paths, lines, metric, _caption(lines, band))
 
@@ -189,12 +192,11 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
         if agent is None or entry["name"] in points_of_stage:
             before += int(entry.get("steps", entry["budget"]))
     names = dict.fromkeys(name for _, points in parts for name in points)
-    return {m: _joined([(b, points[m]) for b, points in parts if m in points]) for m in names}
-
-
-def _joined(parts: Sequence[tuple[int, Curve]]) -> Curve:
-    """Join curves one after another, each moved by the steps before it."""
-    return [(before + x, y) for before, points in parts for x, y in points]
+    # Curves one after another, each moved by the steps before it.
+    return {
+        m: [(before + x, y) for before, points in parts for x, y in points.get(m, ())]
+        for m in names
+    }
 
 
 def _line(
@@ -210,13 +212,6 @@ def _line(
         ends = (25, 75) if band == "iqr" else (0, 100)
         low, high = np.percentile(values, ends, axis=0)
     return Line(label, len(runs), steps, np.median(values, axis=0), low, high)
-
-
-def _binary(runs: Sequence[RunDirectory]) -> bool:
-    """Return whether every return of the runs' evaluations is 0 or 1, and there are evaluations."""
-    saved = [load_evaluation(run) for run in runs]
-    returns = [r for e in saved if e is not None for r in e.evaluation.returns]
-    return bool(returns) and is_binary(returns)
 
 
 def _caption(lines: Sequence[Line], band: Band) -> str:
@@ -244,6 +239,7 @@ def _draw(
     except ImportError as error:
         raise MissingExtra("plotting", "plot") from error
     named = len(lines) > 1
+    most = math.floor(width * 14)  # letters of a name that fits
     if height is None:
         height = 0.62 * width + (0.17 * len(lines) if named else 0.0)
     # The same figure is the same file.
@@ -253,7 +249,8 @@ def _draw(
         for i, line in enumerate(lines):
             look: dict[str, Any] = {"color": COLORS[i % len(COLORS)], "zorder": 3}
             dashes = DASHES[i % len(DASHES)]
-            label = _shortened(line.label, width)
+            name = line.label
+            label = name if len(name) <= most else f"{name[: most - 1]}…"
             axes.plot(line.steps, line.middle, linewidth=1.4, linestyle=dashes, label=label, **look)
             if line.low is not None and line.high is not None:
                 axes.fill_between(
@@ -286,12 +283,6 @@ def _save(figure: Any, out: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise RunError(f"could not write {stem}: {error.strerror}") from error
     return paths
-
-
-def _shortened(label: str, width: float) -> str:
-    """Return a name that fits into the figure."""
-    most = math.floor(width * 14)
-    return label if len(label) <= most else f"{label[: most - 1]}…"
 
 
 def _steps(value: float, _: Any = None) -> str:

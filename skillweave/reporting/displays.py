@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from skillweave.notebooks import Area, Markup, in_notebook, joined, paragraph, table
 from skillweave.terminal import end_quietly, printable
@@ -38,27 +38,54 @@ class Row:
         return self.under, self.name
 
 
-class Display(Protocol):
-    """A display of rows, each under the ones before."""
+class Display:
+    """A display of rows, each under the ones before.
+
+    It turns silent once it cannot be drawn, so that training continues: its reader has ended, or
+    the disk of a log is full.
+    """
 
     every: float
     """Seconds between two drawings."""
 
+    def __init__(self) -> None:
+        self._rows: dict[tuple[str, str], Row] = {}
+        self._draws = True
+
     def put(self, row: Row) -> None:
         """Add a row, or replace the one of the same key; ``draw`` shows it."""
-        ...
+        self._rows[row.key] = row
 
     def draw(self) -> None:
         """Show all rows as they are now."""
-        ...
+        self._try(self._draw)
 
     def message(self, text: str) -> None:
         """Show a line of text."""
-        ...
+        self._try(self._message, text)
 
     def close(self) -> None:
-        """Draw for the last time."""
-        ...
+        """Draw for the last time, and undo the display's changes in any case."""
+        _open.remove(self)
+        self._draws = True
+        self._try(self._close)
+
+    def _try(self, act: Callable[..., None], *arguments: str) -> None:
+        if self._draws:
+            try:
+                act(*arguments)
+            except (OSError, ValueError):
+                self._draws = False
+                end_quietly()
+
+    def _draw(self) -> None:
+        raise NotImplementedError
+
+    def _message(self, text: str) -> None:
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        raise NotImplementedError
 
 
 _open: list[Display] = []
@@ -81,140 +108,74 @@ def open_display(*, transient: bool = False) -> Display | None:
             display = make_bars(transient)
     except (OSError, ValueError):
         return None
-    if display is None:
-        return None
-    display = Shielded(display)
-    _open.append(display)
+    if display is not None:
+        _open.append(display)
     return display
 
 
-class Shielded:
-    """A display that turns silent once it cannot be drawn, so that training continues.
-
-    Its reader has ended, or the disk of a log is full.
-    """
-
-    def __init__(self, display: Display) -> None:
-        self.every = display.every
-        self._display = display
-        self._draws = True
-
-    def put(self, row: Row) -> None:
-        """Add or replace a row."""
-        self._try(self._display.put, row)
-
-    def draw(self) -> None:
-        """Show all rows."""
-        self._try(self._display.draw)
-
-    def message(self, text: str) -> None:
-        """Show a line of text."""
-        self._try(self._display.message, text)
-
-    def close(self) -> None:
-        """Draw for the last time, and undo the display's changes in any case."""
-        _open.remove(self)
-        self._draws = True
-        self._try(self._display.close)
-
-    def _try(self, act: Callable[..., None], *arguments: Any) -> None:
-        if self._draws:
-            try:
-                act(*arguments)
-            except (OSError, ValueError):
-                self._draws = False
-                end_quietly()
-
-
-class Bars:
-    """Bars on a terminal, drawn by rich."""
+class Bars(Display):
+    """Bars on a terminal, drawn by rich; messages are above them."""
 
     every = 0.25
 
     def __init__(self, bars: Any) -> None:
+        super().__init__()
         self._bars = bars
         self._tasks = dict[tuple[str, str], Any]()
         bars.start()
 
-    def put(self, row: Row) -> None:
-        """Add or replace a row."""
-        fields = {"steps": row.steps, "result": row.result, "speed": row.speed, "left": row.left}
-        if row.key not in self._tasks:
-            name = printable(f"  {row.name}" if row.under else row.name)
-            self._tasks[row.key] = self._bars.add_task(name, total=1.0, **fields)
-        self._bars.update(self._tasks[row.key], completed=row.share or 0.0, **fields)
-
-    def draw(self) -> None:
-        """Show all rows."""
+    def _draw(self) -> None:
+        for key, row in self._rows.items():
+            texts = {k: getattr(row, k) for k in ("steps", "result", "speed", "left")}
+            if key not in self._tasks:
+                name = printable(f"  {row.name}" if row.under else row.name)
+                self._tasks[key] = self._bars.add_task(name, total=1.0, **texts)
+            self._bars.update(self._tasks[key], completed=row.share or 0.0, **texts)
         self._bars.refresh()
 
-    def message(self, text: str) -> None:
-        """Show a line above the bars."""
+    def _message(self, text: str) -> None:
         self._bars.console.print(text, markup=False, highlight=False)
 
-    def close(self) -> None:
-        """Draw for the last time."""
+    def _close(self) -> None:
         try:
-            self._bars.refresh()
+            self._draw()
         finally:
             self._bars.stop()
 
 
-class Cell:
+class Cell(Display):
     """A table in the output of a notebook's cell; its last state stays in the notebook."""
 
     every = 0.5
 
     def __init__(self, transient: bool = False) -> None:
+        super().__init__()
         self._area = Area()
         self._transient = transient
-        self._rows: dict[tuple[str, str], Row] = {}
         self._messages: list[str] = []
 
-    def put(self, row: Row) -> None:
-        """Add or replace a row."""
-        self._rows[row.key] = row
-
-    def draw(self) -> None:
-        """Show all rows, and messages below them."""
+    def _draw(self) -> None:
         indent = "\N{NO-BREAK SPACE}" * 4
-        rows = [
-            (
-                (indent if row.under else "") + row.name,
-                "" if row.share is None else _bar(row.share),
-                row.steps,
-                row.result,
-                row.speed,
-                row.left,
-            )
-            for row in self._rows.values()
-        ]
-        shown = [table((), rows)] if rows else []
-        lines = [" ".join(filter(None, _texts(row))) for row in self._rows.values()]
-        self._area.show(
-            joined([*shown, *map(paragraph, self._messages)]), "\n".join([*lines, *self._messages])
-        )
+        cells, lines = [], []
+        for row in self._rows.values():
+            share = "" if row.share is None else f"{row.share:.0%}"
+            bar = share and Markup(f'<progress value="{row.share:.3f}" max="1">{share}</progress>')
+            texts = (row.steps, row.result, row.speed, row.left)
+            cells.append(((indent if row.under else "") + row.name, bar, *texts))
+            lines.append(" ".join(filter(None, (row.name, share, *texts))))
+        shown = [table((), cells)] if cells else []
+        html = joined([*shown, *map(paragraph, self._messages)])
+        self._area.show(html, "\n".join([*lines, *self._messages]))
 
-    def message(self, text: str) -> None:
-        """Show a line below the table."""
+    def _message(self, text: str) -> None:
         self._messages.append(text)
-        self.draw()
+        self._draw()
 
-    def close(self) -> None:
-        """Draw for the last time."""
+    def _close(self) -> None:
         if self._transient:
             self._area.clear()
         elif self._rows or self._messages:
-            self.draw()
-
-
-def _texts(row: Row) -> tuple[str, ...]:
-    share = "" if row.share is None else f"{row.share:.0%}"
-    return row.name, share, row.steps, row.result, row.speed, row.left
-
-
-def _bar(share: float) -> Markup:
-    return Markup(f'<progress value="{share:.3f}" max="1">{share:.0%}</progress>')
+            self._draw()
 
 
 def _may_draw() -> bool:

@@ -49,12 +49,19 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
         name = stage["name"]
         color = hex_of(color_of(i + 1))
         if lineage := read_lineage(run, name):
-            figure = draw_lineage(Figure, lineage, name, color)
+            figure = _draw_lineage(Figure, lineage, name, color)
         else:
-            curve = [(m["steps"], m["return"]) for m in metrics if _has_return(m, name)]
-            if not curve:
+            mine = [
+                m for m in metrics if m.get("stage") == name and {"return", "steps"} <= m.keys()
+            ]
+            if not mine:
                 continue
-            figure = _draw_curve(Figure, curve, name, color)
+            figure = Figure(figsize=(8, 4), layout="constrained")
+            axes = figure.add_subplot()
+            curve = [m["steps"] for m in mine], [m["return"] for m in mine]
+            axes.plot(*curve, color=color, linewidth=1.8)
+            axes.set_title(f"{name}: return while training", loc="left", fontsize=12)
+            _plain(axes, "mean return of 100 episodes", "environment steps")
         folder.mkdir(parents=True, exist_ok=True)
         for suffix in (".png", ".svg"):
             written.append(folder / f"{file_name(name)}{suffix}")
@@ -66,7 +73,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     return written
 
 
-def draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
+def _draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
     """Draw fitness by generation, and below it the path of each setting that differs."""
     path = lineage.path(lineage.winner)
     shown = lineage.varied
@@ -93,33 +100,25 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
         axes.plot(born.generation, born.fitness, "o", color=FAINT, markersize=4, zorder=2)
     line = [b.generation for b in path], [b.fitness for b in path]
     axes.plot(*line, color=color, linewidth=2.2, marker="o", markersize=6, zorder=3)
+    beside = {"textcoords": "offset points"}
     for born in path:
         if born.mutation not in ("goes on", "none", "start"):
-            at = born.generation, born.fitness
-            what = changes_words(born) or "weights"
             axes.annotate(
-                what,
-                at,
-                textcoords="offset points",
+                changes_words(born) or "weights",
+                (born.generation, born.fitness),
                 xytext=(4, -6),
                 rotation=-38,
                 fontsize=7,
                 color=TEXT,
                 va="top",
+                **beside,
             )
     winner = path[-1]
-    axes.plot(winner.generation, winner.fitness, "*", color=color, markersize=16, zorder=4)
+    at = winner.generation, winner.fitness
+    axes.plot(*at, "*", color=color, markersize=16, zorder=4)
     label = f"member {winner.member}: {winner.fitness:.1f}"
-    axes.annotate(
-        label,
-        (winner.generation, winner.fitness),
-        textcoords="offset points",
-        xytext=(-6, 9),
-        ha="right",
-        fontsize=9,
-        color=color,
-        weight="bold",
-    )
+    bold = {"fontsize": 9, "color": color, "weight": "bold"}
+    axes.annotate(label, at, xytext=(-6, 9), ha="right", **bold, **beside)
     fitness = sorted(b.fitness for b in lineage.born.values() if b.fitness is not None)
     # One hopeless member must not squeeze all others into a line.
     low = min(fitness[len(fitness) // 20], *(b.fitness for b in path if b.fitness is not None))
@@ -131,15 +130,16 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
 def _draw_setting(
     axes: Any, setting: str, lineage: Lineage, path: Sequence[Born], color: str
 ) -> None:
+    everyone = list(lineage.born.values())
     words: list[str] = []
-    if any(isinstance(b.settings.get(setting), str) for b in lineage.born.values()):
-        words = sorted({b.settings[setting] for b in lineage.born.values()})
+    if any(isinstance(b.settings.get(setting), str) for b in everyone):
+        words = sorted({b.settings[setting] for b in everyone})
 
     def value(born: Born) -> float:
         return words.index(born.settings[setting]) if words else born.number(setting)
 
-    values = [value(b) for b in lineage.born.values()]
-    for born in lineage.born.values():
+    values = [value(b) for b in everyone]
+    for born in everyone:
         axes.plot(born.generation, value(born), "o", color=FAINT, markersize=3, zorder=1)
     line = [b.generation for b in path], [value(b) for b in path]
     axes.plot(*line, color=color, linewidth=1.8, marker="o", markersize=4, zorder=2)
@@ -152,15 +152,6 @@ def _draw_setting(
     axes.set_title(f"winner: {short_value(won)}", loc="right", fontsize=8, color=TEXT)
 
 
-def _draw_curve(make: Any, curve: list[tuple[int, float]], name: str, color: str) -> Any:
-    figure = make(figsize=(8, 4), layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot(*zip(*curve, strict=True), color=color, linewidth=1.8)
-    axes.set_title(f"{name}: return while training", loc="left", fontsize=12)
-    _plain(axes, "mean return of 100 episodes", "environment steps")
-    return figure
-
-
 def _plain(axes: Any, label: str, below: str = "generation") -> None:
     axes.set_ylabel(label, fontsize=8)
     axes.set_xlabel(below, fontsize=8)
@@ -168,7 +159,3 @@ def _plain(axes: Any, label: str, below: str = "generation") -> None:
     axes.spines[["top", "right"]].set_visible(False)
     if below == "generation":
         axes.xaxis.get_major_locator().set_params(integer=True)
-
-
-def _has_return(metrics: dict[str, Any], stage: str) -> bool:
-    return metrics.get("stage") == stage and {"return", "steps"} <= metrics.keys()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -130,24 +130,22 @@ class Progress:
         budget = self._plan[name]
         share = min(steps / budget, 1.0)
         result = f"return {metrics['return']:.1f}" if "return" in metrics else ""
+        below = _below(name, metrics)
         if self._display is None:
             part = f"{steps:,} of {budget:,} steps ({share:.0%})"
             seconds = self._left_in_all(name)
             in_all = f"{_clock(seconds)} left in all" if seconds else ""
-            numbers = (f"{k} {v:.4g}" for k, v in metrics.items() if k.startswith(INFO))
+            numbers = (f"{row.name} {row.steps}" for row in below if row.name.startswith(INFO))
             text = ", ".join(filter(None, (part, result, *numbers, speed, left, in_all)))
             self._line(f"{self._numbered(name)}: {text}")
-            if name in self._over:
-                for agent, _, acts, reward in _agents(metrics):
-                    self._line(f"  {agent}: " + ", ".join(filter(None, (acts, reward))))
+            for row in below if name in self._over else ():
+                if not row.name.startswith(INFO):
+                    self._line(f"  {row.name}: " + ", ".join(filter(None, (row.steps, row.result))))
             return
         counted = f"{_short(steps)}/{_short(budget)}"
         self._display.put(Row(name, share, counted, result, speed, left))
-        for agent, usage, acts, reward in _agents(metrics):
-            self._display.put(Row(agent, usage, acts, reward, under=name))
-        for key, value in metrics.items():
-            if key.startswith(INFO):
-                self._display.put(Row(key, None, f"{value:.4g}", under=name))
+        for row in below:
+            self._display.put(row)
         if self._several:
             self._put_total(name)
         self._display.draw()
@@ -276,18 +274,20 @@ class EpisodeProgress:
         self._display.draw()
 
 
-def _agents(metrics: dict[str, float]) -> Iterator[tuple[str, float | None, str, str]]:
-    """Yield the learners of a stage: name, share of the steps in which it acts, both in words."""
+def _below(name: str, metrics: dict[str, float]) -> list[Row]:
+    """Return the rows below a stage: its learners, then the numbers from infos."""
+    learners, infos = [], []
     for key, value in metrics.items():
-        name, _, what = key.rpartition(".")
+        agent, _, what = key.rpartition(".")
         if key.startswith(INFO):  # a key may have a dot of its own
-            continue
-        if what == "usage":
-            reward = metrics.get(f"{name}.reward")
+            infos.append(Row(key, None, f"{value:.4g}", under=name))
+        elif what == "usage":
+            reward = metrics.get(f"{agent}.reward")
             words = "" if reward is None else f"reward {reward:.3g} a step"
-            yield name, value, f"{value:.0%} of steps", words
+            learners.append(Row(agent, value, f"{value:.0%} of steps", words, under=name))
         elif what == "call_length":
-            yield name, None, f"calls of {value:.1f} steps", ""
+            learners.append(Row(agent, None, f"calls of {value:.1f} steps", under=name))
+    return [*learners, *infos]
 
 
 def _short(steps: int) -> str:

@@ -19,10 +19,9 @@ from skillweave.reporting.palette import hex_of
 from skillweave.reporting.report import calls, charts
 from skillweave.reporting.report.charts import scores
 from skillweave.reporting.report.curves import read_curves, thinned
-from skillweave.reporting.report.film import HOLD, make_film
-from skillweave.reporting.report.groups import grouped
-from skillweave.reporting.report.seeds import on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import transition_rows, transitions
+from skillweave.reporting.report.facts import transition_rows, transitions
+from skillweave.reporting.report.film import HOLD, episode_shot, make_film
+from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.played_calls import PlayedCalls
@@ -106,7 +105,8 @@ def test_filmed_are_the_worst_the_median_and_the_best() -> None:
 def test_a_film_says_where_each_episode_begins(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     log = logged(tmp_path)
-    film = make_film(EnvSpec(Walkway, engine="sync"), log.episodes, [1, 0])
+    shots = {i: episode_shot(log.episodes[i]) for i in (1, 0)}
+    film = make_film(EnvSpec(Walkway, engine="sync"), shots)
     # Nine steps, a frame for two, and the end, which stands for HOLD frames.
     assert film.first == {1: 0, 0: 5 + HOLD}
     assert (film.fps, film.every) == (10, 2)
@@ -117,7 +117,7 @@ def test_an_environment_that_does_not_repeat_itself_is_told(tmp_path: Path) -> N
     pytest.importorskip("imageio_ffmpeg")
     log = logged(tmp_path, env=Moody)
     with pytest.raises(EnvError, match="does not repeat itself"):
-        make_film(EnvSpec(Moody, engine="sync"), log.episodes, [0])
+        make_film(EnvSpec(Moody, engine="sync"), {0: episode_shot(log.episodes[0])})
 
 
 class Unseen(Walkway):

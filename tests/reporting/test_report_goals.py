@@ -46,7 +46,7 @@ def test_each_kind_of_goals_has_its_picture(tmp_path: Path) -> None:
     ]
     run = declared(skills, selector=chosen).train(tmp_path / "run", quiet=True)
     played = play_episodes(run.policy, run.declaration.spec, 30, 0, 0, True, 4)
-    found = {picture["name"]: picture for picture in played.goals}
+    found = {picture["name"]: picture for picture in played.section.context["goals"]}
     assert set(found) == {"two", "number", "one"}  # goals of a Dict have none
     for name, picture in found.items():
         rows = picture["spec"]["data"]["values"]
@@ -74,7 +74,7 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
     run = declared([two, number, Rest()], selector=selector).train(tmp_path / "run", quiet=True)
     played = play_episodes(run.policy, run.declaration.spec, 12, 0, 0, True, 4)
     seen = set()
-    for shown, episode in zip(played.shown, played.log.episodes, strict=True):
+    for shown, episode in zip(played.section.data["episodes"], played.log.episodes, strict=True):
         for words, call in zip(shown.get("goals", [""] * 99), episode.calls, strict=False):
             skill = played.log.labels[call.skill]
             goal = shown_goal(call.obs.clip(-1, 1)) if skill == "two" else "3"
@@ -113,7 +113,7 @@ def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
 
     run = declared([walks("two", SPACES["box"])], selector=selector).train(tmp_path / "run")
     played = play_episodes(run.policy, run.declaration.spec, 4, 0, 0, True, 2)
-    encoding = played.goals[0]["spec"]["encoding"]
+    encoding = played.section.context["goals"][0]["spec"]["encoding"]
     assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
 
 
@@ -156,4 +156,5 @@ def test_films_of_hand_overs_and_choices_name_goals(tmp_path: Path) -> None:
 def test_a_report_without_goals_has_none(tmp_path: Path) -> None:
     rule = np.vectorize(lambda x: "rest")
     run = declared([Rest()], selector=lambda obs: rule(obs[:, 0])).train(quiet=True)
-    assert play_episodes(run.policy, run.declaration.spec, 2, 0, 0, True, 2).goals == []
+    played = play_episodes(run.policy, run.declaration.spec, 2, 0, 0, True, 2)
+    assert played.section.context["goals"] == []

@@ -13,9 +13,10 @@ from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec, Run
 from skillweave.planning import CallLog
-from skillweave.reporting.report import hand_over
+from skillweave.reporting.report import film, hand_over
 from skillweave.reporting.report.film import HOLD
 from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.page import Section
 from skillweave.runs.directory import CALLS
 
 pytest.importorskip("imageio_ffmpeg")
@@ -42,7 +43,7 @@ def log(run: Run) -> CallLog:
     return run.log_calls(400, num_envs=4)
 
 
-def section(log: CallLog, spec: Any = None, filmed: bool = True) -> hand_over.Section:
+def section(log: CallLog, spec: Any = None, filmed: bool = True) -> Section:
     spec = EnvSpec(Ragged) if spec is None else spec
     return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
 
@@ -67,23 +68,25 @@ def test_the_matrix_and_the_ends(log: CallLog) -> None:
 
 
 def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> None:
-    reached: list[tuple[int, list[Any]]] = []
-    replay = hand_over._replay
+    reached: list[tuple[Any, Any]] = []
+    play = film._play
 
-    def watch(log: CallLog, env: Any, engine: Any, clip: Any, video: Any, every: int) -> None:
+    def watch(shot: Any, env: Any, engine: Any, video: Any, every: int, progress: Any) -> None:
         before = video.frames
-        replay(log, env, engine, clip, video, every)
-        assert video.frames - before == -(-(clip.lead + clip.steps) // every) + HOLD
-        reached.append((clip.row, env.unwrapped._seen().tolist()))
+        play(shot, env, engine, video, every, progress)
+        assert video.frames - before == -(-(len(shot.actions) - shot.first) // every) + HOLD
+        reached.append((shot, env.unwrapped._seen()))
 
-    monkeypatch.setattr(hand_over, "_replay", watch)
+    monkeypatch.setattr(film, "_play", watch)
     log = replace(log, succeeded=np.random.default_rng(0).random(len(log)) < 0.7)
     made = section(log)
     assert made.missing == []
-    assert made.film is not None
+    assert made.context["hand_film"] is not None
     assert len(reached) > 4
-    for row, seen in reached:
-        assert seen == log.end[row].tolist()
+    ends = {(int(log.seed[row]), int(log.age[row] + log.tau[row])): log.end[row].tolist()
+            for row in range(len(log))}  # fmt: skip
+    for shot, seen in reached:
+        assert seen.tolist() == ends[shot.seed, len(shot.actions)]
     cells = made.data["hand_over"]["cells"]
     assert {clip["done"] for cell in cells.values() for clip in cell["clips"]} == {True, False}
     for cell in cells.values():
@@ -99,7 +102,7 @@ def test_only_calls_whose_episodes_are_whole_are_played_again(log: CallLog) -> N
     assert (playable == (without_first.episode > 0)).all()
     unknown = replace(log, seed=np.full(len(log), -1))
     made = section(unknown)
-    assert (made.film, made.missing) == (None, [])
+    assert (made.context["hand_film"], made.missing) == (None, [])
     assert all(cell["clips"] == [] for cell in made.data["hand_over"]["cells"].values())
 
 
@@ -108,7 +111,7 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
 ) -> None:
     monkeypatch.setattr(Ragged, "mood", 1)
     made = section(log)
-    assert made.film is None
+    assert made.context["hand_film"] is None
     assert "it does not repeat itself" in made.missing[0]
     assert made.missing[0].startswith("There is no film of hand-overs: ")
 
@@ -116,7 +119,7 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
 def test_a_log_from_elsewhere_may_hold_anything(log: CallLog) -> None:
     made = section(replace(log, action=log.action + 7))
     assert "the log has the action" in made.missing[0]
-    assert made.film is None
+    assert made.context["hand_film"] is None
     other = gym.spaces.Discrete(3)
     assert (
         "the log has actions of Discrete(3)" in section(replace(log, action_space=other)).missing[0]

@@ -62,31 +62,28 @@ def episode_data(
 def _episode(
     episode: Episode, number: int, first: int | None, named: ObsNames | None
 ) -> dict[str, Any]:
+    calls = episode.calls[:MOST_CALLS_OF_ONE]
     sums = np.cumsum(episode.rewards, dtype=np.float64) if first is not None else ()
-    totals = [rounded(total) for total in sums]
-    calls = [
-        [
-            c.skill,
-            c.start,
-            c.steps,
-            c.why,
-            rounded(c.reward),
-            None if c.own is None else rounded(c.own),
-            c.succeeded,
-        ]
-        for c in episode.calls[:MOST_CALLS_OF_ONE]
-    ]
     entry: dict[str, Any] = {
         "number": number + 1,
         "seed": episode.seed,
         "return": rounded(episode.total),
+        "steps": len(episode.rewards),
+        "cut": episode.cut,
+        "frame": first,
+        "totals": [rounded(total) for total in sums],
+        "calls": [
+            [
+                *(c.skill, c.start, c.steps, c.why, rounded(c.reward)),
+                *(None if c.own is None else rounded(c.own), c.succeeded),
+            ]
+            for c in calls
+        ],
     }
-    entry |= {"steps": len(episode.rewards), "cut": episode.cut, "frame": first}
-    _, observed = seen(episode.calls[:MOST_CALLS_OF_ONE], named)
+    _, observed = seen(calls, named)
     entry |= {"seen": observed} if observed else {}
-    goals = [c.goal for c in episode.calls[:MOST_CALLS_OF_ONE]]
-    entry |= {"goals": goals} if any(goals) else {}
-    return entry | {"totals": totals, "calls": calls}
+    goals = [c.goal for c in calls]
+    return entry | ({"goals": goals} if any(goals) else {})
 
 
 def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
@@ -122,15 +119,13 @@ def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[st
     calls = [call for episode in log.episodes for call in episode.calls]
     every = -(-len(calls) // MOST_DECISIONS)
     calls = calls[::every]
-    columns = coordinates(np.stack([call.obs for call in calls]), named)
-    columns = dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
+    columns = varying(coordinates(np.stack([call.obs for call in calls]), named))
     if columns:
         columns["step of the episode"] = np.array([float(call.start) for call in calls])
-    table = [
+    rows = [
         [*(rounded(v[i]) for v in columns.values()), call.skill, call.succeeded]
-        for i, call in enumerate(calls)
+        for i, call in enumerate(calls if columns else ())
     ]
-    rows = table if columns else []
     goals = [call.goal for call in calls]
     return {"names": list(columns), "rows": rows, "goals": goals, "every": every}
 
@@ -154,6 +149,11 @@ def rounded(value: float) -> float:
     return float(f"{value:.5g}")
 
 
+def varying(columns: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the columns that vary, as many as fit on the page."""
+    return dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
+
+
 def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
     """Return the numbers of a batch of observations by name, (n,) each; none where they are images.
 
@@ -171,14 +171,10 @@ def coordinates(obs: Array, names: ObsNames | None = None) -> dict[str, Array]:
         if part.dtype.names is not None:
             continue  # a Dict in a Dict
         flat = np.asarray(part).reshape(len(part), -1)
-        if flat.shape[1] <= LARGEST_VECTOR:
-            alone = part.ndim == 1
-            for i in range(flat.shape[1]):
-                usual = name if alone else f"{name}[{i}]"
-                label = (
-                    part_names[i]
-                    if part_names is not None and len(part_names) == flat.shape[1]
-                    else usual
-                )
-                columns[usual if label in columns else label] = flat[:, i].astype(float)
+        count = flat.shape[1]
+        if count <= LARGEST_VECTOR:
+            usual = [name] if part.ndim == 1 else [f"{name}[{i}]" for i in range(count)]
+            fitting = part_names if part_names and len(part_names) == count else usual
+            for i, label in enumerate(fitting):
+                columns[usual[i] if label in columns else label] = flat[:, i].astype(float)
     return {k: v for k, v in columns.items() if np.isfinite(v).all()}

@@ -6,7 +6,7 @@ it (https://vega.github.io/vega-lite/docs/).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.reporting.lineage import Born, Lineage, changes_words, setting_title
@@ -14,6 +14,8 @@ from skillweave.reporting.palette import RGB, is_light
 
 Spec = dict[str, Any]
 STEPS = "environment steps"
+FAINT = "#8d8d97"
+"""The colour of members that did not lead to the winner."""
 
 
 def chart(description: str, height: int, **rest: Any) -> Spec:
@@ -40,38 +42,50 @@ def steps_axis(field: str = "x", title: str = STEPS) -> dict[str, Any]:
     return number_axis(field, title, axis=axis, scale={"zero": True, "nice": False})
 
 
-def hover(fields: Sequence[dict[str, Any]], color: dict[str, Any]) -> list[Spec]:
-    """Return layers that show the nearest point under the pointer, with a box of its values."""
-    near = {
-        "name": "near",
-        "select": {
-            "type": "point",
-            "on": "pointerover",
-            "nearest": True,
-            "encodings": ["x"],
-            "clear": "pointerout",
-        },
-    }
-    opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
-    mark = {"type": "point", "filled": True, "size": 60, "aria": False}
-    return [
-        {
-            "params": [near],
-            "mark": mark,
-            "encoding": {"opacity": opacity, "color": color, "tooltip": list(fields)},
-        }
-    ]
+def generation_axis() -> dict[str, Any]:
+    """Return the encoding of a population's generation."""
+    return number_axis("x", "generation", axis={"tickMinStep": 1, "format": "d"})
+
+
+def group_color(
+    field: str, names: Sequence[str], colors: Sequence[str], legend: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Return the encoding of a group by its colour; without a legend, the page has one."""
+    scale = {"domain": list(names), "range": list(colors)}
+    return {"field": field, "type": "nominal", "scale": scale, "legend": legend}
+
+
+def marks(kind: str, **look: Any) -> Spec:
+    """Return marks of a kind; screen readers have the page's tables in their place."""
+    return {"type": kind, "aria": False, **look}
+
+
+def layer(mark: Spec, rows: Sequence[Mapping[str, Any]] | None = None, **encoding: Any) -> Spec:
+    """Return marks with their encoding; ``rows`` where they are not the chart's."""
+    values = {} if rows is None else {"data": {"values": list(rows)}}
+    return values | {"mark": mark, "encoding": encoding}
+
+
+def tips(*fields: Sequence[str], **rest: Any) -> list[dict[str, Any]]:
+    """Return what is shown under the pointer: of each field its name, its title, its format."""
+    return [dict(zip(("field", "title", "format"), f, strict=False)) | rest for f in fields]
 
 
 def curve(label: str, color: str) -> Spec:
-    """Return a chart of one agent's metric; the page sets its values and its name."""
+    """Return a chart of one agent's metric; the page sets its values and its name.
+
+    It shows the nearest point under the pointer, with a box of its values.
+    """
     hue = {"value": color}
-    tooltip = [
-        {"field": "x", "type": "quantitative", "title": STEPS, "format": ",d"},
-        {"field": "y", "type": "quantitative", "title": "value", "format": ",.4~r"},
+    select = {"type": "point", "on": "pointerover", "nearest": True, "clear": "pointerout"}
+    near = {"name": "near", "select": select | {"encodings": ["x"]}}
+    opacity = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
+    tooltip = tips(("x", STEPS, ",d"), ("y", "value", ",.4~r"), type="quantitative")
+    point = marks("point", filled=True, size=60)
+    layers = [
+        layer(marks("line", strokeWidth=2, strokeJoin="round"), color=hue),
+        {"params": [near]} | layer(point, opacity=opacity, color=hue, tooltip=tooltip),
     ]
-    mark = {"type": "line", "strokeWidth": 2, "strokeJoin": "round", "aria": False}
-    layers = [{"mark": mark, "encoding": {"color": hue}}, *hover(tooltip, hue)]
     encoding = {"x": steps_axis(), "y": number_axis("y", "", axis={"tickCount": 5})}
     return chart(f"Learning curve of {label}", 190, encoding=encoding, layer=layers)
 
@@ -84,23 +98,18 @@ def choices(skills: Sequence[str], colors: Sequence[str], *, goals: bool = False
         colors: of each skill.
         goals: the values have goals, in words.
     """
-    scale = {"domain": list(skills), "range": list(colors)}
     shapes = ["circle", "square", "triangle-up", "diamond", "cross", "triangle-down"]
     shape = {"domain": list(skills), "range": [shapes[i % len(shapes)] for i in range(len(skills))]}
     legend = {"orient": "top", "title": None, "symbolOpacity": 1}
+    fields = [("what", "chosen"), *((axis, axis, ",.4~r") for axis in "xy")]
     encoding = {
         "x": number_axis("x", "", axis={"tickCount": 8}),
         "y": number_axis("y", ""),
-        "color": {"field": "what", "type": "nominal", "scale": scale, "legend": legend},
+        "color": group_color("what", skills, colors, legend),
         "shape": {"field": "what", "type": "nominal", "scale": shape},
-        "tooltip": [
-            {"field": "what", "title": "chosen"},
-            {"field": "x", "format": ",.4~r"},
-            {"field": "y", "format": ",.4~r"},
-            *([{"field": "goal"}] if goals else []),
-        ],
+        "tooltip": tips(*fields, *([("goal",)] if goals else [])),
     }
-    mark = {"type": "point", "filled": True, "size": 45, "opacity": 0.85, "aria": False}
+    mark = marks("point", filled=True, size=45, opacity=0.85)
     return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
 
@@ -132,9 +141,8 @@ def goal_map(name: str, rows: Sequence[dict[str, Any]], ranges: Sequence[Sequenc
     legend = {"format": ".0%", "title": "success", "gradientLength": 240, "tickCount": 3}
     hues = {"domain": [0, 1], "range": ["#d55e00", "#f0e442", "#009e73"]}
     encoding["color"] = {"field": "share", "type": "quantitative", "scale": hues, "legend": legend}
-    mark = {"type": "rect", "aria": False}
-    text = f"Success of {name} over its goals"
-    return chart(text, 340, data={"values": list(rows)}, mark=mark, encoding=encoding)
+    map_ = layer(marks("rect"), rows, **encoding)
+    return chart(f"Success of {name} over its goals", 340, **map_)
 
 
 def goal_bars(name: str, rows: Sequence[dict[str, Any]], ranges: Sequence[Sequence[float]]) -> Spec:
@@ -154,24 +162,18 @@ def goal_bars(name: str, rows: Sequence[dict[str, Any]], ranges: Sequence[Sequen
         x = number_axis("x", "goal", axis={"tickCount": 5}, scale=scale)
     shared = {"x": x, "tooltip": _of_goals()} | ({"x2": {"field": "x2"}} if parts else {})
     y = number_axis("share", "success", axis={"format": ".0%"}, scale={"domain": [0, 1]})
-    mark = {"type": "rect" if parts else "bar", "aria": False}
-    layer = [
-        {
-            "mark": mark | {"color": color, "opacity": opacity},
-            "encoding": {"y": top, "y2": {"datum": 0}},
-        }
-        for color, opacity, top in (("#888888", 0.2, y | {"field": "top"}), ("#009e73", 1.0, y))
+    layers = [
+        layer(marks("rect" if parts else "bar", color=hue, opacity=opacity), y=top, y2={"datum": 0})
+        for hue, opacity, top in (("#888888", 0.2, y | {"field": "top"}), ("#009e73", 1.0, y))
     ]
     values = [row | {"top": 1} for row in rows]
     text = f"Success of {name} by its goals"
-    return chart(text, 240, data={"values": values}, encoding=shared, layer=layer)
+    return chart(text, 240, data={"values": values}, encoding=shared, layer=layers)
 
 
 def _of_goals() -> list[dict[str, Any]]:
-    return [
-        {"field": "share", "type": "quantitative", "title": "success", "format": ".0%"},
-        {"field": "calls", "type": "quantitative", "title": "calls", "format": ",d"},
-    ]
+    fields = ("share", "success", ".0%"), ("calls", "calls", ",d")
+    return tips(*fields, type="quantitative")
 
 
 def family_tree(lineage: Lineage, color: str) -> Spec:
@@ -182,80 +184,57 @@ def family_tree(lineage: Lineage, color: str) -> Spec:
     for key, born in lineage.born.items():
         if born.fitness is None:
             continue
-        dot: dict[str, Any] = {
-            "x": born.generation + 1,
-            "y": round(born.fitness, 3),
-            "won": key in path,
-        }
-        what = "winner's line" if key in path else "other members"
-        dot |= {"member": born.member, "how": what_changed(born), "what": what}
-        dots.append(dot)
+        dot: dict[str, Any] = {"x": born.generation + 1, "y": round(born.fitness, 3)}
+        dot |= {"won": key in path, "what": "winner's line" if key in path else "other members"}
+        dots.append(dot | {"member": born.member, "how": what_changed(born)})
         parent = lineage.parent(born)
         if parent is not None and parent.fitness is not None:
-            ends: dict[str, Any] = {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)}
-            lines.append({k: dot[k] for k in ("x", "y", "won", "what")} | ends)
-    axis = {"tickMinStep": 1, "format": "d"}
-    x = number_axis("x", "generation", axis=axis)
-    y = number_axis("y", "fitness: mean return")
-    of = {"domain": ["winner's line", "other members"], "range": [color, "#8d8d97"]}
+            lines.append(dot | {"x2": parent.generation + 1, "y2": round(parent.fitness, 3)})
     legend = {"orient": "top", "title": None, "symbolType": "circle"}
-    hue = {"field": "what", "type": "nominal", "scale": of, "legend": legend}
-    tooltip = [
-        {"field": "member"},
-        {"field": "x", "title": "generation"},
-        {"field": "y", "title": "fitness", "format": ",.4~r"},
-        {"field": "how", "title": "changed"},
+    shared = {
+        "x": generation_axis(),
+        "y": number_axis("y", "fitness: mean return"),
+        "color": group_color("what", ("winner's line", "other members"), (color, FAINT), legend),
+    }
+    fields = ("member",), ("x", "generation"), ("y", "fitness", ",.4~r"), ("how", "changed")
+
+    def if_won(value: float, usual: float) -> Spec:
+        return {"condition": {"test": "datum.won", "value": value}, "value": usual}
+
+    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}, "strokeWidth": if_won(2.5, 1)}
+    dotted = {"size": if_won(70, 25), "tooltip": tips(*fields)}
+    layers = [
+        layer(marks("rule"), lines, **shared, **ends),
+        layer(marks("circle", opacity=1), dots, **shared, **dotted),
     ]
-    joined = {"x": x, "y": y, "x2": {"field": "x2"}, "y2": {"field": "y2"}, "color": hue}
-    thick = {"condition": {"test": "datum.won", "value": 2.5}, "value": 1}
-    big = {"condition": {"test": "datum.won", "value": 70}, "value": 25}
-    layer: list[Spec] = [
-        {
-            "data": {"values": lines},
-            "mark": {"type": "rule", "aria": False},
-            "encoding": joined | {"strokeWidth": thick},
-        },
-        {
-            "data": {"values": dots},
-            "mark": {"type": "circle", "opacity": 1, "aria": False},
-            "encoding": {"x": x, "y": y, "color": hue, "size": big, "tooltip": tooltip},
-        },
-    ]
-    return chart("Fitness by generation, and the line of the winner", 320, layer=layer)
+    return chart("Fitness by generation, and the line of the winner", 320, layer=layers)
 
 
 def setting_paths(lineage: Lineage, color: str) -> list[tuple[str, Spec]]:
     """Return a chart for each setting that differed: its values by generation."""
+    return [(name, _setting(name, lineage, color)) for name in lineage.varied]
+
+
+def _setting(name: str, lineage: Lineage, color: str) -> Spec:
     everyone = list(lineage.born.values())
-    path = lineage.path(lineage.winner)
-    return [(k, _setting(k, everyone, path, color)) for k in lineage.varied]
-
-
-def _setting(name: str, everyone: Sequence[Born], path: Sequence[Born], color: str) -> Spec:
     words = any(isinstance(b.settings[name], str) for b in everyone)
 
-    def value(born: Born) -> Any:
-        return born.settings[name] if words else born.number(name)
+    def rows(members: Sequence[Born]) -> list[dict[str, Any]]:
+        values = [b.settings[name] if words else b.number(name) for b in members]
+        return [{"x": b.generation + 1, "y": v} for b, v in zip(members, values, strict=True)]
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
     if not words:
-        values = [value(b) for b in everyone]
+        values = [b.number(name) for b in everyone]
         log = min(values) > 0 and max(values) > 5 * min(values)
         y = number_axis("y", "", scale={"type": "log"} if log else {}, axis={"tickCount": 4})
-    axis = {"tickMinStep": 1, "format": "d"}
-    encoding = {"x": number_axis("x", "generation", axis=axis), "y": y}
-    rows = [{"x": b.generation + 1, "y": value(b)} for b in everyone]
-    line = [{"x": b.generation + 1, "y": value(b)} for b in path]
-    faint = {"type": "circle", "size": 20, "color": "#8d8d97", "aria": False}
-    bold = {
-        "type": "line",
-        "point": {"size": 35, "color": color},
-        "strokeWidth": 2,
-        "color": color,
-        "aria": False,
-    }
-    layer = [{"data": {"values": rows}, "mark": faint}, {"data": {"values": line}, "mark": bold}]
-    return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layer)
+    bold = marks("line", point={"size": 35, "color": color}, strokeWidth=2, color=color)
+    layers = [
+        layer(marks("circle", size=20, color=FAINT), rows(everyone)),
+        layer(bold, rows(lineage.path(lineage.winner))),
+    ]
+    encoding = {"x": generation_axis(), "y": y}
+    return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layers)
 
 
 def what_changed(born: Born) -> str:
@@ -272,12 +251,6 @@ def ink_on(color: RGB) -> str:
     return "#000" if is_light(color) else "#fff"
 
 
-def _color(field: str, names: Sequence[str], colors: Sequence[str]) -> dict[str, Any]:
-    """Return the colours of groups by their letters; the page has the legend."""
-    scale = {"domain": list(names), "range": list(colors)}
-    return {"field": field, "type": "nominal", "scale": scale, "legend": None}
-
-
 def scores(
     names: Sequence[str], colors: Sequence[str], rows: dict[str, Any], binary: bool = False
 ) -> Spec:
@@ -287,69 +260,40 @@ def scores(
         binary: returns are 0 or 1, so that their mean is the share of episodes that are solved.
     """
     what, form = ("episodes solved", ".0%") if binary else ("mean return", ",.4~r")
-    y = {
-        "field": "group",
-        "type": "nominal",
-        "title": None,
-        "sort": list(names),
-        "axis": {"labelFontSize": 14, "labelFontWeight": "bold"},
-    }
-    color = _color("group", names, colors)
+    y: dict[str, Any] = {"field": "group", "type": "nominal", "title": None, "sort": list(names)}
+    y["axis"] = {"labelFontSize": 14, "labelFontWeight": "bold"}
+    of_group = {"y": y, "color": group_color("group", names, colors)}
     axis: dict[str, Any] = {"tickCount": 8} | ({"format": "%"} if binary else {})
     x = number_axis("x", f"{what} of a run", axis=axis)
-    tooltip = [
-        {"field": "group"},
-        {"field": "x", "title": "interquartile mean", "format": form},
-        {"field": "low", "title": "from", "format": form},
-        {"field": "high", "title": "to", "format": form},
-    ]
-    run = [
-        {"field": "group"},
-        {"field": "seed"},
-        {"field": "x", "title": what, "format": form},
-    ]
+    fields = ("x", "interquartile mean", form), ("low", "from", form), ("high", "to", form)
+    of_bar = of_group | {"tooltip": tips(("group",), *fields)}
+    of_run = tips(("group",), ("seed",), ("x", what, form))
     between = {"x": {"field": "low", "type": "quantitative"}, "x2": {"field": "high"}}
-    layer: list[Spec] = [
-        {
-            "data": {"values": rows["bars"]},
-            "transform": [{"filter": "isValid(datum.low)"}],
-            "mark": {"type": "rule", "strokeWidth": 5, "opacity": 0.5, "aria": False},
-            "encoding": {**between, "y": y, "color": color, "tooltip": tooltip},
-        },
-        {
-            "data": {"values": rows["dots"]},
-            "mark": {"type": "point", "size": 50, "strokeWidth": 1.5, "aria": False},
-            "encoding": {"x": x, "y": y, "color": color, "tooltip": run},
-        },
-        {
-            "data": {"values": rows["bars"]},
-            "mark": {"type": "tick", "thickness": 4, "size": 22, "aria": False},
-            "encoding": {"x": x, "y": y, "color": color, "tooltip": tooltip},
-        },
+    bars = rows["bars"]
+    valid = {"transform": [{"filter": "isValid(datum.low)"}]}
+    dot = marks("point", size=50, strokeWidth=1.5)
+    layers = [
+        valid | layer(marks("rule", strokeWidth=5, opacity=0.5), bars, **between, **of_bar),
+        layer(dot, rows["dots"], x=x, **of_group, tooltip=of_run),
+        layer(marks("tick", thickness=4, size=22), bars, x=x, **of_bar),
     ]
-    if not any("low" in bar for bar in rows["bars"]):
-        del layer[0]  # an axis over nothing is warned of
-    return chart("Scores by group", 50 + 40 * len(names), layer=layer)
+    if not any("low" in bar for bar in bars):
+        del layers[0]  # an axis over nothing is warned of
+    return chart("Scores by group", 50 + 40 * len(names), layer=layers)
 
 
 def group_curves(label: str, names: Sequence[str], colors: Sequence[str]) -> Spec:
     """Return a chart of an agent's metric, with a line and a band for each group."""
-    color = _color("what", names, colors)
-    tooltip = [
-        {"field": "what", "title": "group"},
-        {"field": "x", "title": STEPS, "format": ",d"},
-        {"field": "y", "title": "value", "format": ",.4~r"},
-        {"field": "lo", "title": "from", "format": ",.4~r"},
-        {"field": "hi", "title": "to", "format": ",.4~r"},
+    value = ",.4~r"
+    fields = ("y", "value", value), ("lo", "from", value), ("hi", "to", value)
+    tooltip = tips(("what", "group"), ("x", STEPS, ",d"), *fields)
+    encoding = {"x": steps_axis(), "color": group_color("what", names, colors)}
+    band = marks("area", opacity=0.2, tooltip=False)
+    dot = marks("point", opacity=0, size=80, filled=True)
+    y = number_axis("y", "")
+    layers = [
+        layer(band, y=number_axis("lo", ""), y2={"field": "hi"}),
+        layer(marks("line", strokeWidth=2), y=y),
+        layer(dot, y=y, tooltip=tooltip),
     ]
-    band = {"type": "area", "opacity": 0.2, "aria": False, "tooltip": False}
-    line = {"type": "line", "strokeWidth": 2, "aria": False}
-    dot = {"type": "point", "opacity": 0, "size": 80, "filled": True, "aria": False}
-    low_high = {"y": number_axis("lo", ""), "y2": {"field": "hi"}}
-    encoding = {"x": steps_axis(), "color": color}
-    layer: list[Spec] = [
-        {"mark": band, "encoding": low_high},
-        {"mark": line, "encoding": {"y": number_axis("y", "")}},
-        {"mark": dot, "encoding": {"y": number_axis("y", ""), "tooltip": tooltip}},
-    ]
-    return chart(f"Learning curves of {label}", 220, encoding=encoding, layer=layer)
+    return chart(f"Learning curves of {label}", 220, encoding=encoding, layer=layers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,30 @@ import numpy as np
 
 from skillweave.reporting.palette import color_of, hex_of
 from skillweave.reporting.report import charts, facts
+from skillweave.reporting.report.calls import rounded
 from skillweave.reporting.report.curves import Curves, metrics_of, read_curves
-from skillweave.reporting.report.groups import Group, differences, grouped
-from skillweave.reporting.report.numbers import NOTHING, number, percent, scale_of
+from skillweave.reporting.report.facts import (
+    NOTHING,
+    number,
+    percent,
+    scale_of,
+    transition_rows,
+    transitions,
+)
+from skillweave.reporting.report.groups import (
+    Group,
+    OverSeeds,
+    differences,
+    grouped,
+    on_one_grid,
+    over_seeds,
+)
 from skillweave.reporting.report.page import library, write_page
-from skillweave.reporting.report.seeds import OverSeeds, on_one_grid, over_seeds
-from skillweave.reporting.report.skills_table import transition_rows, transitions
-from skillweave.reporting.report.verdict import is_binary, solved
+from skillweave.reporting.report.verdict import is_binary, solved_share
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
-from skillweave.training.skill_report import levels_of
+from skillweave.training.skill_report import SkillReport, levels_of
 
 MOST_DIFFERENCES = 60
 
@@ -44,39 +57,39 @@ def write_comparison(runs: Sequence[RunDirectory], path: Path) -> dict[str, Any]
     library()
     groups = grouped(runs)
     saved = {run.path: load_evaluation(run) for run in runs}
+    scores = [[s.evaluation for run in g.runs if (s := saved[run.path])] for g in groups]
+    summaries = [over_seeds([e.mean for e in some]) if some else None for some in scores]
     curves_of = {run.path: read_curves(run) for run in runs}
+    all_curves = [c for curves in curves_of.values() for c in curves]
     colors = [hex_of(color_of(i)) for i in range(len(groups))]
     keys = [group.key for group in groups]
-    curves = _curves(groups, curves_of, colors)
-    everything = [c for curves in curves_of.values() for c in curves]
-    data = {"curves": curves, "metrics": metrics_of(everything), "charts": {}}
-    scores = [_scores(group, saved) for group in groups]
-    say = _sayer(saved)
+    say = _sayer([r for some in scores for e in some for r in e.returns])
+    binary = say is percent
+    data: dict[str, Any] = {"curves": _curves(groups, curves_of, colors), "charts": {}}
     if any(scores):
-        rows = _score_rows(groups, saved, scores)
-        binary = say is percent
+        rows = _score_rows(groups, saved, summaries)
         data["charts"] = {"scores-chart": charts.scores(keys, colors, rows, binary)}
     missing = _missing(runs, saved)
     differ = differences(groups)
     context = {
         "title": f"Comparison of {len(runs)} runs",
-        "groups": [_group_words(g, s, say) for g, s in zip(groups, scores, strict=True)],
-        "binary": say is percent,
+        "groups": [_group_words(g, s, say) for g, s in zip(groups, summaries, strict=True)],
+        "binary": binary,
         "legend": [(g.key, g.name, c) for g, c in zip(groups, colors, strict=True)],
         "has_scores": any(scores),
         "skills": [
-            (g.key, g.name, skill_rows, _followed(g, saved))
-            for g in groups
-            if (skill_rows := _skill_rows(g, saved))
+            (g.key, g.name, skill_rows, _followed([e.skills for e in some]))
+            for g, some in zip(groups, scores, strict=True)
+            if (skill_rows := _skill_rows([e.to_json()["skills"] for e in some]))
         ],
         "runs": [_run_row(g, run, saved[run.path], say) for g in groups for run in g.runs],
         "differences": differ[:MOST_DIFFERENCES],
         "more_differences": max(0, len(differ) - MOST_DIFFERENCES),
-        "curves": [c["label"] for c in curves],
-        "metrics": data["metrics"],
+        "curves": [c["label"] for c in data["curves"]],
+        "metrics": metrics_of(all_curves),
         "missing": missing,
     }
-    written = write_page(path, "compare.html", context, data, None)
+    written = write_page(path, "compare.html", context, data)
     return written | {"seconds": round(time.perf_counter() - began, 2), "missing": missing}
 
 
@@ -85,9 +98,8 @@ Say = Callable[[float | None], str]
 """Write a return for people."""
 
 
-def _sayer(saved: Saved) -> Say:
+def _sayer(returns: Sequence[float]) -> Say:
     """Return the writer of returns: as percent where all are 0 or 1, else to one scale."""
-    returns = [r for e in saved.values() if e is not None for r in e.evaluation.returns]
     if returns and is_binary(returns):
         return percent
     return functools.partial(number, scale=scale_of(returns))
@@ -117,43 +129,28 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
     return [f"{line}." for line in sentences]
 
 
-def _scores(group: Group, saved: Saved) -> list[float]:
-    """Return the mean returns of the group's runs that were evaluated."""
-    return [score.evaluation.mean for run in group.runs if (score := saved[run.path]) is not None]
-
-
-def _group_words(group: Group, scores: list[float], say: Say) -> dict[str, Any]:
+def _group_words(group: Group, summary: OverSeeds | None, say: Say) -> dict[str, Any]:
     seeds = ", ".join(str(run.manifest["seed"]) for run in group.runs)
-    words: dict[str, Any] = {
-        "key": group.key,
-        "name": group.name,
-        "seeds": seeds,
-        "count": len(group.runs),
-    }
-    if not scores:
+    words = {"key": group.key, "name": group.name, "seeds": seeds, "count": len(group.runs)}
+    if summary is None:
         return words | {"iqm": None}
-    summary = over_seeds(np.array(scores))
-    return words | {"iqm": say(float(summary.mean)), "interval": interval(summary, say)}
+    interval = summary.interval(say) or "one seed: no interval"
+    return words | {"iqm": say(float(summary.mean)), "interval": interval}
 
 
-def interval(summary: OverSeeds, say: Say = number) -> str:
-    """Return an interval in words."""
-    if summary.low is None or summary.high is None:
-        return "one seed: no interval"
-    return f"{say(float(summary.low))} to {say(float(summary.high))}"
-
-
-def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) -> dict[str, Any]:
+def _score_rows(
+    groups: list[Group], saved: Saved, summaries: list[OverSeeds | None]
+) -> dict[str, Any]:
     """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
-    dots = []
+    dots = [
+        {"group": group.key, "x": score.evaluation.mean, "seed": run.manifest["seed"]}
+        for group in groups
+        for run in group.runs
+        if (score := saved[run.path]) is not None
+    ]
     bars = []
-    for group, group_scores in zip(groups, scores, strict=True):
-        for run in group.runs:
-            if (score := saved[run.path]) is not None:
-                seed = run.manifest["seed"]
-                dots.append({"group": group.key, "x": score.evaluation.mean, "seed": seed})
-        if group_scores:
-            summary = over_seeds(np.array(group_scores))
+    for group, summary in zip(groups, summaries, strict=True):
+        if summary is not None:
             bar = {"group": group.key, "x": float(summary.mean)}
             if summary.low is not None and summary.high is not None:
                 bar |= {"low": float(summary.low), "high": float(summary.high)}
@@ -161,32 +158,32 @@ def _score_rows(groups: list[Group], saved: Saved, scores: list[list[float]]) ->
     return {"dots": dots, "bars": bars}
 
 
-def _skill_rows(group: Group, saved: Saved) -> list[dict[str, str]]:
+FIGURES: dict[str, tuple[str, Say]] = {
+    "share": ("share", percent),
+    "calls": ("calls", number),
+    "length": ("length_mean", number),
+    "success": ("success_rate", percent),
+    "return": ("return_mean", number),
+}
+"""Columns of the table of skills, with a field of their reports and how it is written."""
+
+
+def _skill_rows(reports: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return for each skill its figures over the group's seeds, as ``mean (low to high)``."""
-    reports = [
-        score.evaluation.to_json()["skills"] for run in group.runs if (score := saved[run.path])
-    ]
-    rows = []
-    for name in dict.fromkeys(k for skills in reports for k in skills):
-        seeds = [skills[name] for skills in reports if name in skills]
-        row = {
-            "name": name,
-            "share": _over_seeds([o["share"] for o in seeds], percent),
-            "calls": _over_seeds([o["calls"] for o in seeds], number),
-            "length": _over_seeds([o["length_mean"] for o in seeds], number),
-            "success": _over_seeds([o["success_rate"] for o in seeds], percent),
-            "return": _over_seeds([o["return_mean"] for o in seeds], number),
+    return [
+        {"name": name}
+        | {
+            column: _over_seeds([skills[name][key] for skills in reports if name in skills], say)
+            for column, (key, say) in FIGURES.items()
         }
-        rows.append(row)
-    return rows
+        for name in dict.fromkeys(k for skills in reports for k in skills)
+    ]
 
 
-def _followed(group: Group, saved: Saved) -> list[dict[str, Any]]:
+def _followed(evaluated: Sequence[Mapping[str, SkillReport]]) -> list[dict[str, Any]]:
     """Return transitions between skills, summed over the group's seeds; [] where one lacks them."""
-    evaluated = [score.evaluation.skills for run in group.runs if (score := saved[run.path])]
-    reports = [
-        levels_of(skills).get("", {}) for skills in evaluated
-    ]  # hierarchies below: one report
+    # Hierarchies below have one report here.
+    reports = [levels_of(skills).get("", {}) for skills in evaluated]
     counts = [transitions(skills) for skills in reports]
     known = [c for c in counts if c is not None]
     if not known or len(known) < len(counts):
@@ -201,10 +198,9 @@ def _over_seeds(values: Sequence[float | None], say: Say) -> str:
         return NOTHING
     if say is number:
         say = functools.partial(number, scale=scale_of(known))
-    summary = over_seeds(np.array(known))
-    if summary.low is None or summary.high is None:
-        return str(say(float(summary.mean)))
-    return f"{say(float(summary.mean))} ({say(float(summary.low))} to {say(float(summary.high))})"
+    summary = over_seeds(known)
+    interval = summary.interval(say)
+    return say(float(summary.mean)) + (f" ({interval})" if interval else "")
 
 
 def _run_row(
@@ -221,27 +217,17 @@ def _run_row(
         "seconds": f"{sum(s.get('seconds', 0.0) for s in stages):,.0f}",
         "mean": say(None if score is None else score["mean"]),
         "iqm": say(None if score is None else score["iqm"]),
-        "solved": percent(_solved(saved)),
+        "solved": percent(None if saved is None else solved_share(saved.evaluation)),
         "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
         "episodes": NOTHING if score is None else str(score["episodes"]),
     }
-
-
-def _solved(saved: SavedEvaluation | None) -> float | None:
-    """Return the share of episodes that are solved, or else at the environment's threshold."""
-    if saved is None:
-        return None
-    count = solved(saved.evaluation)
-    if count is None:
-        return saved.evaluation.solved_fraction
-    return count / len(saved.evaluation.returns)
 
 
 def _curves(
     groups: Sequence[Group], curves_of: dict[Path, list[Curves]], colors: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return a chart for each agent of any group, with a line and a band for each group."""
-    labels = list(dict.fromkeys(c.label for curves in curves_of.values() for c in curves))
+    labels = dict.fromkeys(c.label for curves in curves_of.values() for c in curves)
     keys = [group.key for group in groups]
     charts_ = []
     for label in labels:
@@ -266,6 +252,6 @@ def _line(name: str, curves: list[list[tuple[int, float]]]) -> list[list[Any]]:
     low = summary.mean if summary.low is None else summary.low
     high = summary.mean if summary.high is None else summary.high
     return [
-        [int(x), *(float(f"{v:.5g}") for v in values_at), name]
+        [int(x), *map(rounded, values_at), name]
         for x, *values_at in zip(grid, summary.mean, low, high, strict=True)
     ]

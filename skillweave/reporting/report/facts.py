@@ -1,15 +1,70 @@
-"""Facts of a run's files in words: its settings, its stages, and the unfinished ones."""
+"""The facts that reports, cards and comparisons show: of runs, stages, skills, pairs of skills.
+
+Numbers are as people read them: digits that fit the scale, percents.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.policies.core import flat
-from skillweave.reporting.report.numbers import number
 from skillweave.runs.command_words import command_words
 from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.skills import Skill
+from skillweave.training.skill_report import SkillReport, all_steps
+
+DIGITS = 3
+"""Significant digits."""
+MOST_DECIMALS = 4
+NOTHING = "–"
+
+
+def number(value: float | None, scale: float | None = None) -> str:
+    """Return a number with three significant digits.
+
+    Args:
+        scale: the scale of the numbers beside it, which get as many decimals; None: its own.
+    """
+    if value is None:
+        return NOTHING
+    size = abs(value) if scale is None else abs(scale)
+    if value and (size < 10**-MOST_DECIMALS or abs(value) >= 1e9):
+        return f"{value:.{DIGITS - 1}e}".replace("-", "−")
+    places = decimals(size)
+    text = f"{round(value, places) + 0.0:,.{places}f}"
+    if scale is None and "." in text:
+        text = text.rstrip("0").rstrip(".")
+    return text.replace("-", "−")
+
+
+def decimals(size: float) -> int:
+    """Return how many decimals a number of this size needs for three significant digits."""
+    if size <= 0:
+        return 0
+    return min(max(DIGITS - 1 - math.floor(math.log10(size)), 0), MOST_DECIMALS)
+
+
+def scale_of(values: Iterable[float | None]) -> float:
+    """Return the largest size among numbers beside each other."""
+    return max((abs(value) for value in values if value is not None), default=0.0)
+
+
+def percent(value: float | None) -> str:
+    """Return a share as 42 %; one that is not quite nothing or all does not look like it."""
+    if value is None:
+        return NOTHING
+    if 0 < value < 0.005:
+        return "<1 %"
+    if 0.995 <= value < 1:
+        return ">99 %"
+    return f"{100 * value:.0f} %"
+
+
+# Runs and stages
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
 MADE = {
@@ -168,3 +223,97 @@ def plain(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{k}={plain(v)}" for k, v in value.items())
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# Skills, and pairs of skills
+
+WHY = {
+    "own": "by itself",
+    "limit": "at a limit",
+    "interrupted": "cut by the selector",
+    "episode": "with the episode",
+}
+"""Ends of calls in the page's words."""
+
+
+def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
+    """Return a row for each skill."""
+    total = all_steps(reports)
+    longest = max(scale_of(report.length_mean for report in reports.values()), 10)
+    rows = []
+    for name, report in reports.items():
+        calls = report.calls
+        known = bool(report.ended and calls)
+        rows.append(
+            {
+                "name": name,
+                "share": report.steps / total if total else 0.0,
+                "percent": percent(report.steps / total if total else 0.0),
+                "calls": f"{calls:,}",
+                "length": number(report.length_mean, longest),
+                "ends": end_cells(report.ended, report.own_with_episode, calls if known else 0),
+                "success": percent(report.success_rate),
+                "return": number(report.return_mean),
+            }
+        )
+    return rows
+
+
+def end_cells(reasons: Mapping[str, int], own_with_episode: int, calls: int) -> list[str]:
+    """Return the shares of the ends of calls; 0 ``calls``: unknown."""
+    cells = [percent(reasons[why] / calls if calls else None) for why in WHY]
+    if own_with_episode:
+        cells[0] += f" ({percent(own_with_episode / calls)} in the last step)"
+    return cells
+
+
+def about(skill: Skill) -> str:
+    """Return the first paragraph of a skill's docstring; empty where it has none."""
+    for kind in type(skill).__mro__[: type(skill).__mro__.index(Skill)]:
+        if text := inspect.cleandoc(kind.__doc__ or ""):
+            return " ".join(text.split("\n\n")[0].split()).replace("``", "`")
+    return ""
+
+
+def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
+    """Return a row for each reflex: in how many of ``total`` steps it acted."""
+    return [
+        {
+            "name": name,
+            "steps": f"{steps:,}",
+            "share": steps / total,
+            "percent": percent(steps / total),
+        }
+        for name, steps in reflexes.items()
+    ]
+
+
+def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
+    """Return how often each skill followed another: (1 + S, S + 1); None: not known.
+
+    The first row is an episode's start, the last column its end.
+    """
+    names = list(reports)
+    if not names or not all(set(r.followed) == set(names) for r in reports.values()):
+        return None
+    rows = [[reports[name].first for name in names] + [0]]
+    for report in reports.values():
+        after = [report.followed[name] for name in names]
+        rows.append([*after, report.calls - sum(after)])
+    return rows
+
+
+def transition_rows(
+    labels: Sequence[str], counts: Sequence[Sequence[float]]
+) -> list[dict[str, Any]]:
+    """Return a row for each skill and for an episode's start: counts and shares of successors."""
+    rows = []
+    for name, row in zip(("start of an episode", *labels), counts, strict=True):
+        total = sum(row)
+        shares = [n / total if total else 0.0 for n in row]
+        cells = [
+            {"count": f"{n:,.0f}", "share": share, "percent": percent(share)}
+            for n, share in zip(row, shares, strict=True)
+        ]
+        rows.append({"name": name, "total": total, "cells": cells})
+    return rows

@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.paths import join
 from skillweave.planning import CallLog
 from skillweave.reporting.report import charts
-from skillweave.reporting.report.numbers import percent
+from skillweave.reporting.report.facts import percent
 from skillweave.skills import Skill
 from skillweave.types import Array
 

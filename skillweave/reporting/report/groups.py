@@ -1,16 +1,24 @@
-"""Groups of runs that differ by their seed alone, and the settings in which groups differ."""
+"""Groups of runs that differ by their seed alone, and the settings in which groups differ.
+
+Of the seeds' values interquartile means, and bootstrap intervals: Agarwal et al. 2021, "Deep
+reinforcement learning at the edge of the statistical precipice".
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skillweave.errors import DeclarationError
 from skillweave.reporting.report import facts
 from skillweave.runs.directory import RunDirectory
+from skillweave.training.evaluation import interquartile_means
+from skillweave.types import Array
 
 
 @dataclass
@@ -91,3 +99,53 @@ def _letter(number: int) -> str:
     """Return A to Z, then A2, B2 and so on."""
     turn, at = divmod(number, 26)
     return chr(ord("A") + at) + (str(turn + 1) if turn else "")
+
+
+# Values over seeds
+
+RESAMPLES = 2_000
+GRID = 100  # points of a curve
+
+
+@dataclass(frozen=True)
+class OverSeeds:
+    """Interquartile means over seeds, with 95 % bootstrap intervals; arrays (…)."""
+
+    mean: Array
+    low: Array | None
+    """None: one seed alone has no interval."""
+    high: Array | None
+
+    def interval(self, say: Callable[[float], str]) -> str:
+        """Return a single number's interval in words; empty: it has none."""
+        if self.low is None or self.high is None:
+            return ""
+        return f"{say(float(self.low))} to {say(float(self.high))}"
+
+
+def over_seeds(values: Array | Sequence[float]) -> OverSeeds:
+    """Compute interquartile means of values (seeds, …), and their intervals; always the same."""
+    x = np.asarray(values, float)
+    n = len(x)
+    if n < 2:
+        return OverSeeds(interquartile_means(x), None, None)
+    drawn = np.random.default_rng(0).integers(0, n, (n, RESAMPLES))
+    # A resample is a column, so the first axis remains the seeds.
+    means = interquartile_means(x[drawn])
+    low, high = np.percentile(means, (2.5, 97.5), axis=0)
+    return OverSeeds(interquartile_means(x), low, high)
+
+
+def on_one_grid(curves: Sequence[Sequence[tuple[int, float]]]) -> tuple[Array, Array] | None:
+    """Return curves of several seeds at the same steps: (G,) steps and (seeds, G) values.
+
+    Between points the values are interpolated; where a curve has not started or has ended, there is
+    nothing. None: they have no steps in common.
+    """
+    first = max(curve[0][0] for curve in curves)
+    last = min(curve[-1][0] for curve in curves)
+    if last < first:
+        return None
+    grid = np.unique(np.linspace(first, last, GRID).round())
+    table = [np.interp(grid, *np.array(curve, float).T) for curve in curves]
+    return grid, np.stack(table)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skillweave.envs.engine import GymnasiumEngine
+from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError, SkillweaveError
@@ -20,17 +18,14 @@ from skillweave.planning import CallLog, HandOver
 from skillweave.planning.hand_over import before_each
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
-    MOST_COORDINATES,
     coordinates,
     names_misfit,
     rounded,
+    varying,
 )
-from skillweave.reporting.report.film import HOLD, USUAL_FPS, Film
-from skillweave.reporting.report.numbers import number, percent, scale_of
-from skillweave.reporting.report.skills_table import WHY, end_cells
-from skillweave.reporting.screen import without_screen
-from skillweave.reporting.video import enlarged, frame_of
-from skillweave.reporting.video_file import VideoWriter
+from skillweave.reporting.report.facts import WHY, end_cells, number, percent, scale_of
+from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
+from skillweave.reporting.report.page import Section
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
@@ -50,18 +45,6 @@ LONGEST = 300
 """The most steps that a clip shows of the call."""
 MOST_POINTS = 2_000
 """The most calls in the chart, of all cells."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """The hand-over section of a page."""
-
-    context: dict[str, Any]
-    """What its words are made of."""
-    data: dict[str, Any]
-    """What its chart and film need, as plain JSON."""
-    film: Film | None
-    missing: list[str]
 
 
 @dataclass
@@ -134,7 +117,8 @@ def hand_over_section(
     }
     if film is not None:
         data["film"] = {"fps": film.fps}
-    return Section({"hand_over": _words(log, matrix, named)}, {"hand_over": data}, film, missing)
+    context = {"hand_over": _words(log, matrix, named), "hand_film": film}
+    return Section(context, {"hand_over": data}, missing)
 
 
 def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, Any]:
@@ -144,16 +128,19 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
         cells: list[dict[str, Any] | None] = []
         for j in range(len(matrix.skills)):
             calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-            share = done / calls if calls else 0.0
-            cell = {"id": f"{i}-{j}", "share": share, "percent": percent(share)}
-            cell |= {"count": f"{done:,} of {calls:,}"}
-            cell |= {"words": _interval(matrix, i, j), "weak": (i, j) in weak}
-            cells.append(cell if calls else None)
+            if not calls:
+                cells.append(None)
+                continue
+            cell = {"id": f"{i}-{j}", "share": done / calls, "percent": percent(done / calls)}
+            cell |= {"count": f"{done:,} of {calls:,}", "weak": (i, j) in weak}
+            cells.append(cell | {"words": _interval(matrix, i, j)})
         rows.append({"name": name if i else "start of an episode", "cells": cells})
+    # Names between backticks, and percents as the page writes them.
+    prose = [re.sub(r"'([^']+)'", r"`\1`", sentence) for sentence in matrix.weakest()]
     return {
         "columns": list(matrix.skills),
         "rows": rows,
-        "weakest": [_as_prose(sentence) for sentence in matrix.weakest()],
+        "weakest": [re.sub(r"(\d)%", r"\1 %", sentence) + "." for sentence in prose],
         "weak": bool(weak),
         "meaning": matrix.meaning,
         "calls": f"{len(log):,}",
@@ -164,23 +151,20 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
     }
 
 
-def _as_prose(sentence: str) -> str:
-    """Return a sentence with names between backticks, and percents as the page writes them."""
-    named = re.sub(r"'([^']+)'", r"`\1`", sentence)
-    return re.sub(r"(\d)%", r"\1 %", named) + "."
-
-
 def _interval(matrix: HandOver, i: int, j: int) -> str:
     low, high = (percent(float(bound[i, j])) for bound in matrix.interval)
     return f"{low} to {high}"
 
 
+def _called(log: CallLog) -> list[str]:
+    """Return the skills with calls."""
+    return [name for i, name in enumerate(log.skills) if (log.skill == i).any()]
+
+
 def _end_rows(log: CallLog) -> list[dict[str, Any]]:
     """Return a row for each skill: how its calls end."""
     rows = []
-    for name in log.skills:
-        if not (log.skill == log.number(name)).any():
-            continue
+    for name in _called(log):
         ends = log.call_ends(name)
         rows.append(
             {
@@ -196,8 +180,8 @@ def _end_rows(log: CallLog) -> list[dict[str, Any]]:
 
 def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
     """Return the middle 80 % of each coordinate where calls end, by skill."""
-    columns = _varying(coordinates(log.end, named))
-    skills = [name for i, name in enumerate(log.skills) if (log.skill == i).any()]
+    columns = varying(coordinates(log.end, named))
+    skills = _called(log)
     rows = []
     for name, values in columns.items():
         scale, cells = scale_of(np.quantile(values, (0.05, 0.95)).tolist()), []
@@ -211,16 +195,12 @@ def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
     return {"skills": skills, "rows": rows}
 
 
-def _varying(columns: Mapping[str, Array]) -> dict[str, Array]:
-    return dict([(k, v) for k, v in columns.items() if np.ptp(v) > 0][:MOST_COORDINATES])
-
-
 def _points(
     log: CallLog, cells: Mapping[tuple[int, int], _Cell], named: ObsNames | None
 ) -> dict[str, Any]:
     """Return names of coordinates, and rows of each cell: at start and end of a call, if done."""
     both = {when: coordinates(obs, named) for when, obs in (("start", log.start), ("end", log.end))}
-    names = list(_varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
+    names = list(varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
     if not names:
         return {"names": [], "points": {}}
     most = max(10, MOST_POINTS // max(1, len(cells)))
@@ -280,7 +260,6 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
 # The film
 
 
-@without_screen()
 @global_generators(Seeds(0) / "hand-over film")
 def _film(
     log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
@@ -294,22 +273,16 @@ def _film(
     clips = _choose_clips(log, cells, matrix)
     if not clips:
         return None
-    every = max(2, -(-sum(clip.lead + clip.steps for clip in clips) // MOST_FRAMES))
-    frames = sum((clip.lead + clip.steps) // every + HOLD + 1 for clip in clips)
-    env = spec.make(render_mode="rgb_array")
-    engine = GymnasiumEngine(lambda number: env, 1, spec.name)
-    fps = (env.metadata.get("render_fps") or USUAL_FPS) / 2
-    try:
-        log.check_spaces(engine.observation_space, engine.action_space)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "film.mp4"
-            with VideoWriter(path, fps, int(8 * MOST_BYTES * fps / frames)) as video:
-                for clip in clips:
-                    clip.frame = video.frames
-                    _replay(log, env, engine, clip, video, every)
-            return Film(path.read_bytes(), fps, every, {})
-    finally:
-        engine.close()
+    film = make_film(
+        spec,
+        {clip.row: _shot(log, clip) for clip in clips},
+        most_frames=MOST_FRAMES,
+        most_bytes=MOST_BYTES,
+        check_spaces=log.check_spaces,
+    )
+    for clip in clips:
+        clip.frame = film.first[clip.row]
+    return film
 
 
 def _choose_clips(
@@ -365,39 +338,24 @@ def _playable(log: CallLog) -> Array:
     return playable
 
 
-def _until(log: CallLog, row: int) -> Iterator[int]:
-    """Yield the calls of an episode up to ``row``, in their order."""
+def _shot(log: CallLog, clip: _Clip) -> Shot:
+    """Return the shot of a clip, with the observations of the log.
+
+    Raises:
+        EnvError: the log has an action that does not exist.
+    """
+    row, space = clip.row, log.action_space
     calls = np.flatnonzero((log.episode == log.episode[row]) & (log.order <= log.order[row]))
-    yield from calls[np.argsort(log.order[calls])].tolist()
+    calls = calls[np.argsort(log.order[calls])]
+    before = int(log.age[row])
+    steps = [np.arange(log.offset[call], log.offset[call + 1]) for call in calls]
+    actions = log.action[np.concatenate(steps)[: before + clip.steps]]
+    logged = np.concatenate([log.start[calls[:1]], log.next_obs[np.concatenate(steps)]])
+    for action in actions:
+        if not space.contains(env_form(space, action)):
+            raise EnvError(f"the log has the action {short(action)}, which does not exist")
 
+    def same(t: int, obs: Array, step: RawStep | None) -> bool:
+        return np.array_equal(obs, logged[t])
 
-def _replay(
-    log: CallLog, env: Any, engine: GymnasiumEngine, clip: _Clip, video: VideoWriter, every: int
-) -> None:
-    row = np.arange(1)
-    obs = engine.reset_some(row, [int(log.seed[clip.row])])
-    first = int(log.age[clip.row]) - clip.lead
-    t = 0
-    for call in _until(log, clip.row):
-        _check_same(obs[0], log.start[call], t)
-        for step in range(int(log.offset[call]), int(log.offset[call + 1])):
-            if t >= first + clip.lead + clip.steps:
-                break
-            if t >= first and (t - first) % every == 0:
-                video.add(enlarged(frame_of(env)))
-            action = np.asarray(log.action[step])
-            if not engine.action_space.contains(env_form(engine.action_space, action)):
-                raise EnvError(f"the log has the action {short(action)}, which does not exist")
-            obs = engine.step(action[None], row).next_obs
-            t += 1
-            _check_same(obs[0], log.next_obs[step], t)
-    for _ in range(HOLD):
-        video.add(enlarged(frame_of(env)))
-
-
-def _check_same(here: Array, logged: Array, t: int) -> None:
-    if not np.array_equal(here, logged):
-        raise EnvError(
-            f"from the same seed and with the same actions, the environment did another thing in "
-            f"step {t}: it does not repeat itself"
-        )
+    return Shot(int(log.seed[row]), actions, same, "the same seed", before - clip.lead)

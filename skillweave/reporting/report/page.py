@@ -6,32 +6,38 @@ import base64
 import functools
 import importlib
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from skillweave.errors import MissingExtra
-from skillweave.reporting.report.film import Film
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"
 
 
+@dataclass(frozen=True)
+class Section:
+    """A part of a page."""
+
+    context: dict[str, Any]
+    """What its words are made of, and its film."""
+    data: dict[str, Any]
+    """What its charts and film need, as plain JSON."""
+    missing: list[str]
+    """Sentences on what is not in it."""
+
+
 def write_page(
-    path: Path,
-    template: str,
-    context: dict[str, Any],
-    data: dict[str, Any],
-    film: Film | None,
-    hand_film: Film | None = None,
+    path: Path, template: str, context: dict[str, Any], data: dict[str, Any]
 ) -> dict[str, Any]:
     """Fill a template and write the page, whole or not at all.
 
     Args:
         template: a file in ``templates``.
-        context: what its words are made of.
+        context: what its words are made of; ``film``: of episodes, and ``hand_film``: of calls of
+            one skill after another, if there are any.
         data: what its charts and timelines are made of, as plain JSON without NaN.
-        film: of episodes.
-        hand_film: of calls of one skill after another.
 
     Returns:
         ``path`` and ``bytes``.
@@ -54,17 +60,16 @@ def write_page(
         "script": (LOCAL / "page.js").read_text("utf-8"),
         "library": library(),
         "data": data,
-        "film": _encoded(film),
-        "hand_film": _encoded(hand_film),
         "made": time.strftime("%Y-%m-%d %H:%M"),
     }
-    text = environment.get_template(template).render(parts | context).encode()
+    films = {
+        name: film and base64.b64encode(film.data).decode()
+        for name in ("film", "hand_film")
+        for film in [context.get(name)]
+    }
+    text = environment.get_template(template).render(parts | context | films).encode()
     write_bytes(path, text)
     return {"path": str(path), "bytes": len(text)}
-
-
-def _encoded(film: Film | None) -> str | None:
-    return None if film is None else base64.b64encode(film.data).decode()
 
 
 @functools.cache

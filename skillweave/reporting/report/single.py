@@ -13,7 +13,6 @@ from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
 from skillweave.paths import AGENT, join
-from skillweave.planning import CallLog
 from skillweave.planning.hand_over import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
@@ -25,6 +24,7 @@ from skillweave.reporting.report.calls import (
     decision_data,
     episode_data,
     names_misfit,
+    rounded,
     seen,
 )
 from skillweave.reporting.report.curves import (
@@ -34,19 +34,21 @@ from skillweave.reporting.report.curves import (
     read_curves,
     thinned,
 )
-from skillweave.reporting.report.film import Film, make_film
-from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.hand_over import Section, hand_over_section
-from skillweave.reporting.report.numbers import number, percent, scale_of
-from skillweave.reporting.report.page import library, write_page
-from skillweave.reporting.report.skills_table import (
+from skillweave.reporting.report.facts import (
     WHY,
     about,
+    number,
+    percent,
     reflex_rows,
+    scale_of,
     skill_rows,
     transition_rows,
     transitions,
 )
+from skillweave.reporting.report.film import Film, episode_shot, make_film
+from skillweave.reporting.report.goals import goal_pictures
+from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.page import Section, library, write_page
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
@@ -54,7 +56,7 @@ from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
-from skillweave.training.evaluation_file import load_evaluation
+from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.play import Played as PlayedStep
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.played_episodes import PlayedEpisodes
@@ -73,19 +75,9 @@ class Played:
 
     score: Evaluation
     log: PlayedEpisodes
-    film: Film | None
-    shown: list[dict[str, Any]]
-    """The episodes as plain JSON."""
-    missing: list[str]
-    """Sentences on what there is not."""
-    colors: list[RGB]
+    colors: dict[str, RGB]
     """Of each of the log's labels."""
-    docs: list[str]
-    """The docstrings of the log's skills."""
-    named: ObsNames | None
-    """Names of the numbers in an observation."""
-    goals: list[dict[str, Any]]
-    """The pictures of skills with goals."""
+    section: Section
     with_goals: dict[str, Skill]
     """The skills with goals, by path."""
 
@@ -113,40 +105,69 @@ def play_episodes(
             progress.watch(played)
 
         score = evaluate(policy, spec, watch=watch, **how)
-    log = PlayedEpisodes(calls, episode_seeds(seed, episodes))
+    seeds = episode_seeds(seed, episodes)
+    log = PlayedEpisodes(calls, seeds)
     film = None
     missing = []
     if filmed:
         try:
             chosen = chosen_episodes(log.episodes, filmed)
-            film = make_film(spec, log.episodes, chosen, quiet=quiet)
+            film = make_film(spec, {i: episode_shot(log.episodes[i]) for i in chosen}, quiet=quiet)
         except SkillweaveError as error:
             missing.append(f"There is no film: {_sentence(error)}")
-    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
-        missing.append(
-            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
-            "run was loaded without the code of its skills: --recipe FILE.py gives it."
-        )
-    skill_colors = [skill.color for skill in log.skills]
-    skill_colors += [None] * (len(log.labels) - len(skill_colors))
-    colors = [color_of(i, color) for i, color in enumerate(skill_colors)]
-    named = spec.observation_names()
-    if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
-        missing.append(misfit)
-    shown, left_out = episode_data(log, film, named)
-    docs = [about(skill) for skill in log.skills]
+    wanted = [skill.color for skill in log.skills] or [None] * len(log.labels)
+    colors = {k: color_of(i, wanted[i]) for i, k in enumerate(log.labels)}
     with_goals = {
         join(path, skill.name): skill
         for path, recorder in calls.recorders().items()
         for skill in recorder.skills.skills
         if skill.goal_space is not None
     }
-    goals: list[dict[str, Any]] = []
+    section = _section(log, film, spec.observation_names(), colors, missing)
     if with_goals:
-        logs = calls.logs(episode_seeds(seed, episodes))
-        goals = goal_pictures(logs, with_goals, "in the played episodes")
+        pictures = goal_pictures(calls.logs(seeds), with_goals, "in the played episodes")
+        section.context["goals"] += pictures
+    return Played(score, log, colors, section, with_goals)
+
+
+def _section(
+    log: PlayedEpisodes,
+    film: Film | None,
+    named: ObsNames | None,
+    colors: Mapping[str, RGB],
+    missing: list[str],
+) -> Section:
+    """Return the words and data of episodes; ``missing`` gets what is not in them."""
+    if any(isinstance(skill, RecordedSkill) for skill in log.skills):
+        missing.append(
+            "Of the calls, neither the skills' own rewards nor their successes are known, as the "
+            "run was loaded without the code of its skills: --recipe FILE.py gives it."
+        )
+    if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
+        missing.append(misfit)
+    shown, left_out = episode_data(log, film, named)
     missing += left_out
-    return Played(score, log, film, shown, missing, colors, docs, named, goals, with_goals)
+    legend = [(k, hex_of(color), charts.ink_on(color)) for k, color in colors.items()]
+    labels, hues, inks = (list(column) for column in zip(*legend, strict=True))
+    context = {
+        "legend": legend,
+        "episodes": len(log.episodes),
+        "filmed": 0 if film is None else len(film.first),
+        "film": film,
+        "has_skills": log.labels != (AGENT,),
+        "goals": [],
+    }
+    data: dict[str, Any] = {"labels": labels, "colors": hues, "inks": inks, "episodes": shown}
+    data["seen"], _ = seen(log.episodes[0].calls[:1], named)
+    if film is not None:
+        data["film"] = {"fps": film.fps, "every": film.every}
+    if context["has_skills"]:
+        decisions = decision_data(log, named)
+        used = sorted({row[-2] for row in decisions["rows"]})
+        goals = any(decisions["goals"])
+        spec = charts.choices([labels[i] for i in used], [hues[i] for i in used], goals=goals)
+        data["decisions"] = decisions | {"spec": spec}
+    return Section(context, data, missing)
 
 
 def write_report(
@@ -191,56 +212,44 @@ def write_report(
     reached = reached_steps(all_curves)
     missing = facts.missing_stages(run, reached)
     missing += [why_not] if why_not and run.finished else []
-    played = None
+    played, sections = None, []
     if policy is not None and spec is not None:
         try:
             played = play_episodes(
                 policy, spec, episodes, filmed, seed, deterministic, run.num_envs, quiet
             )
-            missing += played.missing
+            missing += played.section.missing
+            sections.append(played.section)
         except SkillweaveError as error:
             missing.append(f"There are no episodes and no film: {_sentence(error)}")
     if not all_curves and run.manifest["stages"]:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
-    log = _log(run, missing)
-    with_goals = {} if played is None else played.with_goals
-    section: Section | None = None
-    if log is not None:
-        section = hand_over_section(log, spec, colors, with_goals, filmed=filmed > 0)
-        missing += section.missing
-    data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
-    context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
-    context |= _lineages(run, data, colors)
-    context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
-    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False, "hand_over": None}
-    context["goals"] = []
-    hand_film = None
-    if section is not None:
-        context |= section.context
-        data |= section.data
-        hand_film = section.film
-    if played is not None:
-        context |= _skills(played)
-        data |= _episodes(played)
-        if log is not None:
-            context["goals"] += goal_pictures({"": log}, played.with_goals, "of the run’s log")
-    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(context["goals"])}
-    film = None if played is None else played.film
-    data |= {"why": WHY, "binary": context["binary"]}
-    page = write_page(path, "report.html", context, data, film, hand_film)
-    page |= {"seconds": round(time.perf_counter() - began, 2)}
-    return page | {"verdict": context["verdict"], "missing": missing}
-
-
-def _log(run: RunDirectory, missing: list[str]) -> CallLog | None:
-    """Return the run's log of calls, or None; add what is missing."""
     try:
         log = load_calls(run)
     except SkillweaveError as error:
+        log = None
         missing.append(f"There is no hand-over: {_sentence(error)}")
-        return None
-    return log if log is not None and len(log) else None
+    if log is not None and len(log):
+        with_goals = {} if played is None else played.with_goals
+        sections.append(hand_over_section(log, spec, colors, with_goals, filmed=filmed > 0))
+        missing += sections[-1].missing
+        if played is not None:
+            pictures = goal_pictures({"": log}, with_goals, "of the run’s log")
+            played.section.context["goals"] += pictures
+    data: dict[str, Any] = {"curves": _curves(all_curves, colors), "why": WHY}
+    context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
+    context |= _lineages(run, data, colors)
+    context |= {"curves": [c.label for c in all_curves], "metrics": metrics_of(all_curves)}
+    context |= {"episodes": 0, "has_skills": False, "hand_over": None, "goals": []}
+    for section in sections:
+        context |= section.context
+        data |= section.data
+    data["charts"] = {f"goals-{i}": picture["spec"] for i, picture in enumerate(context["goals"])}
+    data["binary"] = context["binary"]
+    page = write_page(path, "report.html", context, data)
+    page |= {"seconds": round(time.perf_counter() - began, 2)}
+    return page | {"verdict": context["verdict"], "missing": missing}
 
 
 def _sentence(error: SkillweaveError) -> str:
@@ -251,22 +260,21 @@ def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
     names = [skill["name"] for skill in run.manifest.get("skills", ())]
     colors = {name: color_of(i) for i, name in enumerate(names)}
-    if played is not None:
-        colors |= dict(zip(played.log.labels, played.colors, strict=True))
+    colors |= {} if played is None else played.colors
     for entry in run.manifest["stages"]:
         for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
             colors.setdefault(name, color_of(len(colors)))
     return {name: hex_of(color) for name, color in colors.items()}
 
 
-def curve_data(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
+def _curves(all_curves: Sequence[Curves], colors: Mapping[str, str]) -> list[dict[str, Any]]:
     """Return the curves with their charts, as plain JSON."""
     usual = hex_of(color_of(1))
     return [
         {
             "spec": charts.curve(c.label, colors.get(c.agent, usual)),
             "points": {
-                metric: [[x, float(f"{y:.5g}")] for x, y in thinned(points)]
+                metric: [[x, rounded(y)] for x, y in thinned(points)]
                 for metric, points in c.points.items()
             },
         }
@@ -295,26 +303,28 @@ def _scores(
     run: RunDirectory, played: Played | None, seed: int, deterministic: bool
 ) -> dict[str, Any]:
     """Return the score and the skills' table, of the saved evaluation or the report's episodes."""
+    source = "of the run's evaluation"
     saved = load_evaluation(run, deterministic=deterministic)
-    score = None if played is None else played.score
-    words = _how("played for this report", seed, deterministic)
-    if saved is not None and (score is None or len(saved.evaluation.returns) > len(score.returns)):
-        score = saved.evaluation
-        words = _how("of the run's evaluation", saved.seed, saved.deterministic)
-    if score is None:
+    if played is not None:
+        own = SavedEvaluation("", seed, deterministic, played.score)
+        if saved is None or len(saved.evaluation.returns) <= len(played.score.returns):
+            saved, source = own, "played for this report"
+    if saved is None:
+        nothing: dict[str, Any] = dict.fromkeys(("skill_table", "reflexes", "transitions"), ())
         text = no_verdict(run.manifest["stages"])
-        nothing: dict[str, Any] = {
-            "score": None,
-            "skill_table": [],
-            "reflexes": [],
-            "transitions": [],
-        }
-        return nothing | {"verdict": text, "binary": False}
-    docs = {} if played is None else dict(zip(played.log.labels, played.docs, strict=False))
+        return nothing | {"verdict": text, "binary": False, "score": None}
+    score = saved.evaluation
+    docs = (
+        {}
+        if played is None
+        else dict(zip(played.log.labels, map(about, played.log.skills), strict=False))
+    )
+    how = "greedy" if saved.deterministic else "sampled"
+    of = f"{len(score.returns)} episodes {source} ({how}, seed {saved.seed})"
     return {
         "verdict": verdict(score, deterministic),
         "binary": is_binary(score.returns),
-        "score": score_words(score) | {"of": f"{len(score.returns)} episodes {words}"},
+        "score": score_words(score) | {"of": of},
         "skill_table": [
             row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills)
         ],
@@ -352,10 +362,6 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     return words | {"solved": share, "solved_interval": f"{low} to {high}"}
 
 
-def _how(whose: str, seed: int, deterministic: bool) -> str:
-    return f"{whose} ({'greedy' if deterministic else 'sampled'}, seed {seed})"
-
-
 def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
     """Return a section for each stage whose population evolved."""
     sections = []
@@ -377,40 +383,3 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
         names = [(setting_title(k), short_value(lineage.winner.settings[k])) for k, _ in paths]
         sections.append({"stage": entry["name"], "line": line, "settings": names})
     return {"lineages": sections}
-
-
-def _skills(played: Played) -> dict[str, Any]:
-    """Return words and tables of the episodes that were played."""
-    log = played.log
-    named = zip(log.labels, played.colors, strict=True)
-    legend = [(k, hex_of(c), charts.ink_on(c)) for k, c in named]
-    return {
-        "legend": legend,
-        "episodes": len(log.episodes),
-        "filmed": 0 if played.film is None else len(played.film.first),
-        "has_skills": log.labels != (AGENT,),
-        "goals": list(played.goals),
-    }
-
-
-def _episodes(played: Played) -> dict[str, Any]:
-    """Return the data of the played episodes for the page's script."""
-    log = played.log
-    colors = [hex_of(c) for c in played.colors]
-    data: dict[str, Any] = {
-        "labels": list(log.labels),
-        "colors": colors,
-        "inks": [charts.ink_on(c) for c in played.colors],
-        "episodes": played.shown,
-    }
-    data["seen"], _ = seen(log.episodes[0].calls[:1], played.named)
-    if played.film is not None:
-        data["film"] = {"fps": played.film.fps, "every": played.film.every}
-    if log.labels != (AGENT,):
-        decisions = decision_data(log, played.named)
-        used = sorted({row[-2] for row in decisions["rows"]})
-        names = [log.labels[i] for i in used]
-        goals = any(decisions["goals"])
-        decisions["spec"] = charts.choices(names, [colors[i] for i in used], goals=goals)
-        data["decisions"] = decisions
-    return data

@@ -7,7 +7,7 @@ from typing import Any
 
 from skillweave.paths import level_of
 from skillweave.planning.hand_over import wilson
-from skillweave.reporting.report.numbers import number, percent, scale_of
+from skillweave.reporting.report.facts import number, percent, scale_of
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
 
@@ -34,6 +34,12 @@ def solved(score: Evaluation) -> int | None:
     return None
 
 
+def solved_share(score: Evaluation) -> float | None:
+    """Return the share of episodes that are solved, or else at the environment's threshold."""
+    count = solved(score)
+    return score.solved_fraction if count is None else count / len(score.returns)
+
+
 def is_binary(returns: Sequence[float]) -> bool:
     """Return whether every return is 0 or 1."""
     return set(returns) <= {0.0, 1.0}
@@ -41,7 +47,9 @@ def is_binary(returns: Sequence[float]) -> bool:
 
 def verdict(score: Evaluation, deterministic: bool) -> str:
     """Return one sentence with names between backticks."""
-    parts = [_outcome(score), *_skills(_leaves(score.skills), all_steps(score.skills))]
+    levels = {level_of(name) for name in score.skills}
+    leaves = {name: report for name, report in score.skills.items() if name not in levels}
+    parts = [_outcome(score), *_skills(leaves, all_steps(score.skills))]
     if score.cut:
         parts.append(f"{score.cut} {'episode' if score.cut == 1 else 'episodes'} never ended")
     text = "; ".join(parts) + "."
@@ -111,12 +119,6 @@ def _failing(name: str, report: SkillReport) -> str:
     if not report.succeeded:
         return f"`{name}` succeeds in none of its {report.calls:,} calls"
     return f"`{name}` succeeds in only {percent(report.success_rate)} of its {report.calls:,} calls"
-
-
-def _leaves(skills: Mapping[str, SkillReport]) -> dict[str, SkillReport]:
-    """Return the skills that act themselves, by path: without those that are hierarchies."""
-    above = {level_of(name) for name in skills}
-    return {name: report for name, report in skills.items() if name not in above}
 
 
 def _listed(names: Sequence[str]) -> str:
