@@ -21,9 +21,10 @@ from skillweave.collecting.user_code import (
 )
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
+from skillweave.experience import INFO
 from skillweave.planning.blame import Blame, blame
-from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
-from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
+from skillweave.planning.call_file import read_calls, write_calls
+from skillweave.planning.columns import GOAL, PER_CALL, PER_STEP, CallColumns
 from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
 from skillweave.policies.files import checksum
 from skillweave.skills.foreign_policy import source_of

@@ -209,10 +209,8 @@ def hand_over(
     count = len(log.skills)
     won = calls_done(log, done)
     before = before_each(log, won, only_after_done)
-    calls, did = np.zeros((count + 1, count), np.int64), np.zeros((count + 1, count), np.int64)
     rows = np.flatnonzero(before >= 0)
-    np.add.at(calls, (before[rows], log.skill[rows]), 1)
-    np.add.at(did, (before[rows], log.skill[rows]), won[rows])
+    calls, did = pair_counts(before[rows], log.skill[rows], won[rows], count)
     cut = np.bincount(log.skill[log.was_cut & ~won], minlength=count)
     by_itself = tuple(
         name
@@ -220,6 +218,20 @@ def hand_over(
         if not judged and name not in (done or {})
     )
     return HandOver(log.skills, calls, did, cut, by_itself)
+
+
+def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Array, Array]:
+    """Return how many calls follow each skill, and how many of these were done, (S + 1, S) each.
+
+    Args:
+        before: (C,) rows of the matrix.
+        skill: (C,) columns.
+        won: (C,) bool, the calls that were done.
+        count: S.
+    """
+    place, shape = before * count + skill, (count + 1, count)
+    calls, done = (np.bincount(x, minlength=np.prod(shape)) for x in (place, place[won]))
+    return calls.reshape(shape), done.reshape(shape)
 
 
 def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -29,9 +28,8 @@ class Played:
     memory: InPlaceMemory = field(default_factory=dict)
     """The policy's, of all environments, after the step."""
     acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
-    call_start: Array | None = None  # (k,) bool: a call of that skill starts
-    elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: unknown
-    why: Array | None = None  # (k,) int8, ``CallEnd`` of its call; None: unknown
+    call_start: Array = field(default_factory=lambda: np.zeros(0, bool))
+    """(k,) bool: a call of that skill starts."""
 
     @property
     def over(self) -> Array:
@@ -40,35 +38,9 @@ class Played:
         return over
 
 
-class Episodes(Protocol):
-    """Environments with the episodes to play in them."""
-
-    num_envs: int
-    rows: Array
-    """(k,) acting environments; empty: all episodes are over."""
-    obs: Array
-    """(N, *obs_shape), the next observations."""
-
-    def mask(self) -> Array | None:
-        """Return the actions allowed now, (k, A) bool, or None."""
-        ...
-
-    def step(self, action: Array) -> Played:
-        """Act in ``rows``."""
-        ...
-
-    def go_on(self, played: Played) -> Array:
-        """Start remaining episodes where others are over; return these environments (m,)."""
-        ...
-
-    def episode_of(self, rows: Array) -> Array:
-        """Return the numbers of the episodes in environments ``rows`` (k,)."""
-        ...
-
-
 def play(
     policy: Policy,
-    episodes: Episodes,
+    episodes: SeededEpisodes,
     *,
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
@@ -105,8 +77,6 @@ def play(
         played = episodes.step(action)
         acts.observe(memory, rows, played.step)
         played.memory, played.acting, played.call_start = shown, acting, before == 0
-        if acting is not None and "end" in memory:
-            played.elapsed, played.why = memory["elapsed"][rows], memory["end"][rows]
         yield played
         restarted = episodes.go_on(played)
         if len(restarted):
@@ -126,19 +96,21 @@ class SeededEpisodes:
     def __init__(self, engine: Engine, seeds: Sequence[int] | int, max_steps: int) -> None:
         self.engine = engine
         self.num_envs = engine.num_envs
+        self.rows = np.arange(self.num_envs)
+        """(k,) acting environments; empty: all episodes are over."""
         self._seeds = [] if isinstance(seeds, int) else seeds
         self._max_steps = max_steps
         self._episode = np.arange(self.num_envs)
         self._elapsed = np.zeros(self.num_envs, np.int64)
         if isinstance(seeds, int):
-            self.rows = np.arange(self.num_envs)
             self._upcoming = 0
             first = engine.reset(seeds)
         else:
-            self.rows = np.arange(min(self.num_envs, len(seeds)))
+            self.rows = self.rows[: len(seeds)]
             self._upcoming = len(self.rows)
             first = engine.reset_some(self.rows, list(seeds[: self._upcoming]))
         self.obs = np.array(first)
+        """(N, *obs_shape), the next observations."""
 
     def mask(self) -> Array | None:
         """Return the actions allowed now, (k, A) bool, or None."""
@@ -163,7 +135,7 @@ class SeededEpisodes:
         return number
 
     def go_on(self, played: Played) -> Array:
-        """Start the remaining episodes, in order, where others are over."""
+        """Start remaining episodes where others are over; return these environments (m,)."""
         ended = played.rows[played.over]
         first = self._upcoming
         left = len(self._seeds) - first
