@@ -6,7 +6,6 @@ Stands alone because it is a format of files, with its schema.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -18,7 +17,14 @@ from skillweave.collecting.user_code import Texts
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.experience import INFO
 from skillweave.messages import as_path
-from skillweave.planning.columns import GOAL, call_fields
+from skillweave.planning.columns import (
+    GOAL,
+    PER_CALL,
+    PER_STEP,
+    CallColumns,
+    call_fields,
+    columns_of,
+)
 from skillweave.policies.core import CallEnd
 from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
@@ -76,13 +82,8 @@ class CallsHeader(TypedDict):
     run: NotRequired[LoggedRun]
 
 
-def write_calls(
-    path: str | Path,
-    columns: Mapping[str, Array],
-    about: Mapping[str, Any],
-    run: LoggedRun | None = None,
-) -> None:
-    """Write the columns of a log, and the fields that are no arrays, into a file.
+def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None) -> None:
+    """Write a log into a file.
 
     Args:
         run: the run in whose directory the file is; None: in none.
@@ -92,15 +93,15 @@ def write_calls(
     """
     header = {
         "kind": KIND,
-        **{name: list(about[name]) for name in ("skills", "lengths", *PLAIN)},
-        "code": about["code"],
-        "sees": [None if places is None else list(places) for places in about["sees"]],
-        **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
-        "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
-        "goals": [name.removeprefix(GOAL) for name in columns if name.startswith(GOAL)],
+        **{name: list(getattr(log, name)) for name in ("skills", "lengths", *PLAIN)},
+        "code": log.code,
+        "sees": [None if places is None else list(places) for places in log.sees],
+        **{f"{what}_space": space_to_json(getattr(log, f"{what}_space")) for what in SPACES},
+        "info": list(log.info),
+        "goals": list(log.goals),
     }
     header |= {} if run is None else {"run": run}
-    tensors = {name: to_tensor(value) for name, value in columns.items()}
+    tensors = {name: to_tensor(value) for name, value in columns_of(log).items()}
     write_tensors(as_path(path, "save(): path"), tensors, header)
 
 
@@ -126,10 +127,10 @@ def _fields(
     tensors: dict[str, Tensor], header: dict[str, Any], spaces: dict[str, gym.Space[Any]]
 ) -> dict[str, Any]:
     """Return the checked fields; a ValueError says what is wrong."""
-    skills, lengths, info = (tuple(header[k]) for k in ("skills", "lengths", "info"))
+    skills, lengths = header["skills"], header["lengths"]
     if not skills or len(set(skills)) != len(skills) or not all(map(NAME.fullmatch, skills)):
         raise ValueError("its skills have no names, or two the same")
-    if list(lengths) != sorted(set(lengths)):
+    if lengths != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
     if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
@@ -143,20 +144,15 @@ def _fields(
     offset = columns["offset"]
     if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
         raise ValueError("'offset' is out of range")
-    own = {name: value for name, value in columns.items() if not name.startswith((INFO, GOAL))}
-    return (
-        own
-        | spaces
-        | {
-            "skills": skills,
-            "lengths": lengths,
-            **{name: tuple(header[name]) for name in PLAIN},
-            "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
-            "info": {key: columns[INFO + key] for key in info},
-            "goals": {name: columns[GOAL + name] for name in goals},
-            "code": header.get("code", {}),
-        }
-    )
+    return {
+        **{name: columns[name] for name in (*PER_CALL, *PER_STEP, "offset")},
+        **spaces,
+        **{name: tuple(header[name]) for name in ("skills", "lengths", *PLAIN)},
+        "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
+        "info": {key: columns[INFO + key] for key in header["info"]},
+        "goals": {name: columns[GOAL + name] for name in goals},
+        "code": header.get("code", {}),
+    }
 
 
 def _columns(

@@ -15,6 +15,7 @@ import numpy as np
 
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
+from skillweave.experience import INFO
 from skillweave.messages import close_matches, shortened
 from skillweave.policies.core import CallEnd
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
@@ -234,3 +235,10 @@ class CallColumns:
     def latest(self, steps: int) -> Self:
         """Return the last calls, as many as have at most ``steps`` steps in all."""
         return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
+
+
+def columns_of(log: CallColumns) -> Mapping[str, Array]:
+    """Return all arrays of a log by name."""
+    named = {name: getattr(log, name) for name in (*PER_CALL, "offset", *PER_STEP)}
+    named |= {INFO + key: value for key, value in log.info.items()}
+    return named | {GOAL + name: value for name, value in log.goals.items()}

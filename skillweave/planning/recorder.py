@@ -20,7 +20,7 @@ from skillweave.collecting.views import call_successes, info_numbers_of, judged
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
-from skillweave.experience import INFO, Batch, Trace
+from skillweave.experience import INFO, OF_STEP, Batch, Trace
 from skillweave.paths import join
 from skillweave.planning.calls import CallLog, seen_places, skill_checksums, skill_code
 from skillweave.planning.columns import GOAL, PER_CALL, PER_STEP, call_fields
@@ -195,7 +195,7 @@ class Recorder:
         self._latest[ids], self._open[ids] = calls[at[-1]], mine[-1] & ~over[-1]
         self._calls += len(calls) - k
         infos = trace.infos[-1:] if isinstance(trace, Trace) else ()
-        self._last = Trace(infos, {name: column[-1:] for name, column in trace.items()}), ids
+        self._last = Trace(infos, {name: x[-1:].copy() for name, x in trace.items()}), ids
         self._keep(part)
 
     def _episodes_of(self, begins: Array, starts: Array, ids: Array) -> tuple[Array, Array]:
@@ -295,7 +295,7 @@ class Recorder:
             number: (T, k) int64, of each step's call.
         """
         if not self._keeps_steps:
-            return {"call": number[:0].reshape(0)}
+            return {"call": np.zeros(0, np.int64)}
         columns = {"call": number}
         columns |= {name: trace[column] for name, column in STEPS.items()}
         for key in self.info:
@@ -305,7 +305,7 @@ class Recorder:
         flat = {k: x.reshape(-1, *x.shape[2:]) if every else x[mine] for k, x in columns.items()}
         flat["reward"] = flat["reward"].astype(np.float32)
         if not self._inside:
-            flat["next_obs"] = flat["next_obs"][:0]
+            flat["next_obs"] = flat["next_obs"][:0].copy()
         return flat
 
     def _judge(
@@ -404,7 +404,8 @@ class TraceFeed:
             self._rows = max(1, min(FED_ROWS, FED_BYTES // max(1, self._each * len(ids))))
             self._out = TraceWriter(self._rows, len(ids), keep_infos=self._infos)
         out, place, info = self._out, np.searchsorted(self._ids, ids), step.info
-        columns = {name: getattr(step, field) for name, field in FED.items()}
+        columns = {name: getattr(step, field) for name, field in OF_STEP.items()}
+        columns["elapsed"] = step.elapsed
         for path, calls in levels.items():
             for key, values in calls.items():
                 plain = key == "skill" or key.endswith("/goal")
@@ -446,18 +447,6 @@ def goals_in(skills: SkillSet) -> dict[int, tuple[str, Goals]]:
     return {i: (name, goals) for i, name, goals in every if goals is not None}
 
 
-FED = {
-    "obs": "obs",
-    "env_action": "action",
-    "next_obs": "next_obs",
-    "env_reward": "reward",
-    "env_terminated": "terminated",
-    "env_truncated": "truncated",
-    "elapsed": "elapsed",
-}
-"""By a column of a trace, the field of a ``Step``."""
-
-
 def levels_below(
     skills: SkillSet, path: str = "", above: Mapping[str, int] | None = None
 ) -> dict[str, tuple[SkillSet, dict[str, int]]]:
@@ -481,7 +470,11 @@ def check_size(steps: int, spaces: tuple[gym.Space[Any], gym.Space[Any]]) -> Non
     """Raise a DeclarationError where a log of ``steps`` steps would be too large."""
     each = sum(map(_bytes_of, spaces)) + 4  # and the reward
     if steps * each > MOST_BYTES:
-        _refuse(steps, each)
+        raise DeclarationError(
+            f"a log of {steps:,} steps would have {each * steps / 2**30:.1f} GiB ({each:,} bytes a "
+            f"step); at most {MOST_BYTES // 2**30} GiB are recorded: record at most "
+            f"{MOST_BYTES // each:,} steps"
+        )
 
 
 def _spread(info: Mapping[str, Any], place: Array, n: int) -> dict[str, Any]:
@@ -520,11 +513,3 @@ def is_endless(skills: SkillSet, i: int) -> bool:
 
 def _bytes_of(space: gym.Space[Any]) -> int:
     return int(np.prod(obs_shape(space))) * obs_dtype(space).itemsize
-
-
-def _refuse(steps: int, each: int) -> None:
-    raise DeclarationError(
-        f"a log of {steps:,} steps would have {each * steps / 2**30:.1f} GiB ({each:,} bytes a "
-        f"step); at most {MOST_BYTES // 2**30} GiB are recorded: record at most "
-        f"{MOST_BYTES // each:,} steps"
-    )

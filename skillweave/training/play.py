@@ -20,7 +20,7 @@ class Played:
     """One step in each environment that acts; arrays have a row for each of these."""
 
     rows: Array  # (k,) int64, the environments
-    episode: Array  # (k,) int64, the episode that each of them plays; −1: one that does not count
+    episode: Array  # (k,) int64, the episode that each of them plays
     step: Step  # ``elapsed`` counts the episode's environment steps
     reward: Array  # (k,) undiscounted; of a call the sum over its steps
     lasted: Array  # (k,) int64, environment steps that the action lasted
@@ -62,13 +62,13 @@ def play(
     def begin(rows: Array) -> None:
         """Let a skill that acts alone choose goals where episodes start."""
         if choose_goals is not None and len(rows):
-            numbers = episodes.episode_of(rows).tolist()
-            rngs = [np.random.default_rng([seed, 2, max(number, 0)]) for number in numbers]
+            rngs = [np.random.default_rng([seed, 2, n]) for n in episodes.episode[rows].tolist()]
             choose_goals(memory, rows, episodes.obs[rows], rngs)
 
     begin(episodes.rows)
     while len(rows := episodes.rows):
-        turn = Turn(world, episodes.mask(), greedy=deterministic)
+        mask = allowed_rows(episodes.engine.mask(), rows)
+        turn = Turn(world, mask, greedy=deterministic)
         action = acts.act(memory, rows, episodes.obs[rows], turn)
         if before_step is not None:
             before_step(memory)
@@ -100,7 +100,8 @@ class SeededEpisodes:
         """(k,) acting environments; empty: all episodes are over."""
         self._seeds = [] if isinstance(seeds, int) else seeds
         self._max_steps = max_steps
-        self._episode = np.arange(self.num_envs)
+        self.episode = np.arange(self.num_envs)
+        """(N,) the numbers of their episodes."""
         self._elapsed = np.zeros(self.num_envs, np.int64)
         if isinstance(seeds, int):
             self._upcoming = 0
@@ -111,10 +112,6 @@ class SeededEpisodes:
             first = engine.reset_some(self.rows, list(seeds[: self._upcoming]))
         self.obs = np.array(first)
         """(N, *obs_shape), the next observations."""
-
-    def mask(self) -> Array | None:
-        """Return the actions allowed now, (k, A) bool, or None."""
-        return allowed_rows(self.engine.mask(), self.rows)
 
     def step(self, action: Array) -> Played:
         """Act in ``rows``."""
@@ -127,12 +124,7 @@ class SeededEpisodes:
         step = raw.seen(obs, action, elapsed)
         cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
         one = np.ones(len(rows), np.int64)
-        return Played(rows, self._episode[rows], step, raw.reward, one, cut)
-
-    def episode_of(self, rows: Array) -> Array:
-        """Return the numbers of the episodes in environments ``rows`` (k,)."""
-        number: Array = self._episode[rows]
-        return number
+        return Played(rows, self.episode[rows], step, raw.reward, one, cut)
 
     def go_on(self, played: Played) -> Array:
         """Start remaining episodes where others are over; return these environments (m,)."""
@@ -145,6 +137,6 @@ class SeededEpisodes:
             self._upcoming = first + len(restarted)
             seeds = self._seeds[first : self._upcoming]
             self.obs[restarted] = self.engine.reset_some(restarted, seeds)
-            self._episode[restarted] = np.arange(first, self._upcoming)
+            self.episode[restarted] = np.arange(first, self._upcoming)
             self._elapsed[restarted] = 0
         return restarted

@@ -17,7 +17,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.skills import Skill, asked
+from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
 from skillweave.types import Memory, Policy
@@ -57,9 +57,6 @@ class PlayedCalls:
     ) -> None:
         acts: Any = policy
         skills, skill = skills_below(policy), getattr(policy, "skill", None)
-        first = int(isinstance(skill, Skill))  # a level that reflexes do not have
-        self.plain = skills is None
-        """The policy has no skills."""
         self.alone: Skill | None = None
         """The skill that acts alone; None: the whole policy acts."""
         self.prefix = ""
@@ -86,13 +83,10 @@ class PlayedCalls:
         self._how |= {"inside": inside, "steps": steps}
         self._feed: TraceFeed | None = None
         self._tau = np.zeros(0, np.int64)  # of the call of a skill that acts alone, (N,)
-        self._reflexes = {
-            path: {
-                reflex: join(*names_in(path)[first:], str(reflex.name)) for reflex in one.reflexes
-            }
-            for path, (one, _) in self._levels.items()
+        levels = self._levels.items()
+        self.reflexes = {
+            self._named_at(p, r): 0 for p, (level, _) in levels for r in level.reflexes
         }
-        self.reflexes = {name: 0 for named in self._reflexes.values() for name in named.values()}
         """Steps in which each reflex acted, by its path."""
 
     def add(self, played: Played) -> None:
@@ -106,10 +100,10 @@ class PlayedCalls:
             self.cut |= set(played.episode[played.cut].tolist())
         levels = {path: self._calls(path, played) for path in self._levels}
         self._count_reflexes(played, levels)
-        if self.alone is not None:
-            for path, calls in levels.items():
-                starts = levels[""]["elapsed"] == 1
-                calls["start"] = starts if not path else starts | (calls["elapsed"] == 1)
+        if self.alone is not None:  # calls below it that ran before count from there
+            starts = levels[""]["elapsed"] == 1
+            for calls in levels.values():
+                calls["start"] = starts | (calls["elapsed"] == 1)
         self._feed.add(played.rows, step, levels)
 
     def recorders(self) -> dict[str, Recorder]:
@@ -185,18 +179,22 @@ class PlayedCalls:
         calls = {"skill": np.where(tau >= 0, 0, -1), "elapsed": tau, "end": end}
         return calls if goal is None else calls | {f"{skill.name}/goal": goal}
 
+    def _named_at(self, path: str, reflex: Reflex) -> str:
+        """Return the path of a reflex: a skill that acts alone is no level of it."""
+        return join(*names_in(path)[self.alone is not None :], str(reflex.name))
+
     def _count_reflexes(self, played: Played, levels: dict[str, Memory]) -> None:
         """Count the reflexes that acted: where several hold, the last of the outermost level."""
         if not self.reflexes:
             return
         acted = np.zeros(len(played.rows), bool)
-        for path, (_, above) in self._levels.items():
+        for path, (skills, above) in self._levels.items():
             here = np.ones(len(acted), bool)
             for level, place in above.items():
                 if level or self.alone is None:
                     here &= levels[level]["skill"] == place
-            for reflex, name in reversed(self._reflexes[path].items()):
+            for reflex in reversed(skills.reflexes):
                 rows = np.flatnonzero(here)
                 holds = np.flatnonzero(reflex.holds(played.step.obs[rows]) & ~acted[rows])
-                self.reflexes[name] += len(holds)
+                self.reflexes[self._named_at(path, reflex)] += len(holds)
                 acted[rows[holds]] = True

@@ -72,7 +72,7 @@ class PlayedEpisodes:
         recorders = played.recorders()
         leaves = dict(_leaves(recorders))
         self.labels = tuple(leaves)
-        self.skills = () if played.plain else tuple(leaves.values())
+        self.skills = tuple(leaves.values()) if played.declared else ()
         log = recorders[""].log()
         episode = log.episode[log.owner]
         rows = np.lexsort((log.age[log.owner] + log.elapsed, episode))
