@@ -396,26 +396,21 @@ class TraceFeed:
             step: of these environments; ``elapsed`` counts the steps of the episode.
             levels: by path, what ``calls_in`` reads of each level's calls after the step.
         """
-        # Environments stop one after another; when half have stopped, a new trace begins.
-        if 2 * len(ids) < len(self._ids):
+        if len(ids) < len(self._ids):  # some have stopped
             self.flush()
         if self._out is None:
             self._ids = ids
             self._rows = max(1, min(FED_ROWS, FED_BYTES // max(1, self._each * len(ids))))
             self._out = TraceWriter(self._rows, len(ids), keep_infos=self._infos)
-        out, place, info = self._out, np.searchsorted(self._ids, ids), step.info
         columns = {name: getattr(step, field) for name, field in OF_STEP.items()}
         columns["elapsed"] = step.elapsed
         for path, calls in levels.items():
             for key, values in calls.items():
                 plain = key == "skill" or key.endswith("/goal")
                 columns[join(path, key if plain else f"call_{key}")] = values
-        if len(ids) < len(self._ids):
-            out.write(valid=np.zeros(len(self._ids), bool))
-            info = _spread(info, place, len(self._ids)) if self._infos else {}
-        out.write(place, valid=np.ones(len(ids), bool), **columns)
-        out.next(info)
-        if out.row == self._rows:
+        self._out.write(**columns)
+        self._out.next(step.info)
+        if self._out.row == self._rows:
             self.flush()
 
     def flush(self) -> None:
@@ -475,18 +470,6 @@ def check_size(steps: int, spaces: tuple[gym.Space[Any], gym.Space[Any]]) -> Non
             f"step); at most {MOST_BYTES // 2**30} GiB are recorded: record at most "
             f"{MOST_BYTES // each:,} steps"
         )
-
-
-def _spread(info: Mapping[str, Any], place: Array, n: int) -> dict[str, Any]:
-    """Return an ``info`` of environments ``place`` (k,) as one of n; the others have zeros."""
-    whole: dict[str, Any] = {}
-    for key, value in info.items():
-        if isinstance(value, np.ndarray) and value.shape[:1] == place.shape:
-            whole[key] = np.zeros((n, *value.shape[1:]), value.dtype)
-            whole[key][place] = value
-        else:
-            whole[key] = _spread(value, place, n) if isinstance(value, dict) else value
-    return whole
 
 
 def _numbered(starts: Array, latest: Array, count: int) -> Array:
