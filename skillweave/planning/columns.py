@@ -21,6 +21,8 @@ from skillweave.policies.core import CallEnd
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Step
 
+ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
+"""Names of the ends of calls."""
 GOAL = "goal."
 """Prefix of the fields with the goals of a skill's calls."""
 OF_CALL = (
@@ -162,7 +164,7 @@ class CallColumns:
     @property
     def reasons(self) -> dict[str, int]:
         """The number of calls by the reason of their end: own, limit, interrupted, episode."""
-        return {end.name.lower(): int((self.end_reason == end).sum()) for end in list(CallEnd)[1:]}
+        return {name: int((self.end_reason == end).sum()) for end, name in ENDS.items()}
 
     def flat(self, obs: Array) -> Array:
         """Return the numbers of observations (n, …) without images, (n, F)."""

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skillweave.paths import join
-from skillweave.planning.columns import GOAL
+from skillweave.planning.columns import ENDS, GOAL
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.skill_report import ENDS
 from skillweave.types import Array
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.paths import join, level_of
+from skillweave.planning.columns import ENDS
 from skillweave.planning.hand_over import HandOver, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
@@ -17,9 +18,6 @@ from skillweave.skills import is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.types import Array
-
-ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
-"""Names of the ends of calls in reports."""
 
 
 @dataclass(frozen=True)
