@@ -78,6 +78,15 @@ SCHEMA: dict[str, Column] = {
     "state_before": Column(raw=True, rollout=False),  # (T, N, M) float32, its recurrent state
 }
 """All columns, by name. A row is a step of an environment, or a decision with its whole call."""
+OF_STEP = {
+    "obs": "obs",
+    "env_action": "action",
+    "next_obs": "next_obs",
+    "env_reward": "reward",
+    "env_terminated": "terminated",
+    "env_truncated": "truncated",
+}
+"""By a column of a trace, the field of a ``Step``."""
 INFO = "info."
 """Prefix of the names of columns of ``info``: ``info.key``. They are recorded like raw columns."""
 

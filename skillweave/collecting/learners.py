@@ -27,7 +27,7 @@ from skillweave.collecting.views import (
 from skillweave.collecting.writer import TraceWriter
 from skillweave.envs.checks import LONGEST_EPISODE
 from skillweave.envs.engine import Engine
-from skillweave.experience import INFO, Batch, Trace
+from skillweave.experience import INFO, OF_STEP, Batch, Trace
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.policies.core import EPISODE, LIMIT, RUNNING, Policy, end_with_episode
 from skillweave.policies.hierarchy import ActiveGuide
@@ -38,19 +38,7 @@ from skillweave.skills.own_part import OwnPart
 from skillweave.spaces import action_codec
 from skillweave.types import Array
 
-CALLS = (
-    "obs",
-    "env_action",
-    "next_obs",
-    "env_reward",
-    "env_terminated",
-    "env_truncated",
-    "elapsed",
-    "skill",
-    "call_elapsed",
-    "call_end",
-    "call_limit",
-)
+CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_limit")
 """The columns of a trace from which calls are logged."""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from skillweave.collecting.judge import judge, seen_by
 from skillweave.errors import EnvError, SkillweaveError
-from skillweave.experience import INFO, Batch, Trace
+from skillweave.experience import INFO, OF_STEP, Batch, Trace
 from skillweave.messages import short
 from skillweave.policies.core import OWN, RUNNING
 from skillweave.skills import Skill
@@ -242,31 +242,20 @@ def _together(trace: Trace, steps: Array, acts: Array, elapsed: Array) -> Step:
     every = acts.all()
     flat = {
         name: x.reshape(-1, *x.shape[2:]) if every else x[acts]
-        for name, x in (*((name, trace[name]) for name in _STEP), ("elapsed", elapsed))
+        for name, x in (*((name, trace[name]) for name in OF_STEP), ("elapsed", elapsed))
     }
     infos = [trace.infos[t] for t in steps] if trace.infos else []
     return _made(flat, flat["elapsed"], JointInfo(infos, acts[steps]))
 
 
-_STEP = ("obs", "env_action", "next_obs", "env_reward", "env_terminated", "env_truncated")
-
-
 def _step(trace: Trace, t: int, elapsed: Array, info: Mapping[str, Any]) -> Step:
-    return _made({name: trace[name][t] for name in _STEP}, elapsed[t], info)
+    return _made({name: trace[name][t] for name in OF_STEP}, elapsed[t], info)
 
 
 def _made(columns: Mapping[str, Array], elapsed: Array, info: Mapping[str, Any]) -> Step:
-    return Step(
-        obs=columns["obs"],
-        action=columns["env_action"],
-        next_obs=columns["next_obs"],
-        reward=columns["env_reward"],
-        terminated=columns["env_terminated"],
-        truncated=columns["env_truncated"],
-        timed_out=np.zeros(len(elapsed), bool),
-        elapsed=elapsed,
-        info=info,
-    )
+    fields: dict[str, Any] = {field: columns[name] for name, field in OF_STEP.items()}
+    never = np.zeros(len(elapsed), bool)
+    return Step(**fields, timed_out=never, elapsed=elapsed, info=info)
 
 
 class JointInfo(Mapping[str, Any]):

@@ -8,10 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.errors import RunError
-from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
-from skillweave.planning.hand_over import START, before_each, calls_done, shown_rate, wilson
+from skillweave.planning.hand_over import (
+    START,
+    LinkedCalls,
+    before_each,
+    calls_done,
+    shown_rate,
+    wilson,
+)
 from skillweave.planning.neighbours import Standard, nearest
 from skillweave.types import Array
 
@@ -121,58 +128,6 @@ _ENDS = {
 }
 
 
-def blame(
-    log: CallColumns,
-    skill: str,
-    after: str,
-    done: Mapping[str, Any] | None = None,
-    *,
-    features: Any = None,
-) -> Blame:
-    """See ``CallLog.blame``."""
-    number = log.number(skill)
-    if after != START:
-        log.number(after)
-    won = calls_done(log, done)
-    counts = log.skill == number
-    before = before_each(log, won)
-    wanted = 0 if after == START else log.number(after) + 1
-    rows = np.flatnonzero(counts & (before == wanted))
-    if not len(rows):
-        raise RunError(
-            f"the log has no call of {skill!r} after a call of {after!r} that was done; record "
-            "more calls, chosen at random"
-        )
-    others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
-    elsewhere = float(won[others].mean()) if len(others) else float("nan")
-    reasons = log.take(rows[~won[rows]]).reasons
-    rate, nan = float(won[rows].mean()), float("nan")
-    unknown = Blame(
-        skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan), reasons,
-        False,
-    )  # fmt: skip
-    if after == START or len(rows) < LEAST:
-        return unknown
-    maps = feature_maps(log, features, log.start)
-    known = np.flatnonzero(counts & (~log.was_cut | won))
-    starts, of_first = log.flat(log.start), log.skill[log.owner] == log.number(after)
-    changes = (log.flat(log.before[of_first]) != log.flat(log.next_obs[of_first])).any(0)
-    # Where a number that the first skill does not change decides, none of its ends is better.
-    score = _predicted(maps[number](log.start), won, known, rows)
-    score = score - _predicted(Standard(starts[:, ~changes])(starts[:, ~changes]), won, known, rows)
-    best = np.zeros(len(rows), bool)
-    best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
-    good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
-    as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
-    low, high = (
-        wilson(won[rows[best]].sum(), best.sum())[0],
-        wilson(won[rows[~best]].sum(), (~best).sum())[1],
-    )
-    first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
-    place, means = _largest_difference(starts[rows], best, changes)
-    return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))
-
-
 def _third(calls: int) -> int:
     return max(1, round(calls * BEST))
 
@@ -204,3 +159,77 @@ def _largest_difference(
     size = np.abs(standard(one) - standard(other))
     place = int(np.where(changes, size, -1).argmax())
     return place, (float(one[place]), float(other[place]))
+
+
+class BlamedCalls(LinkedCalls):
+    """Calls of which the failing ones are explained."""
+
+    @checked_names
+    def blame(
+        self,
+        skill: str,
+        after: str,
+        done: Mapping[str, Any] | None = None,
+        *,
+        features: Any = None,
+    ) -> Blame:
+        """Return why a skill fails after another one: would other ends of the first one do?
+
+        Each call of the second skill after the first is predicted by the nearest other ones. If
+        the third of the first skill's ends with the best predictions serve about as well as other
+        starts do, and the other ends clearly worse, then the first skill is to blame for how it
+        ends; else the second has never learnt to start there.
+
+        Args:
+            skill: the second skill.
+            after: the first skill, or "start".
+            done: as for ``hand_over``.
+            features: as for ``Planner``; images need them.
+
+        Raises:
+            DeclarationError: the log has no skill of these names.
+            RunError: the log has no call of the second skill after the first one.
+        """
+        number = self.number(skill)
+        if after != START:
+            self.number(after)
+        won = calls_done(self, done)
+        counts = self.skill == number
+        before = before_each(self, won)
+        wanted = 0 if after == START else self.number(after) + 1
+        rows = np.flatnonzero(counts & (before == wanted))
+        if not len(rows):
+            raise RunError(
+                f"the log has no call of {skill!r} after a call of {after!r} that was done; record "
+                "more calls, chosen at random"
+            )
+        others = np.flatnonzero(counts & (before >= 0) & (before != wanted))
+        elsewhere = float(won[others].mean()) if len(others) else float("nan")
+        reasons = self.take(rows[~won[rows]]).reasons
+        rate, nan = float(won[rows].mean()), float("nan")
+        unknown = Blame(
+            skill, after, rate, elsewhere, len(rows), len(others), nan, nan, None, (nan, nan),
+            reasons, False,
+        )  # fmt: skip
+        if after == START or len(rows) < LEAST:
+            return unknown
+        maps = feature_maps(self, features, self.start)
+        known = np.flatnonzero(counts & (~self.was_cut | won))
+        starts, of_first = self.flat(self.start), self.skill[self.owner] == self.number(after)
+        changes = (self.flat(self.before[of_first]) != self.flat(self.next_obs[of_first])).any(0)
+        # Where a number that the first skill does not change decides, none of its ends is better.
+        score = _predicted(maps[number](self.start), won, known, rows)
+        score = score - _predicted(
+            Standard(starts[:, ~changes])(starts[:, ~changes]), won, known, rows
+        )
+        best = np.zeros(len(rows), bool)
+        best[np.argsort(-score, kind="stable")[: _third(len(rows))]] = True
+        good, bad = float(won[rows[best]].mean()), float(won[rows[~best]].mean())
+        as_elsewhere = rate if np.isnan(elsewhere) else elsewhere
+        low, high = (
+            wilson(won[rows[best]].sum(), best.sum())[0],
+            wilson(won[rows[~best]].sum(), (~best).sum())[1],
+        )
+        first = good >= as_elsewhere - LIKE_ELSEWHERE and good - bad >= WORSE and low > high
+        place, means = _largest_difference(starts[rows], best, changes)
+        return replace(unknown, best=good, others=bad, place=place, means=means, first=bool(first))

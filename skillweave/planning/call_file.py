@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
@@ -13,7 +12,16 @@ from torch import Tensor
 
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import RunError, SkillweaveError
+from skillweave.experience import INFO
 from skillweave.messages import as_path
+from skillweave.planning.columns import (
+    GOAL,
+    PER_CALL,
+    PER_STEP,
+    CallColumns,
+    call_fields,
+    columns_of,
+)
 from skillweave.policies.core import CallEnd
 from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
@@ -30,11 +38,18 @@ from skillweave.spaces import (
 from skillweave.types import LARGEST_REWARD, Array
 
 KIND = "calls"
-INFO = "info."
-GOAL = "goal."
 PLAIN = ("checksums", "recurrent", "own_success")
 """Entries of the header with a value for each skill."""
 SPACES = ("observation", "action")
+RANGES: dict[str, tuple[float, float]] = {
+    "end_reason": (1, max(CallEnd)),
+    "episode": (0, 2**62 - 1),
+    "seed": (-1, 2**31 - 1),
+    "order": (0, 2**31 - 1),
+    "age": (0, 2**31 - 1),
+    "reward": (-LARGEST_REWARD, LARGEST_REWARD),
+}
+"""The least and the largest number in a column."""
 
 
 class LoggedRun(TypedDict):
@@ -64,13 +79,8 @@ class CallsHeader(TypedDict):
     run: NotRequired[LoggedRun]
 
 
-def write_calls(
-    path: str | Path,
-    columns: Mapping[str, Array],
-    about: Mapping[str, Any],
-    run: LoggedRun | None = None,
-) -> None:
-    """Write the columns of a log, and the fields that are no arrays, into a file.
+def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None) -> None:
+    """Write a log into a file.
 
     Args:
         run: the run in whose directory the file is; None: in none.
@@ -80,15 +90,15 @@ def write_calls(
     """
     header = {
         "kind": KIND,
-        **{name: list(about[name]) for name in ("skills", "lengths", *PLAIN)},
-        "code": about["code"],
-        "sees": [None if places is None else list(places) for places in about["sees"]],
-        **{f"{what}_space": space_to_json(about[f"{what}_space"]) for what in SPACES},
-        "info": [name.removeprefix(INFO) for name in columns if name.startswith(INFO)],
-        "goals": [name.removeprefix(GOAL) for name in columns if name.startswith(GOAL)],
+        **{name: list(getattr(log, name)) for name in ("skills", "lengths", *PLAIN)},
+        "code": log.code,
+        "sees": [None if places is None else list(places) for places in log.sees],
+        **{f"{what}_space": space_to_json(getattr(log, f"{what}_space")) for what in SPACES},
+        "info": list(log.info),
+        "goals": list(log.goals),
     }
     header |= {} if run is None else {"run": run}
-    tensors = {name: to_tensor(value) for name, value in columns.items()}
+    tensors = {name: to_tensor(value) for name, value in columns_of(log).items()}
     write_tensors(as_path(path, "save(): path"), tensors, header)
 
 
@@ -114,10 +124,10 @@ def _fields(
     tensors: dict[str, Tensor], header: dict[str, Any], spaces: dict[str, gym.Space[Any]]
 ) -> dict[str, Any]:
     """Return the checked fields; a ValueError says what is wrong."""
-    skills, lengths, info = (tuple(header[k]) for k in ("skills", "lengths", "info"))
+    skills, lengths = header["skills"], header["lengths"]
     if not skills or len(set(skills)) != len(skills) or not all(map(NAME.fullmatch, skills)):
         raise ValueError("its skills have no names, or two the same")
-    if list(lengths) != sorted(set(lengths)):
+    if lengths != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
     if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
         raise ValueError("its header does not have an entry for each skill")
@@ -131,20 +141,15 @@ def _fields(
     offset = columns["offset"]
     if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
         raise ValueError("'offset' is out of range")
-    own = {name: value for name, value in columns.items() if not name.startswith((INFO, GOAL))}
-    return (
-        own
-        | spaces
-        | {
-            "skills": skills,
-            "lengths": lengths,
-            **{name: tuple(header[name]) for name in PLAIN},
-            "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
-            "info": {key: columns[INFO + key] for key in info},
-            "goals": {name: columns[GOAL + name] for name in goals},
-            "code": header.get("code", {}),
-        }
-    )
+    return {
+        **{name: columns[name] for name in (*PER_CALL, *PER_STEP, "offset")},
+        **spaces,
+        **{name: tuple(header[name]) for name in ("skills", "lengths", *PLAIN)},
+        "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
+        "info": {key: columns[INFO + key] for key in header["info"]},
+        "goals": {name: columns[GOAL + name] for name in goals},
+        "code": header.get("code", {}),
+    }
 
 
 def _columns(
@@ -154,38 +159,28 @@ def _columns(
     of = {name: tuple(x.shape) for name, x in tensors.items()}
     calls, steps = (math.prod(of.get(name, ())) for name in ("choice", "reward"))
     choices = len(header["skills"]) * max(1, len(header["lengths"]))
-    obs, acts = obs_dtype(spaces["observation_space"]), obs_dtype(spaces["action_space"])
-    seen, acted = (obs_shape(space) for space in spaces.values())
-    free = -np.inf, np.inf
-    table: dict[str, tuple[Any, tuple[int, ...], float, float]] = {
-        "choice": (np.int64, (calls,), 0, choices - 1),
-        "end_reason": (np.int8, (calls,), 1, max(CallEnd)),
-        "succeeded": (np.bool_, (calls,), *free),
-        "terminated": (np.bool_, (calls,), *free),
-        "truncated": (np.bool_, (calls,), *free),
-        "episode": (np.int64, (calls,), 0, 2**62 - 1),
-        "seed": (np.int64, (calls,), -1, 2**31 - 1),
-        "order": (np.int64, (calls,), 0, 2**31 - 1),
-        "age": (np.int64, (calls,), 0, 2**31 - 1),
-        "may_follow": (np.bool_, (calls, choices), *free),
-        "offset": (np.int64, (calls + 1,), 0, steps),
-        "reward": (np.float32, (steps,), -LARGEST_REWARD, LARGEST_REWARD),
-        "start": (obs, (calls, *seen), *free),
-        "next_obs": (obs, (steps, *seen), *free),
-        "action": (acts if acts.fields else None, (steps, *acted), *free),
+    observation, acts = spaces["observation_space"], obs_dtype(spaces["action_space"])
+    next_obs = obs_dtype(observation), (steps, *obs_shape(observation))
+    # Of a goal and a value of `info` the size is free, and the type of numbers that `info` holds.
+    sizes = {name: math.prod(of.get(GOAL + name, ())[-1:]) for name in header["goals"]}
+    row = np.dtype(call_fields(observation, choices, sizes))
+    fields = ((name, row[name]) for name in row.names or ())
+    table: dict[str, tuple[Any, tuple[int, ...]]] = {
+        **{name: (field.base, (calls, *field.shape)) for name, field in fields},
+        "offset": (np.int64, (calls + 1,)),
+        "reward": (np.float32, (steps,)),
+        "next_obs": next_obs,
+        "action": (acts if acts.fields else None, (steps, *obs_shape(spaces["action_space"]))),
+        **{INFO + key: (None, (steps, *of.get(INFO + key, ())[1:])) for key in header["info"]},
     }
-    # Of these the number of columns is free, and the type of numbers that `info` holds.
-    table |= {k: (None, (steps, *of.get(k, ())[1:]), *free) for k in _named(INFO, header["info"])}
-    table |= {
-        k: (np.float64, (calls, *of.get(k, ())[-1:]), *free) for k in _named(GOAL, header["goals"])
-    }
+    limits = RANGES | {"choice": (0, choices - 1), "offset": (0, steps)}
     if tensors.keys() != table.keys():
         raise ValueError(f"it has the columns {', '.join(sorted(tensors))}"[:300])
-    return {name: _column(name, tensors[name], *row) for name, row in table.items()}
-
-
-def _named(prefix: str, names: Iterable[str]) -> list[str]:
-    return [prefix + name for name in names]
+    free = -np.inf, np.inf
+    return {
+        name: _column(name, tensors[name], *one, *limits.get(name, free))
+        for name, one in table.items()
+    }
 
 
 def _column(

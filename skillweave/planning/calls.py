@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.collecting.user_code import (
     Texts,
@@ -21,21 +20,19 @@ from skillweave.collecting.user_code import (
 )
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.blame import Blame, blame
-from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
-from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
-from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
+from skillweave.planning.blame import BlamedCalls
+from skillweave.planning.call_file import read_calls, write_calls
+from skillweave.planning.columns import PER_CALL, PER_STEP
 from skillweave.policies.files import checksum
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
 from skillweave.spaces import obs_codec, same_space
-from skillweave.types import Array
 
 LEARNING = "learning"
 """In place of a checksum: the skill learnt while its calls were recorded."""
 
 
-class CallLog(CallColumns):
+class CallLog(BlamedCalls):
     """C calls of skills, in the order of their starts, and the T steps inside them.
 
     Attributes:
@@ -69,89 +66,6 @@ class CallLog(CallColumns):
             other skills they mean nothing.
         code: texts of the environment and the skills, to be compared later.
     """
-
-    @checked_names
-    def hand_over(
-        self, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
-    ) -> HandOver:
-        """Count how often each skill is done after each other one.
-
-        A row counts the calls that follow a call of its skill. Calls that the episode's time limit
-        cut before they were done are left out.
-
-        Args:
-            done: by skill, the event that its calls are for, in place of the skill's ``success``:
-                a predicate, a function of observations or of a ``Step``, or ``held(...)``; a call
-                is done if it happened within the call. A call of a skill with neither is done if it
-                ended by itself.
-            only_after_done: leave out calls that follow a call that was not done.
-
-        Raises:
-            DeclarationError: ``done`` names an unknown skill, or holds no event.
-        """
-        return hand_over(self, done, only_after_done=only_after_done)
-
-    @checked_names
-    def chain(
-        self, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
-    ) -> Chain:
-        """Estimate how often skills are done one after another, a call each, from episodes' starts.
-
-        The estimate follows logged calls: from where a call ended, the nearest calls of the next
-        skill count, by distance. So it knows that a skill ends elsewhere after another one, which
-        the product of rates does not.
-
-        Args:
-            *skills: names, in their order.
-            done: as for ``hand_over``.
-            features: as for ``Planner``.
-
-        Raises:
-            DeclarationError: no skill is named, or one that is unknown.
-            RunError: the log has no call of a skill, or none of the first at an episode's start.
-        """
-        return chain(self, *skills, done=done, features=features)
-
-    @checked_names
-    def blame(
-        self,
-        skill: str,
-        after: str,
-        done: Mapping[str, Any] | None = None,
-        *,
-        features: Any = None,
-    ) -> Blame:
-        """Return why a skill fails after another one: would other ends of the first one do?
-
-        Each call of the second skill after the first is predicted by the nearest other ones. If
-        the third of the first skill's ends with the best predictions serve about as well as other
-        starts do, and the other ends clearly worse, then the first skill is to blame for how it
-        ends; else the second has never learnt to start there.
-
-        Args:
-            skill: the second skill.
-            after: the first skill, or "start".
-            done: as for ``hand_over``.
-            features: as for ``Planner``; images need them.
-
-        Raises:
-            DeclarationError: the log has no skill of these names.
-            RunError: the log has no call of the second skill after the first one.
-        """
-        return blame(self, skill, after, done, features=features)
-
-    @checked_names
-    def call_ends(self, skill: str) -> CallEnds:
-        """Return where the calls of a skill end, and why.
-
-        Args:
-            skill: its name.
-
-        Raises:
-            DeclarationError: the log has no skill of this name.
-            RunError: the log has no call of it.
-        """
-        return call_ends(self, skill)
 
     def check_skills(self, skills: SkillSet, *, learning: bool = False) -> None:
         """Raise a RunError where the log is of other skills, spaces or limits of calls.
@@ -212,7 +126,7 @@ class CallLog(CallColumns):
         Raises:
             RunError: the file cannot be written.
         """
-        write_calls(path, columns_of(self), vars(self))
+        write_calls(path, self)
 
     @staticmethod
     def load(path: str | Path) -> CallLog:
@@ -338,13 +252,6 @@ def seen_places(skills: SkillSet) -> tuple[tuple[int, ...] | None, ...]:
             places = tuple(place for place in places if place < size)
         found.append(places or None)
     return tuple(found)
-
-
-def columns_of(log: CallLog) -> Mapping[str, Array]:
-    """Return all arrays of a log by name."""
-    named = {name: getattr(log, name) for name in (*PER_CALL, "offset", *PER_STEP)}
-    named |= {INFO + key: value for key, value in log.info.items()}
-    return named | {GOAL + name: value for name, value in log.goals.items()}
 
 
 def _shown_lengths(lengths: Sequence[int]) -> str:

@@ -5,6 +5,7 @@ Stands apart from ``CallLog``, so that what reads columns can be a method there.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -14,27 +15,48 @@ import numpy as np
 
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
+from skillweave.experience import INFO
 from skillweave.messages import close_matches, shortened
 from skillweave.policies.core import CallEnd
-from skillweave.spaces import obs_codec, to_tensor
+from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Step
 
-PER_CALL = (
-    "start",
-    "choice",
-    "end_reason",
-    "succeeded",
-    "terminated",
-    "truncated",
-    "episode",
-    "seed",
-    "order",
-    "age",
-    "may_follow",
+ENDS = {end: end.name.lower() for end in list(CallEnd)[1:]}
+"""Names of the ends of calls."""
+GOAL = "goal."
+"""Prefix of the fields with the goals of a skill's calls."""
+OF_CALL = (
+    ("choice", np.int64),
+    ("end_reason", np.int8),
+    ("succeeded", np.bool_),
+    ("terminated", np.bool_),
+    ("truncated", np.bool_),
+    ("episode", np.int64),
+    ("seed", np.int64),
+    ("order", np.int64),
+    ("age", np.int64),
 )
+"""Fields of a call with one value each."""
+PER_CALL = ("start", *(name for name, _ in OF_CALL), "may_follow")
 """Columns with a row for each call."""
 PER_STEP = ("next_obs", "action", "reward")
 """Columns with a row for each step."""
+
+
+def call_fields(
+    observation: gym.Space[Any], choices: int, goals: Mapping[str, int], *, whole: bool = True
+) -> list[tuple[Any, ...]]:
+    """Return the fields of a call, a row of a log.
+
+    Args:
+        observation: the environment's space.
+        choices: the number of choices.
+        goals: by skill that has goals, the numbers of one.
+        whole: with the observation of the decision, and the choices that may follow.
+    """
+    start = ("start", obs_dtype(observation), obs_shape(observation))
+    large = [start, ("may_follow", np.bool_, (choices,))] if whole else []
+    return [*OF_CALL, *large, *((GOAL + name, np.float64, (n,)) for name, n in goals.items())]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,7 +164,7 @@ class CallColumns:
     @property
     def reasons(self) -> dict[str, int]:
         """The number of calls by the reason of their end: own, limit, interrupted, episode."""
-        return {end.name.lower(): int((self.end_reason == end).sum()) for end in list(CallEnd)[1:]}
+        return {name: int((self.end_reason == end).sum()) for end, name in ENDS.items()}
 
     def flat(self, obs: Array) -> Array:
         """Return the numbers of observations (n, …) without images, (n, F)."""
@@ -215,3 +237,10 @@ class CallColumns:
     def latest(self, steps: int) -> Self:
         """Return the last calls, as many as have at most ``steps`` steps in all."""
         return self.take(np.flatnonzero(self.steps - self.offset[:-1] <= steps))
+
+
+def columns_of(log: CallColumns) -> Mapping[str, Array]:
+    """Return all arrays of a log by name."""
+    named = {name: getattr(log, name) for name in (*PER_CALL, "offset", *PER_STEP)}
+    named |= {INFO + key: value for key, value in log.info.items()}
+    return named | {GOAL + name: value for name, value in log.goals.items()}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short
 from skillweave.notebooks import table
@@ -89,43 +90,39 @@ class HandOver:
         Args:
             least: the fewest calls that count.
         """
-        never = self._never(least)
+        never, (calls, done) = self._never(least), self._elsewhere
         sentences = [
-            f"{skill!r} succeeds in {shown_rate(0, calls)}, whatever came before"
-            for skill, calls in zip(self.skills, self.calls.sum(0), strict=True)
-            if skill in never
+            f"{skill!r} succeeds in {shown_rate(0, count)}, whatever came before"
+            for skill, count, none in zip(self.skills, self.calls.sum(0), never, strict=True)
+            if none
         ]
         for i, j in self.weak(least):
-            skill, others = self.skills[j], np.delete(np.arange(len(self.before)), i)
-            if skill in never:
+            if never[j]:
                 continue
-            elsewhere = shown_rate(self.done[others, j].sum(), self.calls[others, j].sum())
+            skill, elsewhere = self.skills[j], shown_rate(done[i, j], calls[i, j])
             where = "at the start of an episode" if i == 0 else f"after {self.before[i]!r}"
             does = "ends by itself" if skill in self.by_itself else "succeeds"
             here = shown_rate(self.done[i, j], self.calls[i, j])
             sentences.append(f"{skill!r} {does} in {here} {where}; in {elsewhere} elsewhere")
         return sentences
 
-    def _never(self, least: int) -> set[str]:
-        """Return the skills with a success that they never reach."""
-        columns = np.flatnonzero((self.calls.sum(0) >= least) & ~self.done.any(0))
-        return {self.skills[j] for j in columns} - set(self.by_itself)
+    @property
+    def _elsewhere(self) -> tuple[Array, Array]:
+        """Calls of each skill in the other rows, and of these that were done, (S + 1, S) each."""
+        return self.calls.sum(0) - self.calls, self.done.sum(0) - self.done
+
+    def _never(self, least: int) -> Array:
+        """Return the skills with a success that they never reach, (S,) bool."""
+        never: Array = (self.calls.sum(0) >= least) & ~self.done.any(0)
+        return never & ~np.isin(self.skills, self.by_itself)
 
     def weak(self, least: int = 20) -> list[tuple[int, int]]:
         """Return the places (row, column) that ``weakest`` is about."""
-        places, never = [], self._never(least)
-        high = self.interval[1]
-        for j, skill in enumerate(self.skills):
-            for i in range(len(self.before)):
-                if skill in never and self.calls[i, j]:
-                    places.append((i, j))
-                others = np.delete(np.arange(len(self.before)), i)
-                calls, done = self.calls[others, j].sum(), self.done[others, j].sum()
-                if self.calls[i, j] < least or calls < least:
-                    continue
-                if high[i, j] < wilson(done, calls)[0]:
-                    places.append((i, j))
-        return places
+        calls, done = self._elsewhere
+        weak = (self.calls >= least) & (calls >= least)
+        weak &= self.interval[1] < wilson(done, calls)[0]
+        weak |= self._never(least) & (self.calls > 0)
+        return [(i, j) for j, i in np.argwhere(weak.T).tolist()]
 
     @property
     def meaning(self) -> str:
@@ -202,24 +199,18 @@ class Chain:
         return f"{text}{self.product:.0%} as the product {factors}"
 
 
-def hand_over(
-    log: CallColumns, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
-) -> HandOver:
-    """See ``CallLog.hand_over``."""
-    count = len(log.skills)
-    won = calls_done(log, done)
-    before = before_each(log, won, only_after_done)
-    calls, did = np.zeros((count + 1, count), np.int64), np.zeros((count + 1, count), np.int64)
-    rows = np.flatnonzero(before >= 0)
-    np.add.at(calls, (before[rows], log.skill[rows]), 1)
-    np.add.at(did, (before[rows], log.skill[rows]), won[rows])
-    cut = np.bincount(log.skill[log.was_cut & ~won], minlength=count)
-    by_itself = tuple(
-        name
-        for name, judged in zip(log.skills, log.own_success, strict=True)
-        if not judged and name not in (done or {})
-    )
-    return HandOver(log.skills, calls, did, cut, by_itself)
+def pair_counts(before: Array, skill: Array, won: Array, count: int) -> tuple[Array, Array]:
+    """Return how many calls follow each skill, and how many of these were done, (S + 1, S) each.
+
+    Args:
+        before: (C,) rows of the matrix.
+        skill: (C,) columns.
+        won: (C,) bool, the calls that were done.
+        count: S.
+    """
+    place, shape = before * count + skill, (count + 1, count)
+    calls, done = (np.bincount(x, minlength=np.prod(shape)) for x in (place, place[won]))
+    return calls.reshape(shape), done.reshape(shape)
 
 
 def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> Array:
@@ -236,53 +227,6 @@ def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> A
     before[log.order == 0] = 0
     before[log.was_cut & ~won] = -1
     return before
-
-
-def chain(
-    log: CallColumns, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
-) -> Chain:
-    """See ``CallLog.chain``."""
-    if not skills:
-        raise DeclarationError("chain() needs the names of skills: chain('left', 'right')")
-    numbers = [log.number(name) for name in skills]
-    won = calls_done(log, done)
-    counts = ~log.was_cut | won
-    rows = [np.flatnonzero(counts & (log.skill == number)) for number in numbers]
-    rows[0] = rows[0][log.order[rows[0]] == 0]
-    for name, some in zip(skills, rows, strict=True):
-        if not len(some):
-            where = " at the start of an episode" if some is rows[0] else ""
-            raise RunError(
-                f"the log has no complete call of {name!r}{where}; record more calls, chosen at "
-                "random"
-            )
-    maps = feature_maps(log, features, np.concatenate([log.start, log.end]))
-    # From the last skill back: the chance that the rest of the chain is done after each call.
-    chance = won[rows[-1]].astype(np.float64)
-    for i in reversed(range(len(skills) - 1)):
-        here = maps[numbers[i + 1]]
-        starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
-        near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
-        follows = (weights_of(distance) * chance[near]).sum(1)
-        may = log.may_follow[rows[i]].reshape(len(rows[i]), len(log.skills), -1)
-        goes_on = won[rows[i]] & ~log.terminated[rows[i]]
-        follows_on = goes_on & may[:, numbers[i + 1]].any(1)
-        if goes_on.any() and not follows_on.any():
-            raise RunError(
-                f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was done "
-                "(its initiation() is False there), so this chain cannot be run"
-            )
-        chance = np.where(follows_on, follows, 0.0)
-    matrix = hand_over(log, done)
-    pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
-    rates = tuple(rate for rate, _ in pairs)
-    return Chain(
-        tuple(skills),
-        float(chance.mean()),
-        float(np.prod(rates)),
-        rates,
-        tuple(count for _, count in pairs),
-    )
 
 
 @dataclass(frozen=True)
@@ -311,22 +255,6 @@ class CallEnds:
             f"{self.skill}: {self.calls:,} calls of {self.steps:.1f} steps, of which "
             f"{self.succeeded:.0%} succeeded; ends: {ends}"
         )
-
-
-def call_ends(log: CallColumns, skill: str) -> CallEnds:
-    """See ``CallLog.call_ends``."""
-    some = log.of(skill)
-    if not len(some):
-        raise RunError(f"the log has no call of {skill!r}; record some")
-    return CallEnds(
-        skill,
-        len(some),
-        some.reasons,
-        int(((some.end_reason == CallEnd.OWN) & (some.terminated | some.truncated)).sum()),
-        float(some.tau.mean()),
-        float(some.succeeded.mean()),
-        np.quantile(log.flat(some.end), (0.1, 0.5, 0.9), axis=0),
-    )
 
 
 def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
@@ -379,3 +307,124 @@ def shown_rate(done: float, calls: float, what: str = " calls") -> str:
     """Return a share with its count and its 95 % interval, in words."""
     low, high = wilson(done, calls)
     return f"{done / calls:.0%} of {calls:,}{what} ({low:.0%} to {high:.0%})"
+
+
+class LinkedCalls(CallColumns):
+    """Calls, counted by the skill before."""
+
+    @checked_names
+    def hand_over(
+        self, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
+    ) -> HandOver:
+        """Count how often each skill is done after each other one.
+
+        A row counts the calls that follow a call of its skill. Calls that the episode's time limit
+        cut before they were done are left out.
+
+        Args:
+            done: by skill, the event that its calls are for, in place of the skill's ``success``:
+                a predicate, a function of observations or of a ``Step``, or ``held(...)``; a call
+                is done if it happened within the call. A call of a skill with neither is done if it
+                ended by itself.
+            only_after_done: leave out calls that follow a call that was not done.
+
+        Raises:
+            DeclarationError: ``done`` names an unknown skill, or holds no event.
+        """
+        count = len(self.skills)
+        won = calls_done(self, done)
+        before = before_each(self, won, only_after_done)
+        rows = np.flatnonzero(before >= 0)
+        calls, did = pair_counts(before[rows], self.skill[rows], won[rows], count)
+        cut = np.bincount(self.skill[self.was_cut & ~won], minlength=count)
+        by_itself = tuple(
+            name
+            for name, judged in zip(self.skills, self.own_success, strict=True)
+            if not judged and name not in (done or {})
+        )
+        return HandOver(self.skills, calls, did, cut, by_itself)
+
+    @checked_names
+    def chain(
+        self, *skills: str, done: Mapping[str, Any] | None = None, features: Any = None
+    ) -> Chain:
+        """Estimate how often skills are done one after another, a call each, from episodes' starts.
+
+        The estimate follows logged calls: from where a call ended, the nearest calls of the next
+        skill count, by distance. So it knows that a skill ends elsewhere after another one, which
+        the product of rates does not.
+
+        Args:
+            *skills: names, in their order.
+            done: as for ``hand_over``.
+            features: as for ``Planner``.
+
+        Raises:
+            DeclarationError: no skill is named, or one that is unknown.
+            RunError: the log has no call of a skill, or none of the first at an episode's start.
+        """
+        if not skills:
+            raise DeclarationError("chain() needs the names of skills: chain('left', 'right')")
+        numbers = [self.number(name) for name in skills]
+        won = calls_done(self, done)
+        counts = ~self.was_cut | won
+        rows = [np.flatnonzero(counts & (self.skill == number)) for number in numbers]
+        rows[0] = rows[0][self.order[rows[0]] == 0]
+        for name, some in zip(skills, rows, strict=True):
+            if not len(some):
+                where = " at the start of an episode" if some is rows[0] else ""
+                raise RunError(
+                    f"the log has no complete call of {name!r}{where}; record more calls, chosen "
+                    "at random"
+                )
+        maps = feature_maps(self, features, np.concatenate([self.start, self.end]))
+        # From the last skill back: the chance that the rest of the chain is done after each call.
+        chance = won[rows[-1]].astype(np.float64)
+        for i in reversed(range(len(skills) - 1)):
+            here = maps[numbers[i + 1]]
+            starts, ends = here(self.start[rows[i + 1]]), here(self.end[rows[i]])
+            near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
+            follows = (weights_of(distance) * chance[near]).sum(1)
+            may = self.may_follow[rows[i]].reshape(len(rows[i]), len(self.skills), -1)
+            goes_on = won[rows[i]] & ~self.terminated[rows[i]]
+            follows_on = goes_on & may[:, numbers[i + 1]].any(1)
+            if goes_on.any() and not follows_on.any():
+                raise RunError(
+                    f"{skills[i + 1]!r} may not start where any logged call of {skills[i]!r} was "
+                    "done (its initiation() is False there), so this chain cannot be run"
+                )
+            chance = np.where(follows_on, follows, 0.0)
+        matrix = self.hand_over(done)
+        pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
+        rates = tuple(rate for rate, _ in pairs)
+        return Chain(
+            tuple(skills),
+            float(chance.mean()),
+            float(np.prod(rates)),
+            rates,
+            tuple(count for _, count in pairs),
+        )
+
+    @checked_names
+    def call_ends(self, skill: str) -> CallEnds:
+        """Return where the calls of a skill end, and why.
+
+        Args:
+            skill: its name.
+
+        Raises:
+            DeclarationError: the log has no skill of this name.
+            RunError: the log has no call of it.
+        """
+        some = self.of(skill)
+        if not len(some):
+            raise RunError(f"the log has no call of {skill!r}; record some")
+        return CallEnds(
+            skill,
+            len(some),
+            some.reasons,
+            int(((some.end_reason == CallEnd.OWN) & (some.terminated | some.truncated)).sum()),
+            float(some.tau.mean()),
+            float(some.succeeded.mean()),
+            np.quantile(self.flat(some.end), (0.1, 0.5, 0.9), axis=0),
+        )

@@ -6,7 +6,7 @@ A grammar, with errors that point at a word.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, NoReturn
 
 from skillweave.errors import DeclarationError
@@ -86,30 +86,28 @@ class _Parser:
 
     def sequence(self) -> Part:
         """Parse parts that are joined by ``then``."""
-        parts = [self.choice()]
-        while self.takes("then"):
-            parts.append(self.choice())
-        return sequence(parts)
+        return sequence(self.joined("then", self.choice))
 
     def choice(self) -> Part:
         """Parse parts that are joined by ``or``."""
-        first = self.now
-        parts = [self.any_order()]
-        while self.takes("or"):
-            parts.append(self.any_order())
+        first, parts = self.now, self.joined("or", self.any_order)
         if len(parts) > MOST_TOGETHER:
             self.fail(f"a choice has at most {MOST_TOGETHER} parts", first)
         return parts[0] if len(parts) == 1 else Choice(tuple(parts))
 
     def any_order(self) -> Part:
         """Parse parts that are joined by ``and``."""
-        first = self.now
-        parts = [self.item()]
-        while self.takes("and"):
-            parts.append(self.item())
+        first, parts = self.now, self.joined("and", self.item)
         if len(parts) > MOST_TOGETHER:
             self.fail(f"at most {MOST_TOGETHER} parts can be done in any order", first)
         return parts[0] if len(parts) == 1 else AnyOrder(tuple(parts))
+
+    def joined(self, word: str, parse: Callable[[], Part]) -> list[Part]:
+        """Parse parts with a word between them."""
+        parts = [parse()]
+        while self.takes(word):
+            parts.append(parse())
+        return parts
 
     def item(self) -> Part:
         """Parse parentheses, or an event."""

@@ -16,7 +16,8 @@ from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import short, whole_number
 from skillweave.notices import notice
-from skillweave.planning.calls import CallLog, columns_of
+from skillweave.planning.calls import CallLog
+from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.lacking import check_possible, obstacle, read_log

@@ -112,7 +112,7 @@ def with_returns(
     own_rewards: bool = True,
     keep: Callable[[CallLog], None] | None = None,
 ) -> tuple[CallLog, Array]:
-    """Return the log of ``record_calls``, and each call's ``Recorder.own_returns``, (C,).
+    """Return the log of ``record_calls``, and ``own_return`` of the recorder's rows, (C,).
 
     Args:
         own_rewards: compute them; else there are none, (0,).
@@ -166,7 +166,7 @@ def with_returns(
             raise Interrupted(
                 f"stopped: {len(log):,} calls ({log.steps:,} steps) were recorded and are kept"
             )
-        return log, recorder.own_returns() if own_rewards else np.zeros(0)
+        return log, recorder.rows()["own_return"] if own_rewards else np.zeros(0)
 
 
 class WithDrawnGoals(Around):

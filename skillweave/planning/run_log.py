@@ -16,7 +16,8 @@ from skillweave.messages import shown_path
 from skillweave.notices import notice
 from skillweave.paths import CRITIC, SELECTOR
 from skillweave.planning.call_file import LoggedRun, write_calls
-from skillweave.planning.calls import CallLog, columns_of, join
+from skillweave.planning.calls import CallLog, join
+from skillweave.planning.columns import columns_of
 from skillweave.planning.hand_over import HandOver
 from skillweave.planning.recorder import MOST_BYTES
 from skillweave.reading import check_file, fit
@@ -109,7 +110,7 @@ def save_calls(run: RunDirectory, log: CallLog) -> None:
             log = _joined_or_aside(path, log)
         log = _bounded(log)
         header = LoggedRun(id=run.manifest.get("id"), skills=_weights(run))
-        write_calls(path, columns_of(log), vars(log), header)
+        write_calls(path, log, header)
     finally:
         lock.release()
 

@@ -25,15 +25,21 @@ from skillweave.messages import short, whole_number
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
+from skillweave.policies.parts import OWN_GOAL
 from skillweave.seeding import Seeds, global_generators
 from skillweave.settings import AtLeastOne, Count
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
+from skillweave.skills.goals import goals_of
 from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.reflex_tally import ReflexTally
-from skillweave.training.skill_report import CallTally, SkillReport, all_steps, tally_of
+from skillweave.training.skill_report import (
+    SkillReport,
+    all_steps,
+    skill_reports,
+    weak_hand_overs,
+)
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
 
@@ -339,9 +345,10 @@ def _evaluate(
         )
         if limit is None and own_limit is None:
             moments = _with_notice(moments, spec.name, most)
-        calls = None if info is None else PlayedCalls(policy, spaces, info=info, spec=spec)
+        how: dict[str, Any] = {"steps": False} if info is None else {"info": info, "spec": spec}
+        calls = PlayedCalls(policy, spaces, own_rewards=True, **how)
         evaluation = _scored(policy, episodes, moments, watch, threshold, calls)
-        if calls is not None:
+        if info is not None:
             vars(evaluation)["_logs"] = calls.logs([-1] * episodes if pooled else seeds)
         if spec.check_seed and not pooled and episodes > envs.num_envs:
             _check_starts_again(envs, seeds[0], first, spec.name)
@@ -421,48 +428,47 @@ def episode_seeds(seed: int, episodes: int) -> list[int]:
 
 
 def _scored(
-    policy: Policy,
+    policy: Any,
     episodes: int,
     moments: Iterator[Played],
     watch: Callable[[Played], None] | None,
     threshold: float | None,
-    calls: PlayedCalls | None,
+    calls: PlayedCalls,
 ) -> Evaluation:
-    """Play all episodes and return their scores.
-
-    Args:
-        calls: records what is played; None: nothing is recorded.
-    """
-    returns = np.zeros(episodes)
-    lengths = np.zeros(episodes, np.int64)
-    cut = 0
-    alone, tally = tally_of(policy, episodes)
-    reflexes = ReflexTally(policy)
-    success = np.full(episodes, np.nan)
+    """Play all episodes and return their scores."""
+    returns, lengths, cut = np.zeros(episodes), np.zeros(episodes, np.int64), 0
+    success, skill, goals = np.full(episodes, np.nan), calls.alone, None
+    has_skills = skill is not None or bool(policy.labels)
+    if (own := goals_of(skill)) is not None:
+        goals = own.start(episodes)
     for played in moments:
         returns[played.episode] += played.reward
         lengths[played.episode] += played.lasted
         cut += int(played.cut.sum())
-        tally.add(played)
-        reflexes.add(played)
+        if has_skills:
+            calls.add(played)
+        if goals is not None:
+            goals[played.episode] = played.memory[OWN_GOAL][played.rows]
         succeeded = reported_success(played.step.info, len(played.rows))
         if succeeded is not None:
             success[played.episode[played.over]] = succeeded[played.over]
-        if calls is not None:
-            calls.add(played)
         if watch is not None:
             watch(played)
     evaluation = Evaluation(
         tuple(returns.tolist()),
         tuple(lengths.tolist()),
         threshold,
-        tally.reports(),
+        skill_reports(calls) if has_skills else {},
         cut,
         None if np.isnan(success).any() else int(success.sum()),
-        reflexes.steps(),
-        alone,
+        dict(calls.reflexes),
+        None if skill is None else policy.path,
     )
-    vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
-    if isinstance(tally, CallTally):
-        vars(evaluation).update(_goals=tally.goals, _reached=tally.reached)
+    vars(evaluation)["_hand_over"] = tuple(weak_hand_overs(calls)) if has_skills else ()
+    if skill is not None:
+        reached = None
+        if skill.defines("success"):
+            rows, reached = calls.recorders()[""].rows(), np.zeros(episodes, bool)
+            reached[rows["episode"]] = rows["succeeded"]
+        vars(evaluation).update(_goals=goals, _reached=reached)
     return evaluation

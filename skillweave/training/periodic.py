@@ -80,7 +80,10 @@ class PeriodicEvaluation:
             return {}
         assert self._arena is not None
         started = time.monotonic()
-        episodes = self._play_all(self._arena, play)
+        rounds = -(-self._episodes // self._arena.num_envs)
+        seeds = [self._seeds, *(self._seeds / "round" / i for i in range(1, rounds))]
+        played = [play(self._arena, each) for each in seeds]  # (n, 4 + I) each
+        episodes = np.concatenate(played)[: self._episodes]
         self.after = started - self._ended
         self._ended = time.monotonic()
         self.took = self._ended - started
@@ -89,13 +92,6 @@ class PeriodicEvaluation:
         if np.isnan(success).all():
             return metrics
         return metrics | {"eval_success": float((success == 1.0).mean())}
-
-    def _play_all(self, eval_envs: Collector, play: Callable[[Collector, Seeds], Array]) -> Array:
-        """Play all episodes, (n, 4 + I), in rounds of one episode in each environment."""
-        episodes = [play(eval_envs, self._seeds)]
-        rounds = -(-self._episodes // eval_envs.num_envs)
-        episodes += [play(eval_envs, self._seeds / "round" / i) for i in range(1, rounds)]
-        return np.concatenate(episodes)[: self._episodes]
 
     def spent(self) -> int:
         """Return the environment steps since the previous call."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 
@@ -21,7 +20,7 @@ class Played:
     """One step in each environment that acts; arrays have a row for each of these."""
 
     rows: Array  # (k,) int64, the environments
-    episode: Array  # (k,) int64, the episode that each of them plays; −1: one that does not count
+    episode: Array  # (k,) int64, the episode that each of them plays
     step: Step  # ``elapsed`` counts the episode's environment steps
     reward: Array  # (k,) undiscounted; of a call the sum over its steps
     lasted: Array  # (k,) int64, environment steps that the action lasted
@@ -29,9 +28,8 @@ class Played:
     memory: InPlaceMemory = field(default_factory=dict)
     """The policy's, of all environments, after the step."""
     acting: Array | None = None  # (k,) int64, the skill that acted; None: no skills below
-    call_start: Array | None = None  # (k,) bool: a call of that skill starts
-    elapsed: Array | None = None  # (k,) int64, steps of its call so far; None: unknown
-    why: Array | None = None  # (k,) int8, ``CallEnd`` of its call; None: unknown
+    call_start: Array = field(default_factory=lambda: np.zeros(0, bool))
+    """(k,) bool: a call of that skill starts."""
 
     @property
     def over(self) -> Array:
@@ -40,35 +38,9 @@ class Played:
         return over
 
 
-class Episodes(Protocol):
-    """Environments with the episodes to play in them."""
-
-    num_envs: int
-    rows: Array
-    """(k,) acting environments; empty: all episodes are over."""
-    obs: Array
-    """(N, *obs_shape), the next observations."""
-
-    def mask(self) -> Array | None:
-        """Return the actions allowed now, (k, A) bool, or None."""
-        ...
-
-    def step(self, action: Array) -> Played:
-        """Act in ``rows``."""
-        ...
-
-    def go_on(self, played: Played) -> Array:
-        """Start remaining episodes where others are over; return these environments (m,)."""
-        ...
-
-    def episode_of(self, rows: Array) -> Array:
-        """Return the numbers of the episodes in environments ``rows`` (k,)."""
-        ...
-
-
 def play(
     policy: Policy,
-    episodes: Episodes,
+    episodes: SeededEpisodes,
     *,
     deterministic: bool = True,
     rng: np.random.Generator | None = None,
@@ -90,13 +62,13 @@ def play(
     def begin(rows: Array) -> None:
         """Let a skill that acts alone choose goals where episodes start."""
         if choose_goals is not None and len(rows):
-            numbers = episodes.episode_of(rows).tolist()
-            rngs = [np.random.default_rng([seed, 2, max(number, 0)]) for number in numbers]
+            rngs = [np.random.default_rng([seed, 2, n]) for n in episodes.episode[rows].tolist()]
             choose_goals(memory, rows, episodes.obs[rows], rngs)
 
     begin(episodes.rows)
     while len(rows := episodes.rows):
-        turn = Turn(world, episodes.mask(), greedy=deterministic)
+        mask = allowed_rows(episodes.engine.mask(), rows)
+        turn = Turn(world, mask, greedy=deterministic)
         action = acts.act(memory, rows, episodes.obs[rows], turn)
         if before_step is not None:
             before_step(memory)
@@ -105,8 +77,6 @@ def play(
         played = episodes.step(action)
         acts.observe(memory, rows, played.step)
         played.memory, played.acting, played.call_start = shown, acting, before == 0
-        if acting is not None and "end" in memory:
-            played.elapsed, played.why = memory["elapsed"][rows], memory["end"][rows]
         yield played
         restarted = episodes.go_on(played)
         if len(restarted):
@@ -126,23 +96,22 @@ class SeededEpisodes:
     def __init__(self, engine: Engine, seeds: Sequence[int] | int, max_steps: int) -> None:
         self.engine = engine
         self.num_envs = engine.num_envs
+        self.rows = np.arange(self.num_envs)
+        """(k,) acting environments; empty: all episodes are over."""
         self._seeds = [] if isinstance(seeds, int) else seeds
         self._max_steps = max_steps
-        self._episode = np.arange(self.num_envs)
+        self.episode = np.arange(self.num_envs)
+        """(N,) the numbers of their episodes."""
         self._elapsed = np.zeros(self.num_envs, np.int64)
         if isinstance(seeds, int):
-            self.rows = np.arange(self.num_envs)
             self._upcoming = 0
             first = engine.reset(seeds)
         else:
-            self.rows = np.arange(min(self.num_envs, len(seeds)))
+            self.rows = self.rows[: len(seeds)]
             self._upcoming = len(self.rows)
             first = engine.reset_some(self.rows, list(seeds[: self._upcoming]))
         self.obs = np.array(first)
-
-    def mask(self) -> Array | None:
-        """Return the actions allowed now, (k, A) bool, or None."""
-        return allowed_rows(self.engine.mask(), self.rows)
+        """(N, *obs_shape), the next observations."""
 
     def step(self, action: Array) -> Played:
         """Act in ``rows``."""
@@ -155,15 +124,10 @@ class SeededEpisodes:
         step = raw.seen(obs, action, elapsed)
         cut = ~(raw.terminated | raw.truncated) & (elapsed >= self._max_steps)
         one = np.ones(len(rows), np.int64)
-        return Played(rows, self._episode[rows], step, raw.reward, one, cut)
-
-    def episode_of(self, rows: Array) -> Array:
-        """Return the numbers of the episodes in environments ``rows`` (k,)."""
-        number: Array = self._episode[rows]
-        return number
+        return Played(rows, self.episode[rows], step, raw.reward, one, cut)
 
     def go_on(self, played: Played) -> Array:
-        """Start the remaining episodes, in order, where others are over."""
+        """Start remaining episodes where others are over; return these environments (m,)."""
         ended = played.rows[played.over]
         first = self._upcoming
         left = len(self._seeds) - first
@@ -173,6 +137,6 @@ class SeededEpisodes:
             self._upcoming = first + len(restarted)
             seeds = self._seeds[first : self._upcoming]
             self.obs[restarted] = self.engine.reset_some(restarted, seeds)
-            self._episode[restarted] = np.arange(first, self._upcoming)
+            self.episode[restarted] = np.arange(first, self._upcoming)
             self._elapsed[restarted] = 0
         return restarted

@@ -9,15 +9,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from skillweave.collecting.judge import judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.envs.make import EnvSpec
-from skillweave.paths import AGENT
+from skillweave.paths import AGENT, join, level_of, names_in
 from skillweave.planning.calls import CallLog
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
-from skillweave.policies.core import EPISODE, RUNNING
-from skillweave.skills import Skill
+from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, end_with_episode
+from skillweave.policies.parts import OWN_GOAL
+from skillweave.skills import Reflex, Skill, asked
+from skillweave.skills.base import RecordedSkill
 from skillweave.training.play import Played
-from skillweave.types import Array, Memory, Policy
+from skillweave.types import Memory, Policy
+
+WAITS, IS_DONE = -1, -2
+"""In place of the steps of the call of a skill that acts alone."""
 
 
 class PlayedCalls:
@@ -26,11 +32,16 @@ class PlayedCalls:
     Where nothing but the step limit of ``play`` ends an episode, the call is cut as by the
     environment's time limit. Of a plain agent each episode is one call of ``agent``.
 
+    A skill that acts alone has one call in each episode. It starts where the skill may start,
+    usually at the episode's start, and ends by its ``termination``, at its ``max_steps``, or with
+    the episode. The skill acts on after it, but only the call counts: a skill that is called again
+    where its work is done would succeed each time.
+
     Args:
         policy: that plays.
         spaces: of the environments' observations and actions.
         info: keys of ``info`` to record.
-        own_rewards, inside, spec: see ``Recorder``.
+        own_rewards, inside, steps, spec: see ``Recorder``.
     """
 
     def __init__(
@@ -41,34 +52,58 @@ class PlayedCalls:
         info: Sequence[str] = (),
         own_rewards: bool = False,
         inside: bool = True,
+        steps: bool = True,
         spec: EnvSpec | None = None,
     ) -> None:
-        skills = skills_below(policy)
-        self.plain = skills is None
-        """The policy has no skills."""
+        acts: Any = policy
+        skills, skill = skills_below(policy), getattr(policy, "skill", None)
+        self.alone: Skill | None = None
+        """The skill that acts alone; None: the whole policy acts."""
+        self.prefix = ""
+        """The level of the skill that acts alone."""
+        if isinstance(skill, Skill):
+            self.alone = skill
+            skills = SkillSet((skill,), (acts.policy,), acts.reflexes)
+            self.prefix = level_of(acts.path)
+        self.declared = skills is not None
+        """The declarations of its skills are known."""
+        if skills is None:  # it may still say by names what acts in it
+            names = policy.labels or (AGENT,)
+            named = tuple(type(name, (RecordedSkill,), {"name": name})() for name in names)
+            skills = SkillSet(named, (policy,) * len(named))
+        self._named = bool(policy.labels)
+        self.steps = np.zeros(len(skills.skills), np.int64)
+        """Steps of each skill of which nothing is declared: not all may be in calls."""
         self.cut: set[int] = set()
         """The episodes that were cut at the step limit."""
-        agent: Skill = type(AGENT, (Skill,), {"name": AGENT})()
-        self._levels = levels_below(SkillSet((agent,), (policy,)) if skills is None else skills)
-        self._places = {
-            path: [*map(str, above.values())] for path, (_, above) in self._levels.items()
-        }
+        self._levels = levels_below(skills)
         self._goals = {path: goals_in(below) for path, (below, _) in self._levels.items()}
         self._spaces = spaces
-        self._how: dict[str, Any] = {
-            "info": info, "own_rewards": own_rewards, "inside": inside, "spec": spec,
-        }  # fmt: skip
+        self._how: dict[str, Any] = {"info": info, "own_rewards": own_rewards, "spec": spec}
+        self._how |= {"inside": inside, "steps": steps}
         self._feed: TraceFeed | None = None
+        self._tau = np.zeros(0, np.int64)  # of the call of a skill that acts alone, (N,)
+        levels = self._levels.items()
+        self.reflexes = {
+            self._named_at(p, r): 0 for p, (level, _) in levels for r in level.reflexes
+        }
+        """Steps in which each reflex acted, by its path."""
 
     def add(self, played: Played) -> None:
         """Record a step of each environment; the first one is of all of them."""
         if self._feed is None:
             self._feed = TraceFeed(list(self._recorders(len(played.rows)).values()))
-        step, over = played.step, played.over
+            self._tau = np.zeros(len(played.rows), np.int64)
+        step = played.step
         if played.cut.any():
             step = replace(step, truncated=step.truncated | played.cut)
             self.cut |= set(played.episode[played.cut].tolist())
-        levels = {path: self._calls(path, played, over) for path in self._levels}
+        levels = {path: self._calls(path, played) for path in self._levels}
+        self._count_reflexes(played, levels)
+        if self.alone is not None:  # calls below it that ran before count from there
+            starts = levels[""]["elapsed"] == 1
+            for calls in levels.values():
+                calls["start"] = starts | (calls["elapsed"] == 1)
         self._feed.add(played.rows, step, levels)
 
     def recorders(self) -> dict[str, Recorder]:
@@ -89,22 +124,77 @@ class PlayedCalls:
         return {path: replace(log, seed=by_episode[log.episode]) for path, log in logs.items()}
 
     def _recorders(self, num_envs: int) -> dict[str, Recorder]:
-        return {
+        recorders = {
             path: Recorder(skills, self._spaces, num_envs, path=path, above=above, **self._how)
             for path, (skills, above) in self._levels.items()
         }
+        if self.alone is not None:
+            recorders[""].endless[:] = False
+        return recorders
 
-    def _calls(self, path: str, played: Played, over: Array) -> Memory:
+    def _calls(self, path: str, played: Played) -> Memory:
         """Return what a level's calls did in a step."""
-        if self.plain:
-            nothing = np.zeros(len(over), np.int64)
-            end = np.where(over, np.int8(EPISODE), np.int8(RUNNING))
-            return {"skill": nothing, "elapsed": played.step.elapsed, "end": end}
+        if self.alone is not None and not path:
+            return self._of_alone(self.alone, played)
+        if not self.declared:
+            end = np.where(played.over, np.int8(EPISODE), np.int8(RUNNING))
+            calls = {"skill": np.zeros(len(end), np.int64), "elapsed": played.step.elapsed}
+            if self._named and (acting := played.acting) is not None:
+                calls |= {"skill": acting, "start": played.call_start}
+                self.steps += np.bincount(acting, minlength=len(self.steps))
+            return calls | {"end": end}
         memory = played.memory
-        for place in self._places[path]:
-            memory = memory[place]
+        for level, place in self._levels[path][1].items():
+            if level or self.alone is None:
+                memory = memory[str(place)]
         calls = calls_in(memory, self._goals[path], played.rows)
         if played.cut.any():  # the player sees the environment's own ends
             cut = played.cut & (calls["end"] == RUNNING)
             calls["end"] = np.where(cut, np.int8(EPISODE), calls["end"])
         return calls
+
+    def _of_alone(self, skill: Skill, played: Played) -> Memory:
+        """Return what the calls of a skill that acts alone did in a step."""
+        rows, step = played.rows, played.step
+        tau = self._tau[rows]
+        tau[step.elapsed == 1] = WAITS
+        if len(waiting := np.flatnonzero(tau == WAITS)):
+            may = asked(skill, "initiation", step.obs[waiting], rows[waiting])
+            tau[waiting[may]] = 0
+        runs = np.flatnonzero(tau >= 0)
+        tau[runs] += 1
+        end, goal = np.full(len(rows), RUNNING, np.int8), None
+        if skill.goal_space is not None:
+            goal = played.memory[OWN_GOAL][rows]
+        if skill.max_steps is not None:
+            end[tau >= skill.max_steps] = LIMIT
+        if len(runs):
+            own = None if goal is None else goal[runs]
+            end[
+                runs[judge(skill, seen_by(skill, step, tau[runs], runs, own), rows[runs]).stops]
+            ] = OWN
+        end_with_episode(end, played.over & ~played.cut)
+        end[played.cut & (end == RUNNING)] = EPISODE
+        self._tau[rows] = np.where(end == RUNNING, tau, IS_DONE)
+        calls = {"skill": np.where(tau >= 0, 0, -1), "elapsed": tau, "end": end}
+        return calls if goal is None else calls | {f"{skill.name}/goal": goal}
+
+    def _named_at(self, path: str, reflex: Reflex) -> str:
+        """Return the path of a reflex: a skill that acts alone is no level of it."""
+        return join(*names_in(path)[self.alone is not None :], str(reflex.name))
+
+    def _count_reflexes(self, played: Played, levels: dict[str, Memory]) -> None:
+        """Count the reflexes that acted: where several hold, the last of the outermost level."""
+        if not self.reflexes:
+            return
+        acted = np.zeros(len(played.rows), bool)
+        for path, (skills, above) in self._levels.items():
+            here = np.ones(len(acted), bool)
+            for level, place in above.items():
+                if level or self.alone is None:
+                    here &= levels[level]["skill"] == place
+            for reflex in reversed(skills.reflexes):
+                rows = np.flatnonzero(here)
+                holds = np.flatnonzero(reflex.holds(played.step.obs[rows]) & ~acted[rows])
+                self.reflexes[self._named_at(path, reflex)] += len(holds)
+                acted[rows[holds]] = True

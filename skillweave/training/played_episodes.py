@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skillweave.paths import join
+from skillweave.planning.columns import ENDS, GOAL
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.skill_report import ENDS
 from skillweave.types import Array
 
 
@@ -71,7 +71,7 @@ class PlayedEpisodes:
         recorders = played.recorders()
         leaves = dict(_leaves(recorders))
         self.labels = tuple(leaves)
-        self.skills = () if played.plain else tuple(leaves.values())
+        self.skills = tuple(leaves.values()) if played.declared else ()
         log = recorders[""].log()
         episode = log.episode[log.owner]
         rows = np.lexsort((log.age[log.owner] + log.elapsed, episode))
@@ -92,28 +92,29 @@ class PlayedEpisodes:
 
     def _add(self, path: str, recorder: Recorder, leaves: Mapping[str, Skill]) -> None:
         """Add the calls of one level."""
-        log, own, numbers = recorder.log(), recorder.own_returns(), list(leaves)
-        returns, skills, tau = log.returns(1.0), log.skill, log.tau
-        for i, skill in enumerate(recorder.skills.skills):
+        skills, numbers = recorder.skills, list(leaves)
+        for row in recorder.rows():
+            skill = skills.skills[row["choice"] // max(1, len(skills.lengths))]
             if (name := join(path, skill.name)) not in leaves:
                 continue
             judged = bool(self.skills) and not isinstance(skill, RecordedSkill)
-            goals = recorder.goals.get(skill.name)
-            aims = None if goals is None else goals.space.of_numbers(log.goals[skill.name])
-            for row in np.flatnonzero(skills == i).tolist():
-                won = bool(log.succeeded[row]) if skill.defines("success") else None
-                call = Call(
-                    numbers.index(name),
-                    int(log.age[row]),
-                    log.start[row],
-                    int(tau[row]),
-                    ENDS[CallEnd(int(log.end_reason[row]))],
-                    float(returns[row]),
-                    float(own[row]) if judged else None,
-                    won,
-                    "" if aims is None else shown_goal(aims[row]),
-                )
-                self.episodes[int(log.episode[row])].calls.append(call)
+            episode, start = self.episodes[row["episode"]], int(row["age"])
+            goal = ""
+            if (goals := recorder.goals.get(skill.name)) is not None:
+                goal = shown_goal(goals.space.of_numbers(row[GOAL + skill.name][None])[0])
+            steps = int(row["steps"])
+            call = Call(
+                numbers.index(name),
+                start,
+                row["start"],
+                steps,
+                ENDS[CallEnd(int(row["end_reason"]))],
+                float(episode.rewards[start : start + steps].sum(dtype=np.float64)),
+                float(row["own_return"]) if judged else None,
+                bool(row["succeeded"]) if skill.defines("success") else None,
+                goal,
+            )
+            episode.calls.append(call)
 
 
 def _leaves(recorders: Mapping[str, Recorder], path: str = "") -> Iterator[tuple[str, Skill]]:

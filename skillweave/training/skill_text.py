@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from skillweave.paths import level_of
+from skillweave.planning.columns import ENDS
 from skillweave.skills.learnable import learn_on
-from skillweave.training.skill_report import ENDS, SkillReport, all_steps
+from skillweave.training.skill_report import SkillReport, all_steps
 
 
 def skill_rows(skills: Mapping[str, SkillReport]) -> list[list[str]]:

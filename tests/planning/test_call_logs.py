@@ -28,7 +28,7 @@ from skillweave import Automaton, EnvSpec, Lengths
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.planning import CallLog, join, record_calls
-from skillweave.planning.calls import columns_of
+from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.skills import Skill

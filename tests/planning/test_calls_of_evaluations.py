@@ -26,7 +26,7 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, EnvError
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.planning import CallLog, record_calls
-from skillweave.planning.calls import columns_of
+from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills import Skill
 from skillweave.training.evaluation import episode_seeds, evaluate

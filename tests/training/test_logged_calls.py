@@ -30,7 +30,8 @@ from skillweave.collecting import placement
 from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import CallLog
-from skillweave.planning.calls import LEARNING, columns_of
+from skillweave.planning.calls import LEARNING
+from skillweave.planning.columns import columns_of
 from skillweave.policies.core import CallEnd
 from skillweave.skills.scripted import ScriptedPolicy
 

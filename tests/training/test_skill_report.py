@@ -413,6 +413,39 @@ def test_a_hierarchy_as_a_skill_has_a_report_and_so_have_its_own_skills():
         assert sum(own.ended.values()) == own.calls
 
 
+def test_reports_of_inner_skills_agree_with_the_log_of_their_calls():
+    class Nested(Skill):
+        max_steps = 5
+        policy = woven(*KINDS)
+
+    outer = woven(Nested, Reaching, Left)
+    found = evaluate(outer, EnvSpec(Walk), episodes=40, log_calls=True)
+    assert any(log.succeeded[log.end_reason == 2].any() for log in found.inner_calls.values())
+    for path, log in {"": found.calls, **found.inner_calls}.items():
+        for name in log.skills:
+            report, own = found.skills[f"{path}/{name}".strip("/")], log.of(name)
+            assert (report.calls, report.steps, report.ended) == (len(own), own.steps, own.reasons)
+            assert report.succeeded in (None, own.succeeded.sum())
+
+
+def test_calls_below_a_skill_alone_count_from_where_it_may_start():
+    class Later(Skill):
+        policy = woven(Right, Left, call_steps=9)
+
+        def initiation(self, obs):
+            return obs[:, T] >= 2
+
+    skills = woven(Later, Zigzag).skills
+    report, *below = evaluate(
+        SkillAlone(skills, "later"), EnvSpec(Walk), episodes=20
+    ).skills.values()
+    assert report.calls > 10
+    assert sum(one.steps for one in below) == report.steps
+    assert sum(one.first for one in below) == report.calls
+    for own in below:
+        assert sum(own.ended.values()) == own.calls
+
+
 def test_where_no_reward_is_defined_it_is_the_environments():
     found = evaluate(woven(Zigzag), EnvSpec(Walk), episodes=9)
     assert found.skills["zigzag"].return_sum == pytest.approx(sum(found.returns))
