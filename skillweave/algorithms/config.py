@@ -7,7 +7,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium as gym
@@ -16,8 +16,8 @@ from skillweave.algorithms.schedules import LearningRate, check_rate
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.named import Named
 from skillweave.networks.config import Network, check_critic
-from skillweave.reading import as_json, fit, shown
-from skillweave.settings import (
+from skillweave.policies.files import shown
+from skillweave.schema import (
     AtLeastOne,
     Check,
     Count,
@@ -26,6 +26,8 @@ from skillweave.settings import (
     Positive,
     check,
     checked_settings,
+    fit,
+    to_json,
 )
 
 
@@ -601,22 +603,8 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
         DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
     """
     name = type(config).__name__
-    return {"algorithm": name, **_settings(config, name)}
-
-
-def _settings(value: Any, where: str) -> Any:
-    """Convert settings to dicts; functions of the user become their recorded names.
-
-    Raises:
-        DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
-    """
-    if is_dataclass(value):
-        return {
-            f.name: _settings(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value)
-        }
-    if isinstance(value, Named):
-        return str(value)
-    return as_json(value, where, "record a name, and let the algorithm look up what it means")
+    advice = "record a name, and let the algorithm look up what it means"
+    return {"algorithm": name, **to_json(config, name, advice)}
 
 
 def own_encoders(config: Any) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from skillweave.errors import DeclarationError
 from skillweave.messages import error_text, short
 from skillweave.named import Named, known_names, named
-from skillweave.settings import (
+from skillweave.schema import (
     LARGEST_FLOAT,
     RECORDED,
     Check,

@@ -17,7 +17,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.settings import annotations_of, described, options_of
+from skillweave.schema import annotations_of, described, options_of
 from skillweave.skills import Skill, is_trained
 
 PLAIN = ("call_steps", "steps", "learn")

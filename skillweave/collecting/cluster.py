@@ -17,7 +17,7 @@ from skillweave.collecting.workers import WorkerFactory, Workers
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, MissingExtra, TrainingError
 from skillweave.messages import error_text, short
-from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
+from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
 PATIENCE = 5.0
 """Seconds that an address has to answer."""

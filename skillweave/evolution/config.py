@@ -11,8 +11,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import Activation
-from skillweave.reading import fit
-from skillweave.settings import AtLeastOne, Check, Fraction, NonNegative, check, checked_settings
+from skillweave.schema import AtLeastOne, Check, Fraction, NonNegative, check, checked_settings, fit
 
 Scale = Literal["linear", "log", "complement"]
 KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")

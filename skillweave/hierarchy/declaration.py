@@ -28,8 +28,8 @@ from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.runs.command_words import Caller
+from skillweave.schema import AtLeastOne, Check, check_fields, fitted
 from skillweave.selectors.ready import ReadyValue
-from skillweave.settings import AtLeastOne, Check, check_fields, fitted
 from skillweave.skills import Reflex, Skill, is_trained
 from skillweave.skills.own_part import ZERO
 from skillweave.spaces import action_codec, obs_codec

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from skillweave.errors import DeclarationError
+from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, checked_settings
 from skillweave.selectors.ready import ReadyValue
-from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 
 StartCalls = (
     AtLeastOne | Annotated[tuple[str, ...], Check("names of skills: ('left',)", bool)] | None

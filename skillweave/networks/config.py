@@ -10,7 +10,7 @@ import numpy as np
 
 from skillweave.errors import DeclarationError
 from skillweave.named import named
-from skillweave.settings import Check, Count, check, checked_settings
+from skillweave.schema import Check, Count, check, checked_settings
 
 T = TypeVar("T")
 WIDEST = 65_536

@@ -18,9 +18,8 @@ from skillweave.collecting.user_code import Texts
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import as_path
 from skillweave.policies.core import CallEnd
-from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.settings import AtLeastOne, Count
+from skillweave.schema import AtLeastOne, Count, fit
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
     obs_codec,

@@ -19,10 +19,11 @@ from skillweave.planning.call_file import LoggedRun, write_calls
 from skillweave.planning.calls import CallLog, columns_of, join
 from skillweave.planning.hand_over import HandOver
 from skillweave.planning.recorder import MOST_BYTES
-from skillweave.reading import check_file, fit
+from skillweave.policies.files import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header
 from skillweave.runs.lock import Lock
+from skillweave.schema import fit
 
 MOST_STEPS = 1_000_000
 """The most steps of the log in a run; the latest stay."""

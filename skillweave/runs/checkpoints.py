@@ -11,8 +11,8 @@ from typing import Any
 from torch import Tensor
 
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.reading import fit
 from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
+from skillweave.schema import fit
 
 
 class Checkpoints:

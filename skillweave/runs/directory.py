@@ -36,7 +36,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import absolute, shown_path
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.comparison import needs_comparison
@@ -62,6 +62,7 @@ from skillweave.runs.manifest import (
     read_manifest,
     versions,
 )
+from skillweave.schema import fit
 from skillweave.types import unprefixed
 
 S = TypeVar("S")

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import RunError
-from skillweave.reading import check_file, parse_json, read_file, shown
+from skillweave.policies.files import check_file, parse_json, read_file, shown
 
 SCHEMA = 1
 """Version of all files; readers refuse newer ones."""

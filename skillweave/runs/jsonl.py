@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import RunError
-from skillweave.reading import check_file, fit, load_json, shown
+from skillweave.policies.files import check_file, load_json, shown
 from skillweave.runs.links import own_copy
+from skillweave.schema import fit
 
 
 class JsonLines:

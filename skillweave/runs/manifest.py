@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from skillweave.algorithms.config import config_from_json
 from skillweave.errors import RunError
 from skillweave.paths import names_in
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json
-from skillweave.settings import AtLeastOne, Check, Count, NonNegative, Positive
+from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, fit
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from skillweave.algorithms.config import AlgorithmSettings
-from skillweave.settings import AtLeastOne, Check, annotations_of, checked_settings, fitted
+from skillweave.schema import AtLeastOne, Check, annotations_of, checked_settings, fitted
 
 InfoKeys = Annotated[
     Sequence[Annotated[str, Check("a key of info, such as 'distance'", bool)]],

@@ -14,7 +14,7 @@ from skillweave.paths import level_of
 from skillweave.planning.hand_over import HandOver
 from skillweave.policies.core import CallEnd, end_with_episode, part_of
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.settings import Count
+from skillweave.schema import Count
 from skillweave.skills import Skill, asked, is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goals import goals_of

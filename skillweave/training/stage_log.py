@@ -12,7 +12,7 @@ from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.errors import RunError, SkillweaveError, reworded
 from skillweave.messages import close_matches
 from skillweave.notices import notice
-from skillweave.reading import shown
+from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.comparison import best_words
 from skillweave.runs.directory import RunDirectory
