@@ -13,9 +13,10 @@ from skillweave.algorithms.parameters import setting_number
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
-from skillweave.evolution.stacks import Member, Origin, copy, networks_of
+from skillweave.evolution.stacks import Member, copy, networks_of
 from skillweave.networks.config import Network
 from skillweave.ops.device import FLOAT
+from skillweave.runs.manifest import Origin
 
 Spaces = tuple[Any, Any]
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file, parse_json, read_file, shown
+from skillweave.schema import fit
 
 SCHEMA = 1
 """Version of all files; readers refuse newer ones."""
@@ -216,6 +217,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             newer schema.
     """
     return read_signed(path)[:2]
+
+
+def record_in(kind: Any, header: Mapping[str, Any], path: Path) -> Any:
+    """Return a file's header as a dataclass; a RunError names the file and a wrong field."""
+    return fit(kind, {k: v for k, v in header.items() if k not in ("schema", "sha256")}, str(path))
 
 
 def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
