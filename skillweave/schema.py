@@ -1,6 +1,6 @@
 """The one schema: annotations of fields are their checks, of settings, of files, and of ``--set``.
 
-``gamma: Fraction = 0.99`` says that γ lies between 0 and 1. ``@checked_settings`` above a dataclass
+``gamma: Fraction = 0.99`` says that γ lies between 0 and 1. ``@settings`` above a dataclass
 checks every field by its annotation when an object is made. ``fit`` compares files with the same
 annotations, or with a ``TypedDict`` for JSON that stays a dict; ``to_json`` writes what it reads.
 This module does not import torch.
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
-from functools import cache, wraps
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache
 from types import NoneType, UnionType
 from typing import (
     Annotated,
@@ -21,6 +21,7 @@ from typing import (
     NotRequired,
     TypeVar,
     Union,
+    dataclass_transform,
     get_args,
     get_origin,
     get_type_hints,
@@ -221,12 +222,12 @@ class _Fitting:
         if kind is Callable or origin is Callable:
             return callable(value), ["a function"]
         if kind in (list, tuple) or origin in (list, tuple, Sequence):
-            text = "a list"
-            if origin is tuple and inner and Ellipsis not in inner:
-                text = f"a list of {len(inner)}"
-            elif inner and inner[0] is not Any:
-                text = f"a list, each entry {self.describe(inner[0])}"
-            return isinstance(value, list | tuple), [text]
+            if isinstance(value, list | tuple) or not inner:
+                return isinstance(value, list | tuple), ["a list"]
+            if origin is tuple and Ellipsis not in inner:
+                return False, [f"a list of {len(inner)}"]
+            each = "" if inner[0] is Any else f", each entry {self.describe(inner[0])}"
+            return False, [f"a list{each}"]
         named = isinstance(value, Mapping) and all(isinstance(k, str) for k in value)
         if kind is dict or origin in (dict, Mapping) or (not declared and _is_record(kind)):
             return named, ["a dict with texts as keys" if declared else "an object, in braces"]
@@ -350,8 +351,8 @@ def _hint(kind: Any, value: Any) -> str:
         for name in value:
             if name not in known:
                 return f" ({group} has no setting {name!r}{meant(name, known, 'they are')})"
-        settings = ", ".join(f"{k}={short(v, 40)}" for k, v in value.items())
-        return f" (write {group}({settings}))"
+        given = ", ".join(f"{k}={short(v, 40)}" for k, v in value.items())
+        return f" (write {group}({given}))"
     return ""
 
 
@@ -364,6 +365,21 @@ def options_of(kind: Any) -> list[Any]:
 
 
 # Writing
+
+
+def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Return settings by name, those in a group by dotted names: ``network.hidden``.
+
+    Args:
+        settings: a dataclass.
+        prefix: what all names begin with.
+    """
+    values: dict[str, Any] = {}
+    for name in (f.name for f in fields(settings)):
+        value = getattr(settings, name)
+        group = flat(value, f"{prefix}{name}.") if is_dataclass(value) else {prefix + name: value}
+        values |= group
+    return values
 
 
 def to_json(value: Any, where: str, advice: str) -> Any:
@@ -405,8 +421,9 @@ def to_json(value: Any, where: str, advice: str) -> Any:
 # Settings
 
 
-def checked_settings(kind: C) -> C:
-    """Let a dataclass of settings check every field by its annotation when an object is made.
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def settings(kind: C) -> C:
+    """Make a class a frozen dataclass that checks every field when an object is made.
 
     Names are checked as by ``checked_names``. NumPy's numbers become Python's, and a field that
     holds other settings also takes a dict of them. The fields of subclasses are checked, too.
@@ -416,9 +433,8 @@ def checked_settings(kind: C) -> C:
     Raises:
         DeclarationError: when an object is made: ``PPO.gamma is 1.5; it must be between 0 and 1``.
     """
-    cls: Any = checked_names(kind)
+    cls: Any = kind
     own = getattr(cls, "__post_init__", None)
-    init = cls.__init__
 
     def checked(self: Any) -> None:
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))
@@ -431,14 +447,7 @@ def checked_settings(kind: C) -> C:
 
     cls._checks_fields = True
     cls.__post_init__ = checked
-    if own is None:  # then what ``@dataclass`` has made calls none
-
-        @wraps(init)
-        def made(self: Any, *args: Any, **named: Any) -> None:
-            init(self, *args, **named)
-            checked(self)
-
-        cls.__init__ = made
+    checked_names(dataclass(frozen=True)(cls))
     return kind
 
 

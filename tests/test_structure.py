@@ -428,13 +428,17 @@ def test_everything_public_has_a_docstring(path: Path) -> None:
     assert undocumented(path.read_text()) == []
 
 
+MAKES_FIELDS = ("dataclass", "settings")
+"""Decorators of dataclasses."""
+
+
 def fields_without_a_string(source: str) -> list[str]:
     """Fields of dataclasses that no string follows."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if not isinstance(node, ast.ClassDef):
             continue
-        if not any("dataclass" in ast.dump(d) for d in node.decorator_list):
+        if not any(kind in ast.dump(d) for d in node.decorator_list for kind in MAKES_FIELDS):
             continue
         for statement, after in zip(node.body, [*node.body[1:], None], strict=True):
             if not isinstance(statement, ast.AnnAssign):
@@ -457,7 +461,7 @@ def test_the_search_for_field_strings_finds_what_has_none() -> None:
 )
 def test_every_field_of_the_settings_is_followed_by_a_string(name: str) -> None:
     source = (ROOT / name).read_text()
-    assert "@dataclass" in source
+    assert any(f"@{kind}" in source for kind in MAKES_FIELDS)
     assert fields_without_a_string(source) == []
 
 

@@ -25,14 +25,13 @@ from skillweave.schema import (
     NonNegative,
     Positive,
     check,
-    checked_settings,
     fit,
+    settings,
     to_json,
 )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class OnPolicy:
     """Settings that all algorithms share that learn from their own latest rollout.
 
@@ -65,8 +64,7 @@ class OnPolicy:
         check_rate(self)
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class PPO(OnPolicy):
     """Proximal policy optimisation (Schulman et al. 2017).
 
@@ -138,8 +136,7 @@ class PPO(OnPolicy):
         check(self, "batch_size", self.batch_size <= most, rule)
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SelfImitationPPO(PPO):
     """PPO that learns again from its good past steps (Oh et al. 2018, "Self-Imitation Learning").
 
@@ -172,8 +169,7 @@ class SelfImitationPPO(PPO):
         )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SkillCritic(OnPolicy):
     """Settings of the critic of skills: Q(s, skill) of the task, learnt from every step."""
 
@@ -205,8 +201,7 @@ class SkillCritic(OnPolicy):
 Schedule = Literal["constant", "linear"]
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class OffPolicy:
     """Settings that all algorithms with a replay buffer share."""
 
@@ -291,8 +286,7 @@ class OffPolicy:
         )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class DQN(OffPolicy):
     """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``.
 
@@ -357,8 +351,7 @@ class DQN(OffPolicy):
         return cls(**{**everything, **settings})
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class ActorCritic(OffPolicy):
     """Settings that TD3 and SAC share, with defaults that differ from DQN's."""
 
@@ -381,8 +374,7 @@ class ActorCritic(OffPolicy):
     """The critics' network; None: as the actor's."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class TD3(ActorCritic):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
@@ -424,8 +416,7 @@ class TD3(ActorCritic):
         return cls(**{**plain, **settings})
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SAC(ActorCritic):
     """Soft actor-critic (Haarnoja et al. 2018b); for discrete actions Christodoulou 2019."""
 

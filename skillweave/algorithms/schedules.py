@@ -6,7 +6,6 @@ This module does not import torch; see ``config``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from skillweave.errors import DeclarationError
@@ -18,12 +17,11 @@ from skillweave.schema import (
     Check,
     NonNegative,
     Positive,
-    checked_settings,
+    settings,
 )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Linear:
     """A learning rate that changes linearly: ``PPO(learning_rate=Linear(3e-4, 0))``.
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated
 
 from skillweave.errors import DeclarationError
-from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, checked_settings
+from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 from skillweave.selectors.ready import ReadyValue
 
 StartCalls = (
@@ -21,8 +20,7 @@ GuideValue = Annotated[
 """A ready selector that guides."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Apart:
     """Settings of skills and a selector that train one after another.
 
@@ -50,8 +48,7 @@ class Apart:
     start. 1: each call begins with a reset. Evaluations count an episode's first call."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Selection:
     """Settings of the selector's choices, and of the skills under it.
 
@@ -74,8 +71,7 @@ class Selection:
     """The selector's stage ends early at this mean return of the evaluation while training."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Guide:
     """A ready selector beside one that learns.
 

@@ -455,10 +455,10 @@ class RunDirectory:
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
             raise RunError(f"{path} holds no agent's policy")
-        if header.get("stage", stage) != stage:
-            raise RunError(f"{path} holds the policy of stage {shown(header['stage'])}")
+        if (of := header.get("stage")) != stage:
+            raise RunError(f"{path} holds the policy of stage {shown(of)}")
         self.must_be_ours(header.get("run"), path)
-        known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
+        known = entry.get("policies", {}).get(name, entry.get("sha256"))
         check_unchanged(path, sha256, known)
         return AgentPolicy.from_file(tensors, header, str(path))
 

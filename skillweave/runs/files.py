@@ -236,7 +236,7 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
-def check_unchanged(path: Path, actual: str, recorded: str) -> None:
+def check_unchanged(path: Path, actual: str, recorded: str | None) -> None:
     """Raise a RunError where a file's checksum differs from the one that the run recorded."""
     if actual != recorded:
         raise RunError(

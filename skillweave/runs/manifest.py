@@ -239,7 +239,7 @@ class Manifest(TypedDict):
     stages: list[StageEntry]
     created: str
     versions: dict[str, str]
-    id: NotRequired[str]
+    id: str
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
     keep: NotRequired[Literal["last", "best"]]
@@ -380,7 +380,7 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         config_from_json(stage["algorithm"], file, f"{where}.algorithm")
         if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
-    if "id" in data and "sha256" not in data:
+    if "sha256" not in data:
         raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from skillweave.algorithms.config import AlgorithmSettings
-from skillweave.schema import AtLeastOne, Check, annotations_of, checked_settings, fitted
+from skillweave.schema import AtLeastOne, Check, annotations_of, fitted, settings
 
 InfoKeys = Annotated[
     Sequence[Annotated[str, Check("a key of info, such as 'distance'", bool)]],
@@ -16,8 +16,7 @@ InfoKeys = Annotated[
 """Keys of ``info``."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class TrainDefaults:
     """Values that ``train`` uses for arguments that its caller leaves out.
 
