@@ -23,7 +23,7 @@ class JsonLines:
 
     Args:
         path: the file.
-        schema: the schema of each line (see ``reading.fit``); None: any object.
+        schema: the schema of each line (see ``schema.fit``); None: any object.
         next_step: returns the command to type when a full disk has space again, for messages.
     """
 
