@@ -27,6 +27,22 @@ class Comments(griffe.Extension):
             attr.docstring = griffe.Docstring(text, lineno=node.lineno, parent=attr)
 
 
+class _Dataclass(griffe.ExprName):
+    """The decorator of dataclasses, wherever it stands."""
+
+    canonical_path = "dataclasses.dataclass"
+
+
+class Settings(griffe.Extension):
+    """``@settings`` makes a dataclass."""
+
+    def on_class_instance(self, *, cls: griffe.Class, **_: Any) -> None:
+        """Give the class the decorator that griffe knows."""
+        if any(one.callable_path == "skillweave.schema.settings" for one in cls.decorators):
+            cls.labels.add("dataclass")
+            cls.decorators.append(griffe.Decorator(_Dataclass("dataclass"), lineno=0, endlineno=0))
+
+
 class PlainTypes(griffe.Extension):
     """``gamma: Fraction`` reads in the reference as ``gamma: float``: a type without its checks."""
 

@@ -264,12 +264,9 @@ def _groups(owner: Any, example: str) -> Iterator[_Place]:
 
 def _group(owner: Any, field: Any) -> Any:
     """Return the dataclass of a field's instance; None: it holds something else."""
-    if isinstance(made := field.default_factory, type) and is_dataclass(made):
-        return made
-    if made is not MISSING and is_dataclass(value := made()):
-        return type(value)
-    if is_dataclass(field.default) and not isinstance(field.default, type):
-        return type(field.default)
+    made = field.default if field.default_factory is MISSING else field.default_factory()
+    if is_dataclass(made) and not isinstance(made, type):
+        return type(made)
     try:
         hint = typing.get_type_hints(owner)[field.name]
     except Exception:  # a name that only type checkers import

@@ -279,7 +279,9 @@ def test_an_interrupt_saves_the_round_that_was_begun_and_loses_nothing(
     interrupted(tmp_path / "run", declared, number)
     assert signal.getsignal(number) is before
     assert "stopping after this round, and saving" in capsys.readouterr().err
-    assert RunDirectory.open(tmp_path / "run")._checkpoints.latest_header()["update"] == 10
+    latest = RunDirectory.open(tmp_path / "run")._checkpoints.latest_header()
+    assert latest is not None
+    assert latest.update == 10
     declared.resume(tmp_path / "run", quiet=True)
     assert_same(tmp_path / "run", reference)
 

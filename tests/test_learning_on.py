@@ -25,7 +25,7 @@ def whole(tmp_path_factory):
         save, init = RunDirectory.save_checkpoint, JointLearner.__init__
 
         def saved(self, state, header, *more):
-            ended[header["stage"]] = state
+            ended[header.stage] = state
             save(self, state, header, *more)
 
         def made(self, parts, how, *more):

@@ -24,7 +24,7 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.errors import DeclarationError, RunError
-from skillweave.settings import described, fitted
+from skillweave.schema import described, fitted
 
 if TYPE_CHECKING:
     from fractions import Fraction as Unknown

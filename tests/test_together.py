@@ -44,10 +44,11 @@ from skillweave.api.applying import differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Checkpoint
 from skillweave.training import joint
 from skillweave.training.episodes import Episodes
 from skillweave.training.skill_report import SkillReport
-from skillweave.training.stage_log import START, StageLog, success_rate
+from skillweave.training.stage_log import StageLog, success_rate
 
 
 def declare(*skills, **how):
@@ -499,7 +500,7 @@ def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
     tmp_path, told, succeeded, rate
 ):
     run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
-    log = StageLog("left", run, (), START)
+    log = StageLog("left", run, (), Checkpoint.start("left"))
     for update, metrics in enumerate(told):
         log.tick(update, 64 * (update + 1), 0.1, metrics)
     log.done({}, {})
@@ -511,7 +512,7 @@ def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
 
 def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(tmp_path):
     run = new_run(declare(Left(), Balance(), learn="apart"), tmp_path / "run")
-    log = StageLog("left", run, (), START)
+    log = StageLog("left", run, (), Checkpoint.start("left"))
     log.tick(0, 64, 0.1, {"success": 0.0})
     for other in (1.0, True, None):
         run.log({"success": other})

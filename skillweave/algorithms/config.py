@@ -7,7 +7,7 @@ does not import torch, so that ``--help`` and argument errors are instant.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium as gym
@@ -16,8 +16,8 @@ from skillweave.algorithms.schedules import LearningRate, check_rate
 from skillweave.errors import DeclarationError, EnvError, RunError
 from skillweave.named import Named
 from skillweave.networks.config import Network, check_critic
-from skillweave.reading import as_json, fit, shown
-from skillweave.settings import (
+from skillweave.policies.files import shown
+from skillweave.schema import (
     AtLeastOne,
     Check,
     Count,
@@ -25,12 +25,13 @@ from skillweave.settings import (
     NonNegative,
     Positive,
     check,
-    checked_settings,
+    fit,
+    settings,
+    to_json,
 )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class OnPolicy:
     """Settings that all algorithms share that learn from their own latest rollout.
 
@@ -63,8 +64,7 @@ class OnPolicy:
         check_rate(self)
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class PPO(OnPolicy):
     """Proximal policy optimisation (Schulman et al. 2017).
 
@@ -136,8 +136,7 @@ class PPO(OnPolicy):
         check(self, "batch_size", self.batch_size <= most, rule)
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SelfImitationPPO(PPO):
     """PPO that learns again from its good past steps (Oh et al. 2018, "Self-Imitation Learning").
 
@@ -170,8 +169,7 @@ class SelfImitationPPO(PPO):
         )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SkillCritic(OnPolicy):
     """Settings of the critic of skills: Q(s, skill) of the task, learnt from every step."""
 
@@ -203,8 +201,7 @@ class SkillCritic(OnPolicy):
 Schedule = Literal["constant", "linear"]
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class OffPolicy:
     """Settings that all algorithms with a replay buffer share."""
 
@@ -289,8 +286,7 @@ class OffPolicy:
         )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class DQN(OffPolicy):
     """Deep Q-learning (Mnih et al. 2015) and its extensions; all of them are ``DQN.rainbow()``.
 
@@ -355,8 +351,7 @@ class DQN(OffPolicy):
         return cls(**{**everything, **settings})
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class ActorCritic(OffPolicy):
     """Settings that TD3 and SAC share, with defaults that differ from DQN's."""
 
@@ -379,8 +374,7 @@ class ActorCritic(OffPolicy):
     """The critics' network; None: as the actor's."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class TD3(ActorCritic):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018)."""
 
@@ -422,8 +416,7 @@ class TD3(ActorCritic):
         return cls(**{**plain, **settings})
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class SAC(ActorCritic):
     """Soft actor-critic (Haarnoja et al. 2018b); for discrete actions Christodoulou 2019."""
 
@@ -601,22 +594,8 @@ def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:
         DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
     """
     name = type(config).__name__
-    return {"algorithm": name, **_settings(config, name)}
-
-
-def _settings(value: Any, where: str) -> Any:
-    """Convert settings to dicts; functions of the user become their recorded names.
-
-    Raises:
-        DeclarationError: a setting, of a user's own algorithm, cannot be recorded.
-    """
-    if is_dataclass(value):
-        return {
-            f.name: _settings(getattr(value, f.name), f"{where}.{f.name}") for f in fields(value)
-        }
-    if isinstance(value, Named):
-        return str(value)
-    return as_json(value, where, "record a name, and let the algorithm look up what it means")
+    advice = "record a name, and let the algorithm look up what it means"
+    return {"algorithm": name, **to_json(config, name, advice)}
 
 
 def own_encoders(config: Any) -> list[str]:

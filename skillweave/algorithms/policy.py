@@ -19,7 +19,7 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.ops.seen import Seen
-from skillweave.reading import fit
+from skillweave.schema import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless
 

@@ -34,8 +34,8 @@ from skillweave.ops.distributions import (
 from skillweave.ops.losses import expected_soft_value, masked_entropy_target
 from skillweave.ops.optim import adam_
 from skillweave.ops.returns import discounted, td_target
+from skillweave.schema import check
 from skillweave.seeding import Seeds
-from skillweave.settings import check
 
 
 @dataclass

@@ -6,24 +6,22 @@ This module does not import torch; see ``config``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from skillweave.errors import DeclarationError
 from skillweave.messages import error_text, short
 from skillweave.named import Named, known_names, named
-from skillweave.settings import (
+from skillweave.schema import (
     LARGEST_FLOAT,
     RECORDED,
     Check,
     NonNegative,
     Positive,
-    checked_settings,
+    settings,
 )
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Linear:
     """A learning rate that changes linearly: ``PPO(learning_rate=Linear(3e-4, 0))``.
 

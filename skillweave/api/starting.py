@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import as_path, close_matches, short
 from skillweave.notices import notice
 from skillweave.paths import AGENT, decides
-from skillweave.reading import shown
+from skillweave.policies.files import shown
 from skillweave.runs.initial_policies import (
     Chooses,
     Learnt,

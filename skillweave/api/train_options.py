@@ -23,7 +23,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.evolution.plan import Evolve
 from skillweave.messages import short, whole_number
-from skillweave.settings import fitted
+from skillweave.schema import fitted
 from skillweave.training.callback import Callback, check_callback
 from skillweave.training.options import RECORDED, CallReports, Continuing, Reports, Starting
 

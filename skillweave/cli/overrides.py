@@ -17,7 +17,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.settings import annotations_of, described, options_of
+from skillweave.schema import annotations_of, described, flat, options_of
 from skillweave.skills import Skill, is_trained
 
 PLAIN = ("call_steps", "steps", "learn")
@@ -129,9 +129,9 @@ def list_settings(declaration: Declaration) -> dict[str, Any]:
             values[f"skills.{skill.name}.steps"] = budgets.get(skill.name, skill.steps)
             values[f"skills.{skill.name}.task_weight"] = skill.task_weight
             config = skill.algorithm or declaration.algorithm
-            values |= _flatten(f"skills.{skill.name}.", config)
+            values |= flat(config, f"skills.{skill.name}.")
     trained = isinstance(declaration.selector, AlgorithmConfig)
-    return values | (_flatten("selector.", declaration.selector) if trained else {})
+    return values | (flat(declaration.selector, "selector.") if trained else {})
 
 
 def _config(declaration: Declaration, owner: tuple[str, ...]) -> Any:
@@ -298,18 +298,6 @@ def _parse(name: str, text: str, hint: Any) -> Any:
     if typing.get_origin(options[0]) is Sequence:
         expected = "names with commas between them"
     raise DeclarationError(f"{name}={text}: expected {expected}")
-
-
-def _flatten(prefix: str, config: Any) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for f in fields(config):
-        value = getattr(config, f.name)
-        values |= (
-            _flatten(f"{prefix}{f.name}.", value)
-            if is_dataclass(value)
-            else {prefix + f.name: value}
-        )
-    return values
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:

@@ -20,8 +20,9 @@ from typing import TypedDict
 from skillweave import recipes
 from skillweave.collecting.shipping import is_own_code
 from skillweave.errors import RunError
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.files import read_json, write_json
+from skillweave.schema import fit
 
 MARK = ".sweep"
 """A file in the sweep's directory; a machine that can read it shares the directory."""

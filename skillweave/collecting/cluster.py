@@ -8,7 +8,6 @@ import os
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from skillweave.collecting.group import Collectors, MakeCollector, share_of
@@ -17,14 +16,13 @@ from skillweave.collecting.workers import WorkerFactory, Workers
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, MissingExtra, TrainingError
 from skillweave.messages import error_text, short
-from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
+from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 
 PATIENCE = 5.0
 """Seconds that an address has to answer."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Ray:
     """Collectors as actors of Ray, on this machine or on a cluster.
 

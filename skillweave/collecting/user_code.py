@@ -25,8 +25,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from skillweave.envs.make import EnvSpec
 from skillweave.notices import notice
-from skillweave.policies.files import checksum
-from skillweave.reading import shown
+from skillweave.policies.files import checksum, shown
 from skillweave.skills import Reflex, Skill
 from skillweave.tracebacks import is_own_code, is_own_module
 

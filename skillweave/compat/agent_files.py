@@ -9,7 +9,7 @@ from typing import Any
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy, state_from
 from skillweave.errors import RunError
-from skillweave.reading import check_file
+from skillweave.policies.files import check_file
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 

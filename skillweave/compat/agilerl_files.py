@@ -21,9 +21,9 @@ from skillweave.compat.pickles import read_torch_pickle
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import CNN, Network
 from skillweave.networks.stacked import Views
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
+from skillweave.schema import AtLeastOne, Check, fit
 from skillweave.seeding import Seeds
-from skillweave.settings import AtLeastOne, Check
 
 _KINDS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "DDPG": TD3, "TD3": TD3}
 _OUTPUTS = {"PPO": "Softmax", "DQN": None, "DDPG": "Tanh", "TD3": "Tanh"}

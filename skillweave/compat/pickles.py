@@ -21,7 +21,7 @@ from torch import Tensor
 
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.messages import short, shortened
-from skillweave.reading import check_file, shown
+from skillweave.policies.files import check_file, shown
 
 DEEPEST = 100
 """Deepest nesting of a pickle's objects: hashing a deeper tuple overflows Python's stack."""

@@ -15,7 +15,8 @@ from skillweave.compat.numpy_actor import NumpyActor, NumpyPPOActor, Sampled
 from skillweave.evolution.architecture import check_architecture
 from skillweave.evolution.config import Mutations
 from skillweave.evolution.mutation import mutate, with_settings
-from skillweave.evolution.stacks import Member, Origin, copy
+from skillweave.evolution.stacks import Member, copy
+from skillweave.runs.manifest import Origin
 from skillweave.seeding import Seeds
 from skillweave.types import Array
 

@@ -156,7 +156,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if not self._fits(obs):
             raise self._misfit(obs)
         if type(reward) is not float:
-            reward = self._number_of(reward)
+            reward = float(self._scalar(reward, "its reward", "a number"))
         if not -LARGEST_REWARD <= reward <= LARGEST_REWARD:
             raise self._wrong(f"its reward is {reward}; {_REWARDS}")
         if type(terminated) is not bool:
@@ -232,23 +232,22 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
                 "but resources of the environment may not have been released"
             )
 
-    def _number_of(self, reward: Any) -> float:
-        try:
-            array = np.asarray(reward)
-        except Exception:
-            array = np.asarray(None)
-        if array.dtype.kind not in "fiub" or array.size != 1:
-            raise self._wrong(f"its reward is {short(reward)}; it must be a number")
-        return float(array.reshape(()))
-
-    def _flag(self, value: Any, which: str) -> bool:
+    def _scalar(self, value: Any, which: str, needed: str) -> Array:
+        """Return the only number in a value, ()."""
         try:
             array = np.asarray(value)
         except Exception:
             array = np.asarray(None)
-        if array.dtype.kind not in "fiub" or array.size != 1 or array.reshape(())[()] not in (0, 1):
-            raise self._wrong(f"{which} is {short(value)}; it must be True or False")
-        return bool(array.reshape(()))
+        if array.dtype.kind not in "fiub" or array.size != 1:
+            raise self._wrong(f"{which} is {short(value)}; it must be {needed}")
+        return array.reshape(())
+
+    def _flag(self, value: Any, which: str) -> bool:
+        needed = "True or False"
+        number = self._scalar(value, which, needed)
+        if number not in (0, 1):
+            raise self._wrong(f"{which} is {short(value)}; it must be {needed}")
+        return bool(number)
 
     def _check_info(self, info: Any) -> None:
         if not isinstance(info, dict):

@@ -24,9 +24,8 @@ from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import close_matches, error_text, short, shortened
 from skillweave.policies.infos import batched_infos
-from skillweave.reading import as_json
+from skillweave.schema import AtLeastOne, Check, check_fields, to_json
 from skillweave.seeding import Seeds, global_generators
-from skillweave.settings import AtLeastOne, Check, check_fields
 from skillweave.spaces import env_form, obs_dtype, obs_shape, put_observation
 from skillweave.spaces.packing import parts
 
@@ -250,7 +249,7 @@ class EnvSpec:
         for name, value in self.kwargs.items():
             known = isinstance(self.env, str)
             call = f"gymnasium.make({self.env!r}, " if known else f"{self._function_name}("
-            recorded[name] = as_json(
+            recorded[name] = to_json(
                 value,
                 f"{self.name}: kwargs[{name!r}]",
                 f"put it into a function, and pass that as env: def make(): return {call}"

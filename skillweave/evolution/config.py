@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, field, fields
 from typing import Annotated, Any, Literal, TypedDict, get_args
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.errors import DeclarationError
 from skillweave.networks.config import Activation
-from skillweave.reading import fit
-from skillweave.settings import AtLeastOne, Check, Fraction, NonNegative, check, checked_settings
+from skillweave.schema import AtLeastOne, Check, Fraction, NonNegative, check, fit, settings
 
 Scale = Literal["linear", "log", "complement"]
 KINDS = ("none", "hyperparameters", "parameters", "architecture", "activation")
 """The kinds of mutation; ``Mutations`` has a probability of each."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Range:
     """The range of a setting, and the scale on which it mutates.
 
@@ -97,8 +95,7 @@ Activations = Annotated[
 """At least one nonlinearity."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Mutations:
     """Probabilities of the kinds of change of an heir, of which one happens.
 
@@ -192,8 +189,7 @@ class Mutations:
         return dict(self.ranges)
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Tournament:
     """A selection in which each heir's parent is the best of a few members drawn at random.
 
@@ -207,8 +203,7 @@ class Tournament:
     """The best member continues unchanged."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Truncation:
     """A selection that replaces the worst members by heirs of the best (Jaderberg et al. 2017).
 
@@ -220,8 +215,7 @@ class Truncation:
     """The share of members that are replaced, and that are parents."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Evolution:
     """A population in place of one agent: it trains, is compared, selected and mutated.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,11 @@ from skillweave.algorithms.parameters import setting_number
 from skillweave.errors import DeclarationError, SkillweaveError
 from skillweave.evolution.architecture import check_architecture, draw_change, rebuilt
 from skillweave.evolution.config import KINDS, Evolution, Mutations, Range
-from skillweave.evolution.stacks import Member, Origin, copy, networks_of
+from skillweave.evolution.stacks import Member, copy, networks_of
 from skillweave.networks.config import Network
 from skillweave.ops.device import FLOAT
+from skillweave.runs.manifest import Origin
+from skillweave.schema import flat
 
 Spaces = tuple[Any, Any]
 
@@ -45,19 +47,8 @@ def mutate(
 
 def difference(old: AlgorithmConfig, new: AlgorithmConfig) -> dict[str, tuple[Any, Any]]:
     """Return the old and new values of settings that differ, by dotted name."""
-    changes: dict[str, tuple[Any, Any]] = {}
-    for field in fields(old):
-        before, after = getattr(old, field.name), getattr(new, field.name)
-        if before == after:
-            continue
-        if isinstance(before, Network) and isinstance(after, Network):
-            parts = {
-                k.name: (getattr(before, k.name), getattr(after, k.name)) for k in fields(before)
-            }
-            changes |= {f"{field.name}.{k}": v for k, v in parts.items() if v[0] != v[1]}
-        else:
-            changes[field.name] = (before, after)
-    return changes
+    before = flat(old)
+    return {k: (before.get(k), v) for k, v in flat(new).items() if before.get(k) != v}
 
 
 def with_settings(member: Member, **settings: Any) -> Member:

@@ -18,7 +18,8 @@ from skillweave.evolution.mutation import mutate, random_config
 from skillweave.evolution.part import OnGenerationTick, Part, policy_of, spaces_of
 from skillweave.evolution.selection import select
 from skillweave.evolution.split import Parts
-from skillweave.evolution.stacks import Member, Origin, copy, grouped
+from skillweave.evolution.stacks import Member, copy, grouped
+from skillweave.runs.manifest import Origin
 from skillweave.seeding import Seeds
 from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array

@@ -22,18 +22,10 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import is_schedule
 from skillweave.networks.config import Network
 from skillweave.networks.stacked import Layout
+from skillweave.runs.manifest import Origin
 
 SETTLED = 1 << 15
 """Steps after which Adam's corrections are 1: 0.999 to this power is below float32's ε."""
-
-
-@dataclass(frozen=True)
-class Origin:
-    """The origin of a member: its parent, and the old and new values of changed settings."""
-
-    parent: int | None = None
-    mutation: str = "start"
-    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
 
 
 @dataclass
@@ -44,7 +36,7 @@ class Member:
     config: AlgorithmConfig
     state: Any  # of its algorithm, P = 1
     steps: int = 0  # environment steps that it and its ancestors were trained for
-    origin: Origin = field(default_factory=lambda: Origin())
+    origin: Origin = field(default_factory=Origin)
 
     def algorithm(self, spaces: tuple[Any, Any]) -> Algorithm:
         """Create its algorithm on (observation space, action space)."""

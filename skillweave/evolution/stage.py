@@ -7,9 +7,9 @@ resumes from the last complete generation.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,15 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json, conf
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm, state_from
 from skillweave.collecting import interrupts
 from skillweave.collecting.placement import LOCAL, Placement
+from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import spaces_of
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
-from skillweave.evolution.stacks import Member, Origin
+from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
-from skillweave.runs.manifest import Generation
+from skillweave.runs.manifest import BestEntry, Generation, MemberEntry
 from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
@@ -56,8 +57,6 @@ class EvolvingPopulation:
     Raises:
         DeclarationError: the selection is missing or wrong.
     """
-
-    schema: Any = Generation
 
     def __init__(self, stage: StageRun, selection: Any = None, where: Placement = LOCAL) -> None:
         self.stage = stage
@@ -91,7 +90,7 @@ class EvolvingPopulation:
         """Restore a checkpoint, whose members are in ``extra``."""
         self.log = log
         if extra:
-            self._restore(log.at, extra)
+            self._restore(extra)
         else:
             self.population = Population.fresh(
                 self.config, self.evolution, self.stage.learning_task, self.seeds, self.parts
@@ -99,7 +98,7 @@ class EvolvingPopulation:
         self._open.callback(self.population.close)
         if extra:
             self._resume_episodes(extra)
-        self._started: float = time.perf_counter() - log.at["seconds"]
+        self._started: float = time.perf_counter() - log.at.seconds
 
     def _parts(self) -> Parts | None:
         """Return the parts at workers; None: members train in this process."""
@@ -145,7 +144,7 @@ class EvolvingPopulation:
 
         It ends when the target is reached, the budget is spent, or a callback requests it.
         """
-        spent = self.done > 0 and self.log.at["steps"] >= self.budget
+        spent = self.done > 0 and self.log.at.steps >= self.budget
         early = self._good or spent or self.log.stop_requested
         return early or self.done >= self.evolution.generations
 
@@ -158,12 +157,12 @@ class EvolvingPopulation:
 
     def generation(self) -> None:
         """Train, compare, log, evolve and save."""
-        before = self.log.at["steps"]
+        before = self.log.at.steps
 
         def on_tick(steps: int, metrics: dict[str, float]) -> None:
             if self.best is not None:
                 metrics |= {"fitness": self.best.fitness}
-            update = self.log.at["update"] + 1
+            update = self.log.at.update + 1
             self.log.tick(update, before + steps, self._seconds, metrics)
 
         seeds = self.seeds / "generation" / self.done
@@ -172,7 +171,7 @@ class EvolvingPopulation:
         fitness = self.population.fitness(self.eval_envs, seeds / "fitness")
         self._keep_best(fitness, seeds / "fitness")
         self.fitness_steps = self._measured - measured
-        self.log.at["steps"] += self.fitness_steps
+        self.log.at.steps += self.fitness_steps
         self._note(fitness)
         self.done += 1
         self.log.report_absent(self.population.part.tally, over=False)
@@ -260,19 +259,20 @@ class EvolvingPopulation:
         store = self.population.part.store
         if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
             tensors |= prefixed("store", store.state())
-        header: dict[str, Any] = {
-            "generation": self.done,
-            "rounds": self.population.part.rounds,
-            "fitness_steps": self.fitness_steps,
-            "next_number": self.population.next_number,
-            "members": [_member_to_json(m) for m in self.population.members],
-        }
-        if self.best is not None:
-            weights, about = self.best.policy.to_file()
-            tensors |= prefixed("best", weights)
-            header["best"] = {"fitness": self.best.fitness, "number": self.best.number}
-            header["best"] |= {"generation": self.best.generation, "policy": about}
-        self.log.save(None, tensors, **header)
+        best = self.best
+        weights, about = ({}, {}) if best is None else best.policy.to_file()
+        self.log.at.population = Generation(
+            self.fitness_steps,
+            self.done,
+            self.population.part.rounds,
+            self.population.next_number,
+            [
+                MemberEntry(m.number, m.steps, config_to_json(m.config), m.origin)
+                for m in self.population.members
+            ],
+            None if best is None else BestEntry(best.fitness, best.number, best.generation, about),
+        )
+        self.log.save(None, tensors | prefixed("best", weights))
 
     def _resume_episodes(self, tensors: dict[str, Tensor]) -> None:
         """Restore the environments and their episodes from a checkpoint."""
@@ -282,50 +282,39 @@ class EvolvingPopulation:
         ids = resumed(self.log, lambda: population.resume(saved, store))
         self.log.report_reset(len(ids), population.part.num_envs)
 
-    def _restore(self, at: Mapping[str, Any], tensors: dict[str, Tensor]) -> None:
+    def _restore(self, tensors: dict[str, Tensor]) -> None:
         """Restore the population from a checkpoint."""
         where = str(self.run.path)
-        self.done = at["generation"]
-        self.fitness_steps = at["fitness_steps"]
-        if best := at.get("best"):
-            policy = AgentPolicy.from_file(unprefixed("best", tensors), best["policy"], where)
-            self.best = Best(best["fitness"], best["number"], best["generation"], policy)
+        at = self.log.at.population
+        if at is None:
+            raise RunError(
+                f"{where}: the checkpoint of stage {self.stage.name!r} has no population"
+            )
+        self.done = at.generation
+        self.fitness_steps = at.fitness_steps
+        if (best := at.best) is not None:
+            policy = AgentPolicy.from_file(unprefixed("best", tensors), best.policy, where)
+            self.best = Best(best.fitness, best.number, best.generation, policy)
         members = [
             self._restored(entry, unprefixed(str(i), tensors), f"{where}: member {i}")
-            for i, entry in enumerate(at["members"])
+            for i, entry in enumerate(at.members)
         ]
         learning_task = self.stage.learning_task
         self.population = Population(members, self.evolution, learning_task, self.seeds, self.parts)
-        self.population.part.rounds = at["rounds"]
-        self.population.next_number = at["next_number"]
+        self.population.part.rounds = at.rounds
+        self.population.next_number = at.next_number
 
-    def _restored(self, entry: dict[str, Any], tensors: dict[str, Tensor], where: str) -> Member:
+    def _restored(self, entry: MemberEntry, tensors: dict[str, Tensor], where: str) -> Member:
         """Return a member of a checkpoint.
 
         Heirs have parents that had not diverged. The last generation has no heirs.
         """
-        member = _member_from_json(entry)
-        algorithm = make_algorithm(member.config, *self.spaces)
+        config = config_from_json(entry.config)
+        algorithm = make_algorithm(config, *self.spaces)
         like = algorithm.init([self.seeds])
         groups = algorithm.parameter_groups()
-        member.state = state_from(tensors, like, where, groups, may_diverge=self.over)
-        return member
-
-
-def _member_to_json(member: Member) -> dict[str, Any]:
-    return {
-        "number": member.number,
-        "steps": member.steps,
-        "config": config_to_json(member.config),
-        "origin": vars(member.origin),
-    }
-
-
-def _member_from_json(entry: dict[str, Any]) -> Member:
-    origin = dict(entry["origin"])
-    origin["changes"] = {k: tuple(v) for k, v in origin["changes"].items()}
-    config = config_from_json(entry["config"])
-    return Member(entry["number"], config, None, entry["steps"], Origin(**origin))
+        state = state_from(tensors, like, where, groups, may_diverge=self.over)
+        return Member(entry.number, config, state, entry.steps, entry.origin)
 
 
 def lineage_of(
@@ -342,9 +331,7 @@ def lineage_of(
             "stage": stage,
             "generation": generation,
             "member": member.number,
-            "parent": member.origin.parent,
-            "mutation": member.origin.mutation,
-            "changes": {k: list(v) for k, v in member.origin.changes.items()},
+            **asdict(member.origin),
             "fitness": float(value) if np.isfinite(value) else None,
             "diverged": not np.isfinite(value),
             "best": member.number == best,

@@ -13,8 +13,8 @@ from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
 from skillweave.messages import close_matches, short
 from skillweave.paths import name_of
+from skillweave.schema import fitted
 from skillweave.selectors import Automaton
-from skillweave.settings import fitted
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.learnable import learn_on
 from skillweave.skills.own_part import ZERO, checked_rest

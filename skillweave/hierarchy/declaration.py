@@ -26,7 +26,7 @@ from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
-from skillweave.settings import check_fields, fitted
+from skillweave.schema import check_fields, fitted
 from skillweave.skills import Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import check_env

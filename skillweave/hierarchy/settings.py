@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from skillweave.algorithms.config import PPO, AlgorithmConfig, AlgorithmSettings
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
+from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 from skillweave.selectors.ready import ReadyValue
-from skillweave.settings import AtLeastOne, Check, NonNegative, Positive, checked_settings
 from skillweave.skills import Reflex
 from skillweave.skills.own_part import ZERO
 from skillweave.training.stage import Together
@@ -27,8 +27,7 @@ GuideValue = Annotated[
 """A ready selector that guides."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Apart:
     """Settings of skills and a selector that train one after another.
 
@@ -56,8 +55,7 @@ class Apart:
     start. 1: each call begins with a reset. Evaluations count an episode's first call."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Selection:
     """Settings of the selector's choices, and of the skills under it.
 
@@ -80,8 +78,7 @@ class Selection:
     """The selector's stage ends early at this mean return of the evaluation while training."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Guide:
     """A ready selector beside one that learns.
 

@@ -23,9 +23,9 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.messages import short
 from skillweave.paths import AGENT, below, join
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.settings import AtLeastOne, NonNegative
+from skillweave.schema import AtLeastOne, NonNegative, fit
 from skillweave.skills.foreign_policy import Foreign, Source, as_recorded, source_of
 from skillweave.skills.goal_spaces import goal_part, other_goals, with_goal, without_goal
 from skillweave.skills.own_part import part_to_json

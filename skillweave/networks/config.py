@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
 from skillweave.errors import DeclarationError
 from skillweave.named import named
-from skillweave.settings import Check, Count, check, checked_settings
+from skillweave.schema import Check, Count, check, settings
 
 T = TypeVar("T")
 WIDEST = 65_536
@@ -38,8 +38,7 @@ EncoderValue = Annotated[
 """An encoder as the user passes it."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class CNN:
     """A convolutional network for images; ``CNN()`` is Nature's (Mnih et al. 2015).
 
@@ -89,8 +88,7 @@ class CNN:
         return cls("plain", (16,), (3,), (1,))
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class RNN:
     """A recurrent layer after the hidden layers.
 
@@ -106,8 +104,7 @@ class RNN:
     """Width of its output."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Network:
     """A network: a CNN for images, then hidden layers on all numbers, then a recurrent layer.
 

@@ -23,9 +23,8 @@ from skillweave.planning.columns import (
     columns_of,
 )
 from skillweave.policies.core import CallEnd
-from skillweave.reading import fit
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.settings import AtLeastOne, Count
+from skillweave.schema import AtLeastOne, Count, fit
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
     obs_codec,

@@ -20,10 +20,11 @@ from skillweave.planning.calls import CallLog, join
 from skillweave.planning.columns import columns_of
 from skillweave.planning.hand_over import HandOver
 from skillweave.planning.recorder import MOST_BYTES
-from skillweave.reading import check_file, fit
+from skillweave.policies.files import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
 from skillweave.runs.files import read_header
 from skillweave.runs.lock import Lock
+from skillweave.schema import fit
 
 MOST_STEPS = 1_000_000
 """The most steps of the log in a run; the latest stay."""

@@ -11,8 +11,15 @@ from typing import Any
 from torch import Tensor
 
 from skillweave.errors import RunError, SkillweaveError
-from skillweave.reading import fit
-from skillweave.runs.files import move, read_header, read_tensors, remove, write_tensors
+from skillweave.runs.files import (
+    move,
+    read_header,
+    read_tensors,
+    record_in,
+    remove,
+    write_tensors,
+)
+from skillweave.runs.manifest import Checkpoint
 
 
 class Checkpoints:
@@ -40,13 +47,13 @@ class Checkpoints:
             raise
 
     def load(
-        self, stage: str, schema: Any, check: Callable[[dict[str, Any], Path], None]
-    ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
+        self, stage: str, check: Callable[[str | None, Path], None]
+    ) -> tuple[dict[str, Tensor], Checkpoint, Path] | None:
         """Return tensors, header and file of a stage's latest good checkpoint; None: it has none.
 
         Args:
-            schema: the schema of its header.
-            check: raises where a header and its file do not belong to this run.
+            stage: its name.
+            check: raises where the ``id`` of a file's run is not the one of this run.
 
         Raises:
             RunError: checkpoints of this stage exist, but all are damaged.
@@ -59,8 +66,9 @@ class Checkpoints:
                 tensors, header = read_tensors(path)
                 if header.get("stage") != stage:
                     continue
-                check(fit(schema, header, str(path)), path)
-                return tensors, header, path
+                checkpoint: Checkpoint = record_in(Checkpoint, header, path)
+                check(checkpoint.run, path)
+                return tensors, checkpoint, path
             except SkillweaveError as error:
                 problems.append(str(error))
         if problems:
@@ -69,13 +77,14 @@ class Checkpoints:
             )
         return None
 
-    def latest_header(self) -> dict[str, Any]:
-        """Return the header of the checkpoint that a resumed run loads; empty: it has none."""
+    def latest_header(self) -> Checkpoint | None:
+        """Return the header of the checkpoint that a resumed run loads; None: it has none."""
         fresh, latest, before = self._files
         for path in (latest, fresh, before):  # the order of ``clear`` and ``load``
             with suppress(RunError):
-                return read_header(path)
-        return {}
+                checkpoint: Checkpoint = record_in(Checkpoint, read_header(path), path)
+                return checkpoint
+        return None
 
     def any(self) -> bool:
         """Return whether a checkpoint exists."""

@@ -108,7 +108,7 @@ def python_string(text: object) -> str:
 def saved_words(run: RunLike) -> str:
     """Return the progress that a stopped run has saved, in words."""
     if header := Checkpoints(run.path).latest_header():
-        return f"saved at {header['steps']:,} steps of {header['stage']}"
+        return f"saved at {header.steps:,} steps of {header.stage}"
     stages = run.manifest["stages"]
     for stage in stages:
         if stage["status"] != "done" and (continued := stage.get("continued")):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, NotRequired, TypedDict
 
-from skillweave.settings import AtLeastOne
+from skillweave.schema import AtLeastOne
 
 Candidate = Literal[
     "before", "greedy", "skills_sample", "selector_samples", "both_sample", "repaired"

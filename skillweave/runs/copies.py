@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from skillweave.reading import read_file
+from skillweave.policies.files import read_file
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.files import make_directory, write_bytes
 from skillweave.skills.foreign_policy import Foreign, as_recorded

@@ -26,7 +26,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import asdict, fields
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,7 +36,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import absolute, shown_path
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
 from skillweave.runs.comparison import needs_comparison
@@ -46,6 +46,7 @@ from skillweave.runs.files import (
     make_directory,
     read_signed,
     read_tensors,
+    record_in,
     remove,
     write_json,
     write_tensors,
@@ -290,32 +291,33 @@ class RunDirectory:
         return any("kept" not in s and needs_comparison(s) for s in stages)
 
     def save_checkpoint(
-        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
     ) -> None:
         """Write a stage's latest checkpoint; the one before stays beside it.
 
         Args:
             state: a dataclass of tensors; None: all is in ``extra``.
+            header: the stage's progress; run and sizes of files are filled in.
             extra: further tensors for resuming: environments, a replay buffer.
         """
         self.check()
         self._checkpoints.save(*self._as_checkpoint(state, header, extra))
 
     def save_final(
-        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None = None
+        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
     ) -> None:
         """Write a stage's final state; arguments as in ``save_checkpoint``."""
         self.check()
-        path = self.final_path(header["stage"])
+        path = self.final_path(header.stage)
         make_directory(path.parent)
         write_tensors(path, *self._as_checkpoint(state, header, extra), make_directories=False)
 
     def _as_checkpoint(
-        self, state: Any | None, header: dict[str, Any], extra: Mapping[str, Tensor] | None
+        self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        return tensors, self.place(header["stage"]) | header | self.line_bytes()
+        return tensors, asdict(header) | self.place(header.stage) | self.line_bytes()
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints of a stage that ``run.json`` marks as done."""
@@ -345,8 +347,8 @@ class RunDirectory:
         return self._checkpoints.drop_previous() or bool(spare)
 
     def load_checkpoint(
-        self, kind: type[S] | None, stage: str, like: S | None = None, schema: Any = Checkpoint
-    ) -> tuple[S | None, dict[str, Any], dict[str, Tensor]] | None:
+        self, kind: type[S] | None, stage: str, like: S | None = None
+    ) -> tuple[S | None, Checkpoint, dict[str, Tensor]] | None:
         """Return state, header and extra of a stage's latest good checkpoint; None: it has none.
 
         Without a checkpoint, use the final state of a stage that continues, or whose budget is
@@ -354,16 +356,16 @@ class RunDirectory:
 
         Args:
             kind: the type of the state, a dataclass of tensors; None: no state.
+            stage: its name.
             like: a state with the required shapes and types.
-            schema: the schema of the header.
 
         Raises:
             RunError: checkpoints of this stage exist, but all are damaged.
         """
-        checkpoint = self._checkpoints.load(stage, schema, self.must_be_ours)
-        if checkpoint is None and (final := self._final(stage, schema)) is not None:
+        checkpoint = self._checkpoints.load(stage, self.must_be_ours)
+        if checkpoint is None and (final := self._final(stage)) is not None:
             entry = self.stage(stage)
-            if entry.get("continued") or final[1]["steps"] >= entry["budget"]:
+            if entry.get("continued") or final[1].steps >= entry["budget"]:
                 checkpoint = final
         if checkpoint is None:
             return None
@@ -380,23 +382,21 @@ class RunDirectory:
             return state_from(tensors, like, str(path)), header, extra
         return None if kind is None else kind(**tensors), header, extra
 
-    def _final(
-        self, stage: str, schema: Any
-    ) -> tuple[dict[str, Tensor], dict[str, Any], Path] | None:
+    def _final(self, stage: str) -> tuple[dict[str, Tensor], Checkpoint, Path] | None:
         """Return tensors, header and file of a stage's final state; None: it has none."""
         path = self.final_path(stage)
         if not path.exists():
             return None
-        tensors, header = read_tensors(path)
-        fit(schema, header, str(path))
-        if header["stage"] != stage:
-            raise RunError(f"{path} holds the state of stage {shown(header['stage'])}")
-        self.must_be_ours(header, path)
+        tensors, found = read_tensors(path)
+        header: Checkpoint = record_in(Checkpoint, found, path)
+        if header.stage != stage:
+            raise RunError(f"{path} holds the state of stage {shown(header.stage)}")
+        self.must_be_ours(header.run, path)
         entry = self.stage(stage)
-        if header["steps"] == (entry.get("continued") or [None])[-1]:
+        if header.steps == (entry.get("continued") or [None])[-1]:
             # Since then, other stages have added lines and evaluations.
-            header = {k: v for k, v in header.items() if k not in LINES}
-            header["evaluation_steps"] = entry.get("evaluation_steps", header["evaluation_steps"])
+            header.metrics_bytes = header.lineage_bytes = None
+            header.evaluation_steps = entry.get("evaluation_steps", header.evaluation_steps)
         return tensors, header, path
 
     def final_tensors(self, stage: str) -> list[str]:
@@ -405,7 +405,7 @@ class RunDirectory:
         Raises:
             RunError: the file is damaged, or belongs to another stage or run.
         """
-        final = self._final(stage, Checkpoint)
+        final = self._final(stage)
         return [] if final is None else list(final[0])
 
     def save_policies(self, stage: str, policies: Mapping[str, AgentPolicy]) -> None:
@@ -426,13 +426,11 @@ class RunDirectory:
 
     def place(self, stage: str) -> dict[str, str]:
         """Return the part of a file's header that names its stage and run."""
-        run = self.manifest.get("id")  # runs of older versions have none
-        return {"stage": stage} | ({} if run is None else {"run": run})
+        return {"stage": stage, "run": self.manifest["id"]}
 
-    def must_be_ours(self, header: Mapping[str, Any], path: Path) -> None:
-        """Raise a RunError where a file's header names another run."""
-        run = self.manifest.get("id")
-        if header.get("run", run) != run:
+    def must_be_ours(self, run: str | None, path: Path) -> None:
+        """Raise a RunError where ``run``, which a file's header names, is another run."""
+        if run != self.manifest["id"]:
             raise RunError(f"{path} belongs to another run")
 
     def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
@@ -457,10 +455,10 @@ class RunDirectory:
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
             raise RunError(f"{path} holds no agent's policy")
-        if header.get("stage", stage) != stage:
-            raise RunError(f"{path} holds the policy of stage {shown(header['stage'])}")
-        self.must_be_ours(header, path)
-        known = entry.get("policies", {}).get(name, entry.get("sha256", sha256))
+        if (of := header.get("stage")) != stage:
+            raise RunError(f"{path} holds the policy of stage {shown(of)}")
+        self.must_be_ours(header.get("run"), path)
+        known = entry.get("policies", {}).get(name, entry.get("sha256"))
         check_unchanged(path, sha256, known)
         return AgentPolicy.from_file(tensors, header, str(path))
 
@@ -477,7 +475,7 @@ class RunDirectory:
         """Return the sizes of ``metrics.jsonl`` and ``lineage.jsonl``, for ``rewind``."""
         return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
 
-    def rewind(self, at: Mapping[str, Any]) -> list[str]:
+    def rewind(self, at: Mapping[str, int]) -> list[str]:
         """Drop the lines after the sizes of ``line_bytes``: training writes them again.
 
         Args:

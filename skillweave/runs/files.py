@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import RunError
-from skillweave.reading import check_file, parse_json, read_file, shown
+from skillweave.policies.files import check_file, parse_json, read_file, shown
+from skillweave.schema import fit
 
 SCHEMA = 1
 """Version of all files; readers refuse newer ones."""
@@ -218,6 +219,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return read_signed(path)[:2]
 
 
+def record_in(kind: Any, header: Mapping[str, Any], path: Path) -> Any:
+    """Return a file's header as a dataclass; a RunError names the file and a wrong field."""
+    return fit(kind, {k: v for k, v in header.items() if k not in ("schema", "sha256")}, str(path))
+
+
 def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     """Return tensors, header and checksum written by ``write_tensors``."""
     header, tensors = _open(path, with_tensors=True)
@@ -230,7 +236,7 @@ def read_signed(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], str]:
     return {k: v.clone() for k, v in tensors.items()}, header, sha256
 
 
-def check_unchanged(path: Path, actual: str, recorded: str) -> None:
+def check_unchanged(path: Path, actual: str, recorded: str | None) -> None:
     """Raise a RunError where a file's checksum differs from the one that the run recorded."""
     if actual != recorded:
         raise RunError(

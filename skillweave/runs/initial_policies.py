@@ -179,7 +179,7 @@ def initial_policy(
             f"{path} is missing: {name!r} needs it to begin. Restore the file, or train again"
         )
     tensors, header, sha256 = read_signed(path)
-    run.must_be_ours(header, path)
+    run.must_be_ours(header.get("run"), path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
     check_unchanged(path, sha256, start["copy"])

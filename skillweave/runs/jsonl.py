@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import RunError
-from skillweave.reading import check_file, fit, load_json, shown
+from skillweave.policies.files import check_file, load_json, shown
 from skillweave.runs.links import own_copy
+from skillweave.schema import fit
 
 
 class JsonLines:
@@ -19,7 +20,7 @@ class JsonLines:
 
     Args:
         path: the file.
-        schema: the schema of each line (see ``reading.fit``); None: any object.
+        schema: the schema of each line (see ``schema.fit``); None: any object.
         next_step: returns the command to type when a full disk has space again, for messages.
     """
 

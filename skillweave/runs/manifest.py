@@ -9,17 +9,18 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.errors import RunError
 from skillweave.paths import names_in
-from skillweave.reading import fit, shown
+from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.files import read_json
-from skillweave.settings import AtLeastOne, Check, Count, NonNegative, Positive
+from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, fit
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -119,7 +120,8 @@ class Best(TypedDict):
     value: float
 
 
-class BestSoFar(TypedDict):
+@dataclass(frozen=True)
+class BestSoFar:
     """The best evaluation so far of a stage in training."""
 
     steps: Count
@@ -237,7 +239,7 @@ class Manifest(TypedDict):
     stages: list[StageEntry]
     created: str
     versions: dict[str, str]
-    id: NotRequired[str]
+    id: str
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
     keep: NotRequired[Literal["last", "best"]]
@@ -272,26 +274,20 @@ MetricsLine = TypedDict(
 """A line of ``metrics.jsonl``: an update, with further numbers of its algorithm."""
 
 
-class Checkpoint(TypedDict):
-    """A checkpoint's header."""
-
-    stage: NodePath
-    update: Count
-    steps: Count
-    evaluation_steps: Count
-    seconds: NonNegative
-    metrics: dict[str, float | None]
-    metrics_bytes: Count
-    lineage_bytes: NotRequired[Count]
-    run: NotRequired[str]
-    kept_best: NotRequired[BestSoFar]
-    """The best evaluation so far, if the best weights are kept."""
-
-
 # Populations
 
 
-class MemberEntry(TypedDict):
+@dataclass(frozen=True)
+class Origin:
+    """The origin of a member: its parent, and the old and new values of changed settings."""
+
+    parent: Count | None = None
+    mutation: str = "start"
+    changes: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MemberEntry:
     """A member of a population, in a checkpoint's header."""
 
     number: Count
@@ -300,15 +296,8 @@ class MemberEntry(TypedDict):
     origin: Origin
 
 
-class Origin(TypedDict):
-    """The origin of a member: its parent and its mutation."""
-
-    parent: Count | None
-    mutation: str
-    changes: dict[str, tuple[Any, Any]]
-
-
-class BestEntry(TypedDict):
+@dataclass(frozen=True)
+class BestEntry:
     """The best member of a population so far."""
 
     fitness: float
@@ -331,15 +320,42 @@ class LineageLine(TypedDict):
     settings: dict[str, Any]
 
 
-class Generation(Checkpoint):
-    """The header of a population's checkpoint."""
+@dataclass(frozen=True)
+class Generation:
+    """A population, in a checkpoint's header."""
 
     fitness_steps: Count
     generation: Count
     rounds: Count
     next_number: Count
     members: Annotated[list[MemberEntry], Check("at least one member", bool)]
-    best: BestEntry
+    best: BestEntry | None
+
+
+# Checkpoints
+
+
+@dataclass
+class Checkpoint:
+    """A checkpoint's header: the progress of a stage in training."""
+
+    stage: NodePath
+    update: Count
+    steps: Count
+    evaluation_steps: Count
+    seconds: NonNegative
+    metrics: dict[str, float]
+    metrics_bytes: Count | None = None
+    lineage_bytes: Count | None = None
+    run: str | None = None
+    kept_best: BestSoFar | None = None
+    """The best evaluation so far, if the best weights are kept."""
+    population: Generation | None = None
+
+    @classmethod
+    def start(cls, stage: str) -> Self:
+        """Return the header of a stage before its first update."""
+        return cls(stage, 0, 0, 0, 0.0, {})
 
 
 # Reading and writing ``run.json``
@@ -364,7 +380,7 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         config_from_json(stage["algorithm"], file, f"{where}.algorithm")
         if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
-    if "id" in data and "sha256" not in data:
+    if "sha256" not in data:
         raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
 
 

@@ -44,7 +44,7 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     tensors, header = read_tensors(path)
     if header.get("learns") != name:
         raise RunError(f"{path} does not hold the state of {name!r}")
-    run.must_be_ours(header, path)
+    run.must_be_ours(header.get("run"), path)
     if run.stage(header.get("stage", "")).get("kept", {}).get("kept") == "before":
         return None
     return state_from(tensors, like, str(path))

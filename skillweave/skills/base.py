@@ -18,7 +18,7 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.policies.spaces import Space as Data
-from skillweave.settings import AtLeastOne, NonNegative, Share, annotations_of, fitted
+from skillweave.schema import AtLeastOne, NonNegative, Share, annotations_of, fitted
 from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import answer, as_array, called

@@ -17,9 +17,9 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunEr
 from skillweave.messages import short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.files import check_file
 from skillweave.policies.mapped import OnnxFile, fits_shape, open_session
 from skillweave.policies.spaces import space_of
-from skillweave.reading import check_file
 from skillweave.skills.foreign_policy import SEES
 from skillweave.skills.mapped import MappedPolicy
 from skillweave.skills.mapping import PolicyMapping, mapping_of

@@ -16,9 +16,8 @@ from skillweave.errors import DeclarationError, MissingExtra, PolicyError
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Turn
-from skillweave.policies.files import checksum
+from skillweave.policies.files import check_file, checksum, read_file
 from skillweave.policies.mapped import Shapes
-from skillweave.reading import check_file, read_file
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of

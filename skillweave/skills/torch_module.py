@@ -15,9 +15,8 @@ from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.messages import short, shortened
 from skillweave.policies.core import Turn
-from skillweave.policies.files import checksum
+from skillweave.policies.files import checksum, read_file
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
-from skillweave.reading import read_file
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy

@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.errors import EnvError, RunError
+from skillweave.policies.files import shown
 from skillweave.policies.spaces import Space
-from skillweave.reading import fit, shown
-from skillweave.settings import LARGEST, AtLeastOne, Check
+from skillweave.schema import LARGEST, AtLeastOne, Check, fit
 from skillweave.spaces.choices import ChoiceSpace
 from skillweave.spaces.observations import image_layout
 from skillweave.spaces.packing import OBSERVATIONS, obs_dtype, parts

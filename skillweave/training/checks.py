@@ -13,7 +13,7 @@ from skillweave.buffers.ram import check_memory
 from skillweave.envs.checks import is_batched, refuse_batched
 from skillweave.envs.make import EnvSpec
 from skillweave.messages import short
-from skillweave.settings import Check
+from skillweave.schema import Check
 from skillweave.spaces import obs_dtype, obs_shape
 
 EnvValue = Annotated[

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Annotated, Any, Literal
 
 from skillweave.algorithms.config import AlgorithmSettings
-from skillweave.settings import AtLeastOne, Check, annotations_of, checked_settings, fitted
+from skillweave.schema import AtLeastOne, Check, annotations_of, fitted, settings
 from skillweave.training.options import CallReports, Reports
 
 InfoKeys = Annotated[
@@ -17,8 +17,7 @@ InfoKeys = Annotated[
 """Keys of ``info``."""
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class TrainDefaults(CallReports):
     """Values that ``train`` uses for arguments that its caller leaves out.
 

@@ -26,8 +26,8 @@ from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.policies.parts import OWN_GOAL
+from skillweave.schema import AtLeastOne, Count
 from skillweave.seeding import Seeds, global_generators
-from skillweave.settings import AtLeastOne, Count
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
 from skillweave.skills.goals import goals_of

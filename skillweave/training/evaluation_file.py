@@ -13,12 +13,11 @@ from typing import Any, NotRequired, TypedDict
 
 from skillweave.errors import RunError
 from skillweave.paths import names_in
-from skillweave.reading import fit
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, write_json
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import steps_of, trackers_of
-from skillweave.settings import Count
+from skillweave.schema import Count, fit
 from skillweave.training.evaluation import Evaluation
 
 SCORE = "evaluation.json"

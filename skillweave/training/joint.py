@@ -228,9 +228,7 @@ class JointAgents(OneAgent):
             quota = 0 if learns_all_rows else max(1, round(rows * self.together.quota / row_steps))
             return RolloutLearner(stack, seeds, quota)
         store = store_of(stack.algorithm, num_envs)
-        learner = ReplayLearner(
-            [stack], store, seeds, row_steps=row_steps, goes_on_at=log.at["steps"]
-        )
+        learner = ReplayLearner([stack], store, seeds, row_steps=row_steps, goes_on_at=log.at.steps)
         if learnt_before:
             learner.act_from_the_start()
         return learner
@@ -250,12 +248,12 @@ class JointAgents(OneAgent):
                 learns = self.first in self.stage.entry["learns"]
                 more = "raise together.epsilon, " if learns else ""
                 log.message(
-                    f"skill {name!r} acted in {rows:,} of {log.at['steps']:,} steps only, too few "
+                    f"skill {name!r} acted in {rows:,} of {log.at.steps:,} steps only, too few "
                     f"to learn from once: lower together.quota, {more}or give more steps"
                 )
             elif not rows:
                 log.message(
-                    f"skill {name!r} was never called in {log.at['steps']:,} steps, so it learnt "
+                    f"skill {name!r} was never called in {log.at.steps:,} steps, so it learnt "
                     "nothing: perhaps its initiation() is never True where the other skills "
                     "lead, or the selector never chooses it"
                 )

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from skillweave.algorithms.policy import state_from
+from skillweave.runs.manifest import BestSoFar
 from skillweave.types import prefixed, unprefixed
 
 
@@ -46,9 +47,7 @@ class KeepBest:
             states: returns the present states of the learners.
         """
         value = evaluation.get(f"eval_{self.of}", math.nan)
-        if not self.wanted or math.isnan(
-            value
-        ):  # no evaluation, or none of its episodes could start
+        if not self.wanted or math.isnan(value):  # or no evaluation, or no episode could start
             return
         if self.metrics and self._rank(evaluation) < self._rank(self.metrics):
             return
@@ -60,11 +59,9 @@ class KeepBest:
     def _rank(self, metrics: Mapping[str, float]) -> tuple[float, float]:
         return metrics[f"eval_{self.of}"], metrics["eval_return"]
 
-    def header(self) -> dict[str, Any]:
-        """Return the entries for the header of a checkpoint."""
-        if not self.metrics:
-            return {}
-        return {"kept_best": {"steps": self.steps, "metrics": self.metrics}}
+    def header(self) -> BestSoFar | None:
+        """Return the entry for the header of a checkpoint."""
+        return BestSoFar(self.steps, self.metrics) if self.metrics else None
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors for a checkpoint."""
@@ -75,7 +72,7 @@ class KeepBest:
 
     def load(
         self,
-        header: Mapping[str, Any],
+        best: BestSoFar | None,
         extra: Mapping[str, Tensor],
         like: Mapping[str, Any],
         where: str,
@@ -83,15 +80,15 @@ class KeepBest:
         """Restore the best evaluation from a checkpoint.
 
         Args:
-            header: of the checkpoint.
+            best: of the checkpoint's header.
             extra: its tensors beside the state.
             like: states of the learners' shapes, by name.
             where: the run, for messages.
         """
-        if (best := header.get("kept_best")) is None:
+        if best is None:
             return
-        self.steps = int(best["steps"])
-        self.metrics = dict(best["metrics"])
+        self.steps = best.steps
+        self.metrics = best.metrics
         saved = unprefixed("best", dict(extra))
         self.states = {
             name: state_from(unprefixed(name, saved), example, f"{where}: the best of {name}")

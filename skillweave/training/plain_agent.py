@@ -16,7 +16,7 @@ from skillweave.envs.make import EnvSpec, Spaces
 from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
-from skillweave.settings import AtLeastOne, Share, check_fields
+from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
 from skillweave.training.defaults import TrainDefaults

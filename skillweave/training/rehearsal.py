@@ -81,7 +81,7 @@ def rehearse(learner: Learner, run: RunDirectory, entry: Mapping[str, Any], poli
             "or repair again in another directory"
         )
     tensors, header, sha256 = read_signed(path)
-    run.must_be_ours(header, path)
+    run.must_be_ours(header.get("run"), path)
     check_unchanged(path, sha256, recorded)
     (stack,) = learner.stacks
     device = stack.state.params.device

@@ -13,7 +13,7 @@ from skillweave.planning.columns import ENDS
 from skillweave.planning.hand_over import HandOver, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
-from skillweave.settings import Count
+from skillweave.schema import Count
 from skillweave.skills import is_trained
 from skillweave.skills.base import RecordedSkill
 from skillweave.training.played_calls import PlayedCalls

@@ -20,7 +20,7 @@ from skillweave.errors import DeclarationError, EnvError, SkillweaveError, rewor
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
 from skillweave.paths import SELECTOR, join
-from skillweave.settings import AtLeastOne, Fraction, NonNegative, Positive, checked_settings
+from skillweave.schema import AtLeastOne, Fraction, NonNegative, Positive, settings
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
 from skillweave.training.role import Role
@@ -81,8 +81,7 @@ def target_of(
     return None if target_success is None else Target("success", float(target_success))
 
 
-@checked_settings
-@dataclass(frozen=True)
+@settings
 class Together:
     """Settings of a selector and skills that learn from the same steps.
 

@@ -12,11 +12,12 @@ from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.errors import RunError, SkillweaveError, reworded
 from skillweave.messages import close_matches
 from skillweave.notices import notice
-from skillweave.reading import shown
+from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.comparison import best_words
-from skillweave.runs.directory import RunDirectory
+from skillweave.runs.directory import LINES, RunDirectory
 from skillweave.runs.initial_policies import remove_initial_policies
+from skillweave.runs.manifest import Checkpoint
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
@@ -28,8 +29,6 @@ ENOUGH = 20
 SLOW_SECONDS = 10.0
 """Seconds of an evaluation that cause a message, if training takes less."""
 T = TypeVar("T")
-START = {"update": 0, "steps": 0, "evaluation_steps": 0, "seconds": 0.0, "metrics": {}}
-"""Header of a stage before its first update."""
 LARGEST_SPARE = 100 * 2**20
 """Most bytes of replay buffers that a finished stage keeps; without them it fills new ones."""
 
@@ -76,21 +75,23 @@ class StageLog:
     """Writer of a stage's entry in the manifest, its lines and checkpoints, and its listeners.
 
     Args:
-        at: the header of the checkpoint to continue from, or ``START``.
+        at: the header of the checkpoint to continue from; its progress is counted on.
     """
 
     def __init__(
-        self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Mapping[str, Any]
+        self, name: str, run: RunDirectory, listeners: tuple[Listener, ...], at: Checkpoint
     ) -> None:
         self.run = run
         self.listeners = listeners
         self.entry = run.stage(name)
-        self.at = dict(at)
+        self.at = at
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         self._has_final = False
         # Before a stage trains, its entry has the size that the files had when it was last done.
         is_new = self.entry["status"] != "training"
-        incomplete = run.rewind(self.at if is_new else self.entry | self.at)
+        known = {} if is_new else self.entry
+        now = {k: v for k in LINES if (v := getattr(at, k)) is not None}
+        incomplete = run.rewind(known | now)
         sizes = {} if is_new or incomplete else self.entry
         self.entry.update(run.line_bytes() | sizes, status="training")
         run.save()
@@ -102,7 +103,8 @@ class StageLog:
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write the report of an update, and pass it to listeners."""
         name = self.entry["name"]
-        self.at.update(update=update, steps=steps, seconds=seconds, metrics=metrics)
+        self.stands(update, steps, seconds)
+        self.at.metrics = metrics
         header = {"stage": name, "update": update, "steps": steps}
         self.run.log(header | {"seconds": round(seconds, 4)} | metrics)
         for listener in self.listeners:
@@ -115,7 +117,7 @@ class StageLog:
 
     def stands(self, update: int, steps: int, seconds: float) -> None:
         """Set the counts of the next checkpoint."""
-        self.at.update(update=update, steps=steps, seconds=seconds)
+        self.at.update, self.at.steps, self.at.seconds = update, steps, seconds
 
     def message(self, text: str) -> None:
         """Send a message about the stage to listeners."""
@@ -134,27 +136,23 @@ class StageLog:
     def report_learnt_nothing(self) -> None:
         """Report that the weights are still the initial ones."""
         self.message(
-            f"it learnt nothing in {self.at['steps']:,} steps, as too few of them were its own: "
+            f"it learnt nothing in {self.at.steps:,} steps, as too few of them were its own: "
             "perhaps its initiation() is seldom True where the others lead. Widen it, or give more "
             "steps"
         )
 
-    def save(self, state: Any | None, extra: Mapping[str, Tensor] | None, **more: Any) -> None:
-        """Write a checkpoint: a state, other tensors for resuming, and ``more`` in its header.
+    def save(self, state: Any | None, extra: Mapping[str, Tensor] | None) -> None:
+        """Write a checkpoint: a state, and other tensors for resuming.
 
         The updates and steps of ``at`` must be of this moment; its metrics are the latest reported
         ones.
         """
-        self.run.save_checkpoint(state, self._header(more), extra)
+        self.run.save_checkpoint(state, self.at, extra)
         self._notify_callbacks()
-
-    def _header(self, more: Mapping[str, Any]) -> dict[str, Any]:
-        fields = ("update", "steps", "evaluation_steps", "seconds", "metrics")
-        return {"stage": self.entry["name"]} | {k: self.at[k] for k in fields} | dict(more)
 
     def _notify_callbacks(self) -> None:
         for callback in self._callbacks:
-            callback.checkpoint(self.entry["name"], self.at["steps"], self.at["metrics"])
+            callback.checkpoint(self.entry["name"], self.at.steps, self.at.metrics)
 
     def report_absent(self, tally: EpisodeTally, *, over: bool) -> None:
         """Report once in a run the logged keys of ``info`` that never occurred.
@@ -203,15 +201,15 @@ class StageLog:
 
     def stopped(self) -> None:
         """Record that a callback has ended the stage."""
-        self.entry["stopped"] = {"steps": self.at["steps"]}
+        self.entry["stopped"] = {"steps": self.at.steps}
         self.message(
-            f"the callback returned False after {self.at['steps']:,} steps: the stage ends here"
+            f"the callback returned False after {self.at.steps:,} steps: the stage ends here"
         )
 
     def kept_best(self, best: KeepBest) -> None:
         """Record that the stage ends with the weights of its best evaluation."""
         self.entry["best"] = {"steps": best.steps, "of": best.of, "value": best.value}
-        self.at["metrics"] = self.at["metrics"] | best.metrics
+        self.at.metrics = self.at.metrics | best.metrics
         self.message(best_words(self.entry["best"]))
 
     def save_final(
@@ -219,7 +217,6 @@ class StageLog:
         state: Any | None,
         extra: Mapping[str, Tensor],
         spare: Mapping[str, Tensor],
-        more: Mapping[str, Any],
         *,
         spent: bool,
     ) -> None:
@@ -230,17 +227,15 @@ class StageLog:
         Args:
             extra: tensors that continuing needs beside the state.
             spare: replay buffers, which are left out if they are large.
-            more: entries of the header.
             spent: the budget is spent, so the state is a checkpoint, too, in case writing the
                 policies fails. Else a run that is killed now repeats the end of the stage from
                 the previous checkpoint.
         """
-        header = self._header(more)
         write = self.run.save_checkpoint if spent else self.run.save_final
         small = sum(x.numel() * x.element_size() for x in spare.values()) <= LARGEST_SPARE
         for tensors in ({**extra, **spare}, extra) if spare and small else (extra,):
             try:
-                write(state, header, tensors)
+                write(state, self.at, tensors)
             except RunError as error:
                 problem = error
             else:
@@ -257,10 +252,10 @@ class StageLog:
 
     def reached(self, value: float) -> None:
         """Record that the stage has reached its target."""
-        self.entry["reached"] = {"steps": self.at["steps"], "value": value}
+        self.entry["reached"] = {"steps": self.at.steps, "value": value}
         target = self.entry["target"]
         self.message(
-            f"target reached after {self.at['steps']:,} steps: {target['of']} {value:g}, "
+            f"target reached after {self.at.steps:,} steps: {target['of']} {value:g}, "
             f"the target is {target['at_least']:g}"
         )
 
@@ -280,11 +275,11 @@ class StageLog:
             policy.name_outliers(repr(name))
         if self._has_final:
             self.run.keep_final(entry["name"])
-        entry.update(status="done", steps=at["steps"], seconds=round(at["seconds"], 3))
+        entry.update(status="done", steps=at.steps, seconds=round(at.seconds, 3))
         entry.update(self.run.line_bytes())  # so that a later stage notices removed lines
-        entry["evaluation_steps"] = at["evaluation_steps"]
-        entry.update(steps_per_second=round(at["steps"] / max(at["seconds"], 1e-9), 1))
-        entry["final"] = at["metrics"]
+        entry["evaluation_steps"] = at.evaluation_steps
+        entry.update(steps_per_second=round(at.steps / max(at.seconds, 1e-9), 1))
+        entry["final"] = at.metrics
         if (succeeded := self._succeeded()) is not None:
             entry["succeeded"] = succeeded
         self.run.save()
@@ -299,7 +294,7 @@ class StageLog:
         remove_initial_policies(self.run, entry["name"])
         remove_rehearsal(self.run, entry)
         for listener in self.listeners:
-            listener.done(entry["name"], at["steps"], at["seconds"], at["metrics"])
+            listener.done(entry["name"], at.steps, at.seconds, at.metrics)
 
     def _save_policies(self, policies: Mapping[str, AgentPolicy]) -> None:
         """Write the policies; on a full disk delete final states of earlier stages first."""

@@ -85,9 +85,6 @@ class StageRun:
 class StageLearner(Protocol):
     """The learner of a stage: one agent, several agents, or a population."""
 
-    schema: Any
-    """Schema of the headers of its checkpoints."""
-
     def open(self) -> Any | None:
         """Make the environments; return the initial state, if checkpoints hold one."""
         ...

@@ -34,7 +34,7 @@ from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.rehearsal import rehearse, remove_rehearsal
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
-from skillweave.training.stage_log import START, Listener, StageLog, resumed
+from skillweave.training.stage_log import Listener, StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, prefixed, unprefixed
 
@@ -48,8 +48,6 @@ class OneAgent:
     Args:
         make_collectors: makes the collectors, here or in other processes.
     """
-
-    schema: Any = Checkpoint
 
     def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
         if stage.entry.get("evolution") is not None:
@@ -114,7 +112,7 @@ class OneAgent:
             config.num_envs,
             stage.seeds,
             row_steps=stage.learning_task.row_steps,
-            goes_on_at=log.at["steps"],
+            goes_on_at=log.at.steps,
         )
         keep_to_guide(learner, stage.entry.get("guide_kl"))
         rehearse(learner, stage.run, stage.entry, stage.policies.get(stage.learner))
@@ -160,14 +158,14 @@ class OneAgent:
         needed = prefixed("learner", self.learner.kept(requested=False, replay=False))
         state, extra = self.saved(needed)
         spare = {k: v for k, v in whole.items() if k not in needed}
-        log.save_final(state, extra, spare, self.best.header(), spent=spent)
+        log.save_final(state, extra, spare, spent=spent)
 
     def go_on(self, state: Any | None, extra: dict[str, Tensor], log: StageLog) -> None:
         """Restore a checkpoint."""
         self.learner = self.learner_from(state, extra, log)
-        self.at = at = Progress(*(log.at[k] for k in ("update", "steps", "seconds")))
+        self.at = at = Progress(log.at.update, log.at.steps, log.at.seconds)
         self._steps_before = at.steps
-        self.best.load(log.at, extra, self.states(), str(log.run.path))
+        self.best.load(log.at.kept_best, extra, self.states(), str(log.run.path))
         learner, collectors, episodes = self.learner, self.collectors, self.episodes
         if unprefixed("collector", extra):
             ids = resumed(log, lambda: resume(learner, collectors, episodes, extra, at))
@@ -190,10 +188,11 @@ class OneAgent:
             # If the best weights count, the last ones must be evaluated, too.
             last = self.best.wanted and tick.steps >= self.stage.budget
             evaluation = self.evaluation.due(tick.since, tick.steps, self.play, also=last)
-            log.at["evaluation_steps"] += self.evaluation.spent()
+            log.at.evaluation_steps += self.evaluation.spent()
             if evaluation:
                 log.tell_slow(self.evaluation.took, self.evaluation.after)
             self.best.see(evaluation, tick.steps, self.states)
+            log.at.kept_best = self.best.header()
             log.tick(tick.update, tick.steps, tick.seconds, tick.metrics | evaluation)
             # No checkpoint at the end: a run that resumes from the previous one comes here again.
             if target is not None and target.reached(evaluation, self.stage.name) is not None:
@@ -203,7 +202,7 @@ class OneAgent:
 
         def on_checkpoint(saved: Saved) -> None:
             log.stands(saved.at.update, saved.at.steps, saved.at.seconds)
-            log.save(*self.saved(saved.extra), **self.best.header())
+            log.save(*self.saved(saved.extra))
             if log.stop_requested:
                 raise _Stopped
 
@@ -222,13 +221,13 @@ class OneAgent:
             )
         except (_TargetReached, _Stopped) as end:
             # Count the steps collected since the update, too.
-            log.at["steps"] = self._steps_before + self.collectors.steps_made - made
+            log.at.steps = self._steps_before + self.collectors.steps_made - made
             if isinstance(end, _Stopped):
                 log.stopped()
                 self._save_final(log, spent=False)
             else:
                 assert target is not None
-                log.reached(float(log.at["metrics"][f"eval_{target.of}"]))
+                log.reached(float(log.at.metrics[f"eval_{target.of}"]))
         else:
             self._save_final(log, spent=True)
             if self.stage.entry["kind"] == "skill" and self._is_unchanged():
@@ -334,8 +333,8 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
         try:
             fresh = learner.open()
             kind = None if fresh is None else type(fresh)
-            checkpoint = run.load_checkpoint(kind, stage.name, like=fresh, schema=learner.schema)
-            state, at, extra = checkpoint or (fresh, START, {})
+            checkpoint = run.load_checkpoint(kind, stage.name, like=fresh)
+            state, at, extra = checkpoint or (fresh, Checkpoint.start(stage.name), {})
             log = StageLog(stage.name, run, course.listeners, at)
             learner.go_on(state, extra, log)
             policies = learner.train(log)

@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range
+from skillweave import CNN, DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import KINDS
-from skillweave.evolution.mutation import check_mutations, mutate, random_config, with_settings
+from skillweave.evolution.mutation import (
+    check_mutations,
+    difference,
+    mutate,
+    random_config,
+    with_settings,
+)
 from skillweave.evolution.stacks import Member, join
 from skillweave.experience import Sample
 from skillweave.seeding import Seeds
@@ -222,3 +228,9 @@ def test_a_limit_of_gradients_may_be_none_and_may_be_set():
     assert with_settings(made, max_grad_norm=2.0).state.max_grad_norm.tolist() == [2.0]
     back = with_settings(with_settings(made, max_grad_norm=2.0), max_grad_norm=None)
     assert back.state.max_grad_norm.tolist() == [LARGEST]
+
+
+def test_a_change_of_a_convolution_is_recorded_by_its_parts() -> None:
+    before = PPO(network=Network(cnn=CNN()))
+    after = replace(before, network=replace(before.network, cnn=CNN(channels=(32, 64, 48))))
+    assert difference(before, after) == {"network.cnn.channels": ((32, 64, 64), (32, 64, 48))}

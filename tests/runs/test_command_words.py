@@ -1,6 +1,7 @@
 """What people are told to type works: it names the file with their code."""
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import pytest
 
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import command_words, saved_words
+from skillweave.runs.manifest import Checkpoint
 
 
 @pytest.mark.parametrize(
@@ -39,7 +41,7 @@ def test_what_is_saved_is_what_a_resumed_run_goes_on_from(tmp_path):
     run, kept = SimpleNamespace(path=tmp_path, manifest={"stages": stages}), Checkpoints(tmp_path)
     assert saved_words(run) == "saved after left"
     for steps in (100, 200):
-        kept.save({}, {"stage": "right", "steps": steps})
+        kept.save({}, asdict(Checkpoint("right", 1, steps, 0, 0.0, {})))
     assert saved_words(run) == "saved at 200 steps of right"
     names = "checkpoint", "checkpoint.new", "checkpoint.previous"
     latest, fresh, before = (tmp_path / f"{name}.safetensors" for name in names)

@@ -24,7 +24,14 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_json, read_tensors, write_json, write_tensors
-from skillweave.runs.manifest import Generation, versions
+from skillweave.runs.manifest import (
+    BestEntry,
+    Checkpoint,
+    Generation,
+    MemberEntry,
+    Origin,
+    versions,
+)
 from skillweave.seeding import Seeds
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
@@ -34,7 +41,6 @@ STAGES: list[dict[str, Any]] = [
     {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM}
     | {"kind": "selector", "learns": ["selector"], "decides": "selector"},
 ]
-AT = {"seconds": 1.0, "evaluation_steps": 0, "metrics": {}}
 
 
 def manifest() -> dict[str, Any]:
@@ -91,7 +97,7 @@ def damage(path: Path) -> None:
 
 def save(run: RunDirectory, seed: int, stage: str = "landing") -> Learnt:
     state = learnt(seed)
-    run.save_checkpoint(state, {"stage": stage, "update": seed, "steps": 10 * seed} | AT)
+    run.save_checkpoint(state, Checkpoint(stage, seed, 10 * seed, 0, 0.0, {}))
     return state
 
 
@@ -188,8 +194,8 @@ def test_a_checkpoint_comes_back_exactly(run: RunDirectory) -> None:
     found = RunDirectory.open(run.path).load_checkpoint(Learnt, "landing")
     assert found is not None
     assert_same(found[0], state)
-    assert (found[1]["update"], found[1]["steps"]) == (3, 30)
-    assert found[1]["metrics_bytes"] == (run.path / "metrics.jsonl").stat().st_size > 0
+    assert (found[1].update, found[1].steps) == (3, 30)
+    assert found[1].metrics_bytes == (run.path / "metrics.jsonl").stat().st_size > 0
 
 
 def test_there_is_no_checkpoint_at_first(run: RunDirectory) -> None:
@@ -222,7 +228,7 @@ def test_a_bad_checkpoint_falls_back_to_the_one_before(run: RunDirectory, how: s
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
     assert_same(found[0], before)
-    assert found[1]["update"] == 1
+    assert found[1].update == 1
 
 
 def test_two_damaged_checkpoints_are_an_error_that_names_both(run: RunDirectory) -> None:
@@ -250,8 +256,7 @@ def test_a_checkpoint_of_another_algorithm_is_refused(run: RunDirectory) -> None
     class Other:
         bias: Tensor
 
-    at = {"stage": "landing", "update": 1, "steps": 1} | AT
-    run.save_checkpoint(Other(torch.zeros(1)), at)
+    run.save_checkpoint(Other(torch.zeros(1)), Checkpoint("landing", 1, 1, 0, 0.0, {}))
     with pytest.raises(RunError, match="has other fields than this version"):
         run.load_checkpoint(Learnt, "landing")
 
@@ -352,7 +357,7 @@ def test_rewinding_drops_what_came_after_the_checkpoint(run: RunDirectory) -> No
         run.log({"update": i})
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
-    run.rewind({"metrics_bytes": found[1]["metrics_bytes"]})
+    run.rewind({"metrics_bytes": found[1].metrics_bytes})
     assert [r["update"] for r in run.metrics()] == [0, 1, 2]
     run.log({"update": 3})
     assert [r["update"] for r in run.metrics()] == [0, 1, 2, 3]
@@ -560,7 +565,7 @@ def test_a_checkpoint_with_a_damaged_header_falls_back_to_the_one_before(
     write_tensors(run.path / "checkpoint.safetensors", tensors, header | {"steps": "many"})
     found = run.load_checkpoint(Learnt, "landing")
     assert found is not None
-    assert found[1]["update"] == 1
+    assert found[1].update == 1
 
 
 # One process at a time, and what a killed one leaves
@@ -722,21 +727,16 @@ def test_a_checkpoint_that_cannot_be_renamed_is_an_error_for_people(
 def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     run: RunDirectory, field: str
 ) -> None:
-    header: dict[str, Any] = {"stage": "landing", "update": 1, "steps": 1} | AT
-    origin = {"parent": None, "mutation": "start", "changes": {"gamma": [0.9, 0.99]}}
-    member = {"number": 0, "steps": 1, "config": ALGORITHM, "origin": origin}
-    best = {"fitness": 1.0, "number": 0, "generation": 0, "policy": {}}
-    header |= {
-        "generation": 1,
-        "rounds": 0,
-        "fitness_steps": 0,
-        "next_number": 1,
-        "lineage_bytes": 0,
-    }
-    header |= {"members": [member], "best": best}
-    run.save_checkpoint(learnt(1), header)
-    assert run.load_checkpoint(Learnt, "landing", schema=Generation) is not None
-    run.save_checkpoint(learnt(1), {k: v for k, v in header.items() if k != field})
-    (run.path / "checkpoint.previous.safetensors").unlink()
-    with pytest.raises(RunError, match=f"damaged: no field '{field}'"):
-        run.load_checkpoint(Learnt, "landing", schema=Generation)
+    member = MemberEntry(0, 1, ALGORITHM, Origin(changes={"gamma": (0.9, 0.99)}))
+    population = Generation(0, 1, 0, 1, [member], BestEntry(1.0, 0, 0, {}))
+    saved = Checkpoint("landing", 1, 1, 0, 0.0, {}, population=population)
+    run.save_checkpoint(learnt(1), saved)
+    found = run.load_checkpoint(Learnt, "landing")
+    assert found is not None
+    assert found[1].population == population
+    path = run.path / "checkpoint.safetensors"
+    tensors, header = read_tensors(path)
+    del header["population"][field]
+    write_tensors(path, tensors, header)
+    with pytest.raises(RunError, match=f"damaged: population has no field '{field}'"):
+        run.load_checkpoint(Learnt, "landing")
