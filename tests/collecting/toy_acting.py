@@ -6,6 +6,7 @@ import itertools
 import os
 import signal
 import zlib
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,8 @@ class Mortal(Again):
     fuse: Any = None  # a file with "tag", removed when it has burnt
 
     def step(self, action: int) -> Any:
-        if self.fuse is not None and self.fuse.exists() and self.t == 2:
-            self.fuse.unlink()
-            os.kill(os.getpid(), signal.SIGKILL)
+        if self.fuse is not None and self.t == 2:
+            with suppress(FileNotFoundError):  # it burnt already, perhaps in another process now
+                self.fuse.unlink()
+                os.kill(os.getpid(), signal.SIGKILL)
         return super().step(action)

@@ -115,7 +115,7 @@ def test_a_selectors_training_logs_whole_calls_and_learns_the_same(tmp_path: Pat
         _ = without.calls
     # The skills were ready, so these calls are as good as those of log_calls.
     log.check_skills(run.policy.skills)
-    assert isinstance(run.plan(lambda step: step.next_obs[:, 0] > 0), Run)
+    assert run.plan(lambda step: step.next_obs[:, 0] > 0).explain()
     more = run.log_calls(100)
     assert run.calls.steps == log.steps + more.steps
     again = Hierarchy.load(declare(), tmp_path / "b")
