@@ -287,8 +287,8 @@ def test_the_worlds_show_all_that_can_be_declared() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("user", USERS)
-@pytest.mark.parametrize("first", range(50, 1_000, 50))
-def test_many_more_worlds_are_played_as_the_reference_does(first: int, user: str) -> None:
-    for seed in range(first, first + 50):
-        check(USERS[user], world(seed))
+@pytest.mark.parametrize("first", range(50, 1_000, 25))
+def test_many_more_worlds_are_played_as_the_reference_does(first: int) -> None:
+    for seed in range(first, first + 25):
+        for user in USERS.values():  # all of them while the reference's episodes are cached
+            check(user, world(seed))
