@@ -30,9 +30,9 @@ from typing import (
 
 import numpy as np
 
-from skillweave.arguments import checked_names, meant
+from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.policies.files import shown
 
 C = TypeVar("C", bound=type[Any])
@@ -350,7 +350,7 @@ def _hint(kind: Any, value: Any) -> str:
         known = [f.name for f in fields(kinds[0])]
         for name in value:
             if name not in known:
-                return f" ({group} has no setting {name!r}{meant(name, known, 'they are')})"
+                return f" ({group} has no setting {name!r}{suggest(name, known)})"
         given = ", ".join(f"{k}={short(v, 40)}" for k, v in value.items())
         return f" (write {group}({given}))"
     return ""

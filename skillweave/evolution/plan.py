@@ -14,7 +14,7 @@ from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.training.joint import agents_of
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 
@@ -97,8 +97,8 @@ def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:
         )
     for name, how in evolve.items():
         if name not in stages:
-            known = ", ".join(stages)
-            raise DeclarationError(f"evolve: no stage {short(name)} is trained; there are: {known}")
+            end = suggest(name, stages)
+            raise DeclarationError(f"evolve: no stage {short(name)} is trained{end}")
         if not isinstance(how, Evolution | None):
             raise DeclarationError(
                 f"evolve[{name!r}] is {short(how)}; it must be an Evolution() or None"

@@ -11,7 +11,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.paths import name_of
 from skillweave.schema import fitted
 from skillweave.selectors import Automaton
@@ -202,8 +202,8 @@ def _check_start_calls(level: Level) -> None:
     for name in calls if isinstance(calls, tuple) else ():
         if name not in level.names:
             raise DeclarationError(
-                f"apart.start_calls names {short(name)}, which is no skill here; there are: "
-                f"{', '.join(level.names)}.{close_matches(name, level.names)}"
+                f"apart.start_calls names {short(name)}, which is no skill here"
+                f"{suggest(name, level.names)}"
             )
 
 

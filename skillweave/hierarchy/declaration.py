@@ -21,7 +21,7 @@ from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_s
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
 from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
 from skillweave.hierarchy.settings import Settings, settings_in
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
@@ -115,7 +115,7 @@ class Declaration(Settings, Nestable, Declared):
         """
         skills = roles_of(self).skills
         if not isinstance(name, str) or name not in skills:
-            raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(skills)}")
+            raise DeclarationError(f"no skill {short(name)}{suggest(name, skills)}")
         return skills[name]
 
     def stages(self) -> list[Stage]:

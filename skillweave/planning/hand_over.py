@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
@@ -77,7 +77,7 @@ class HandOver:
         for name, known in ((skill, self.skills), (after, self.before)):
             if name not in known:
                 raise DeclarationError(
-                    f"the log has no skill {short(name)}; its skills are: {', '.join(self.skills)}"
+                    f"the log has no skill {short(name)}{suggest(name, self.skills)}"
                 )
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])

@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.planning.predicates import Event, Held, Predicate, as_event
 from skillweave.policies.plan import Machine
 from skillweave.selectors.automaton import Automaton, check_name, check_transitions
@@ -381,7 +381,7 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
         if name not in skills:
             raise DeclarationError(
                 f"automaton(): the event {name!r} has no skill; give one: "
-                f"automaton({{{name!r}: 'a_skill', ...}}).{close_matches(name, skills)}"
+                f"automaton({{{name!r}: 'a_skill', ...}}){suggest(name, skills, listed=False)}"
             )
         chosen += _names(skills[name])
     return chosen

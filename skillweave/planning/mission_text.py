@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, NoReturn
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.planning.parts import (
     MOST_TOGETHER,
     AnyOrder,
@@ -145,9 +145,8 @@ class _Parser:
             if not self.predicates:
                 name = token.text
                 self.fail(f"{name!r} is no known predicate: give predicates={{{name!r}: …}}", token)
-            known = ", ".join(self.predicates)
-            close = close_matches(token.text, self.predicates)
-            self.fail(f"{token.text!r} is no known predicate; known are: {known}.{close}", token)
+            end = suggest(token.text, self.predicates)
+            self.fail(f"{token.text!r} is no known predicate{end}", token)
         event = self.predicates[token.text]
         if negated is None:
             return event

@@ -12,7 +12,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, RunError
-from skillweave.messages import as_path, close_matches, short
+from skillweave.messages import as_path, short, suggest
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.reporting.report.verdict import is_binary
@@ -167,8 +167,8 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
                     f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
                 )
             raise DeclarationError(
-                f"{run.path} has no metric {short(metric)} of {whose}."
-                f"{close_matches(metric, metrics) or ' There are: ' + ', '.join(sorted(metrics))}"
+                f"{run.path} has no metric {short(metric)} of {whose}"
+                f"{suggest(metric, sorted(metrics))}"
             )
     return metric
 

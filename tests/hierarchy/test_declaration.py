@@ -274,12 +274,12 @@ def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
 KNOWN = "PPO, SelfImitationPPO, DQN, TD3, SAC"
 WRONG_SETTINGS = {
     "call_steps": "name=value",
-    "call_step=4": "call_step'.*did you mean call_steps",
-    "selecter.gamma=1": "selecter.gamma.*did you mean.*selector.gamma",
-    "selector.gama=0.9": "selector.gama.*did you mean.*selector.gamma",
-    "skills.center.learning_rat=1": "learning_rat'.*did you mean.*skills.center.learning_rate",
-    "selector.network.hiden=3": "hiden.*did you mean.*selector.network.hidden",
-    "skills.centre.gamma=1": "'centre'.*center, lean",
+    "call_step=4": "call_step'.*is 'call_steps' meant",
+    "selecter.gamma=1": "selecter.gamma.*is 'selector.gamma",
+    "selector.gama=0.9": "selector.gama.*is 'selector.gamma",
+    "skills.center.learning_rat=1": "learning_rat'.*is 'skills.center.learning_rate",
+    "selector.network.hiden=3": "hiden.*is 'selector.network.hidden",
+    "skills.centre.gamma=1": "'centre'.*is 'center' meant",
     "skills.center=4": f"skills.center=4: no algorithm '4'; there are: {KNOWN}",
     "selector=4": f"selector=4: no algorithm '4'; there are: {KNOWN}, .*Rainbow, DDPG",
     "skills.nobody=DQN": "no skill 'nobody'",

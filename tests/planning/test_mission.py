@@ -211,7 +211,7 @@ def test_texts_and_what_they_mean() -> None:
 @pytest.mark.parametrize(
     ("text", "reason", "word"),
     [
-        ("a then bb then c", "'bb' is no known predicate; known are: a, b, c, d", "bb"),
+        ("a then bb then c", "'bb' is no known predicate: is 'b' meant", "bb"),
         ("a then", "the name of a predicate is expected", ""),
         ("", "the name of a predicate is expected", ""),
         ("a b", "'then', 'or', 'and', or a comma is expected", "b"),
@@ -265,7 +265,7 @@ def test_equal_names_are_numbered_in_linear_time() -> None:
 
 def test_the_nearest_name_is_given_and_long_texts_are_cut() -> None:
     known = {"hover": P[0], "left": P[1]}
-    with pytest.raises(DeclarationError, match="Close matches: hover") as caught:
+    with pytest.raises(DeclarationError, match="is 'hover' meant") as caught:
         Mission.from_text(" then ".join(["hover", "left"] * 40 + ["hovr"]), known)
     _, line, pointer = str(caught.value).split("\n")
     assert line[pointer.index("^") :] == "hovr"

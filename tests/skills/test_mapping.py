@@ -328,7 +328,7 @@ def test_settings_that_are_wrong_are_named(make: Any, message: str) -> None:
             {"sees": ("gyro", "gyroo")},
             r"sees\[1\] reads 'gyroo', which the observation does not ha",
         ),
-        ({"sees": "gyroo"}, "its parts are"),
+        ({"sees": "gyroo"}, "is 'gyro' meant"),
         (
             {"sees": sw.Part("gyro", slice(0, 4))},
             r"sees.places is slice\(0, 4.*there are 3 numbers",
