@@ -8,8 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
 from skillweave.errors import DeclarationError, RunError
 from skillweave.tracebacks import place
 
@@ -44,9 +42,6 @@ ELSEWHERE = {
     "value_coef": "vf_coef",
 }
 """Names that other libraries give to settings, with the names that they have here."""
-
-MOST = 10**12
-"""The largest whole number that an argument may be: a million times it fits into 64 bits."""
 
 
 def short(value: object, longest: int = 100) -> str:
@@ -107,22 +102,6 @@ def error_text(error: BaseException) -> str:
     text = type(error).__name__ + (f": {shortened(message)}" if message else "")
     where = place(error)
     return f"{text.removesuffix('.')} ({where})" if where else text
-
-
-def whole_number(value: object, name: str, least: int) -> int:
-    """Return ``value`` as an int.
-
-    Raises:
-        DeclarationError: it is no whole number, less than ``least``, or more than ``MOST``; the
-            message begins with ``name``.
-    """
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise DeclarationError(f"{name} is {short(value)}; it must be a whole number")
-    if value < least:
-        raise DeclarationError(f"{name} is {short(value)}; it must be at least {least}")
-    if value > MOST:
-        raise DeclarationError(f"{name} is {short(value)}; it must be at most {MOST:,}")
-    return int(value)
 
 
 def absolute(path: str | Path) -> Path:

@@ -38,7 +38,9 @@ from skillweave.policies.files import shown
 C = TypeVar("C", bound=type[Any])
 
 LARGEST = 2**63
-"""The limit of whole numbers."""
+"""The limit of whole numbers in files."""
+BITS = 43
+"""Those that are declared need no more bits: a million times they fit into 64."""
 LARGEST_FLOAT = 3.4e38
 """The limit of other numbers, which tensors of float32 must represent."""
 LONGEST_TEXT = 4096
@@ -169,7 +171,8 @@ class _Fitting:
             whole = isinstance(found, int)
             if not whole and not math.isfinite(found):
                 raise _Unfit(path, found, text or _FINITE)
-            largest, limit = (LARGEST, "2^63") if whole else (LARGEST_FLOAT, "3.4e38")
+            bits = BITS if self.file is None else 63
+            largest, limit = (2**bits, f"2^{bits}") if whole else (LARGEST_FLOAT, "3.4e38")
             if abs(found) >= largest:
                 raise _Unfit(path, found, f"below {limit}" if found > 0 else f"above -{limit}")
         return found

@@ -17,7 +17,7 @@ from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
@@ -25,6 +25,7 @@ from skillweave.policies.core import Around, CallEnd, Turn, World, restart
 from skillweave.policies.core import Memory as InPlaceMemory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.parts import GOAL
+from skillweave.schema import AtLeastOne, fitted
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.skills.goal_spaces import blank_choices
@@ -121,7 +122,7 @@ def with_returns(
     Raises:
         Interrupted: Ctrl-C has stopped the recording; the message says what was kept.
     """
-    steps, num_envs = whole_number(steps, "steps", 1), whole_number(num_envs, "num_envs", 1)
+    steps, num_envs = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, num_envs, "num_envs")
     skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
     if skill_set is None:
         raise DeclarationError(

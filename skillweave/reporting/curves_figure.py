@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -19,10 +19,12 @@ from skillweave.reporting.report.verdict import is_binary
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs
+from skillweave.schema import Check, fitted
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import Array
 
 Band = Literal["iqr", "range", "none"]
+_Inches = Annotated[float, Check("from 1 to 40 inches", lambda x: 1 <= x <= 40)]
 Paths: TypeAlias = str | Path | Sequence[str | Path]
 Curve: TypeAlias = list[tuple[int, float]]
 
@@ -108,11 +110,9 @@ def plot_curves(
         MissingExtra: the extra 'plot' is not installed.
     """
     out = as_path(out, "out")
-    if band not in get_args(Band):
-        raise DeclarationError(f"band is {short(band)}; it must be one of {', '.join(BANDS)}")
+    fitted(Band, band, "band")
     for name, size in (("width", width), ("height", height)):
-        if size is not None and not (isinstance(size, int | float) and 1 <= size <= 40):
-            raise DeclarationError(f"{name} is {short(size)}; it must be from 1 to 40 inches")
+        fitted(_Inches | None, size, name)
     must_be_own(out.parent)
     groups = _groups(runs)
     groups = _renamed(groups, labels) if labels is not None else groups

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.named import named
 from skillweave.policies.mapped import LONGEST
+from skillweave.schema import Check, check_fields, fitted
+
+_Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
 
 # Parts of an input
 
@@ -66,15 +69,8 @@ class Part(Scaling):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.key, str):
-            raise DeclarationError(
-                f"Part.key is {short(self.key)}; it must be the name of a part of the observation"
-            )
+        check_fields(self)
         _check(self, _places, "places")
-        if not isinstance(self.one_hot, bool):
-            raise DeclarationError(
-                f"Part.one_hot is {short(self.one_hot)}; it must be True or False"
-            )
 
 
 @checked_names
@@ -218,7 +214,8 @@ class PolicyMapping:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "goal", checked_goal(self.goal))
-        _check(self, _count, "every", "chunk")
+        for name, kind in (("every", _Steps), ("chunk", _Steps | None)):
+            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"
@@ -498,12 +495,6 @@ def _range(value: Any, where: str) -> tuple[float, ...]:
     if not isinstance(ends, tuple) or len(ends) != 2 or ends[0] > ends[1]:
         raise DeclarationError(f"{where} the lowest and the highest number: (-1.0, 1.0)")
     return ends
-
-
-def _count(value: Any, where: str) -> int:
-    if not _is_whole(value) or not 1 <= value <= LONGEST:
-        raise DeclarationError(f"{where} a whole number, at least 1 and at most {LONGEST:,}")
-    return int(value)
 
 
 def _places(value: Any, where: str) -> slice | tuple[int, ...]:

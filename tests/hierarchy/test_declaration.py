@@ -590,7 +590,7 @@ def test_a_rollout_that_does_not_fit_into_memory_is_refused(tmp_path):
         ({"seed": -1}, "seed is -1"),
         ({"run_dir": 5}, "run_dir is 5; it must be a path"),
         ({"track": 5}, "track is 5"),
-        ({"evolve": 3}, r"evolve is 3; it must be an Evolution\(\)"),
+        ({"evolve": 3}, r"evolve is 3; it must be Evolution\(\)"),
     ],
 )
 def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):

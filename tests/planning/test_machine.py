@@ -223,7 +223,7 @@ def wrong(make: Any, message: str) -> Any:
         wrong(lambda: held(A, 3) & A, r"combine predicates inside it: held\(a & b"),
         wrong(lambda: Predicate(A) | held(A, 3), "is an event over several steps"),
         wrong(lambda: Predicate(3), "a predicate is 3"),
-        wrong(lambda: Predicate(A, reads="steps"), "must be 'obs' or 'step'"),
+        wrong(lambda: Predicate(A, reads="steps"), "must be one of obs, step"),
         wrong(
             lambda: RewardMachine({("a", "b"): A}).automaton({"b": "x"}),
             r"event 'a' has no skill; give one",

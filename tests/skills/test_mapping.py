@@ -287,7 +287,7 @@ def zeros(x: Array) -> Array:
             r"goal is \(1.0,\), out of the range.*Goal.high",
         ),
         ({"sees": sw.Goal(), "goal": "north"}, "goal is 'north'; it must be finite numbers"),
-        ({"every": 0}, "every is 0; it must be a whole number, at least 1"),
+        ({"every": 0}, "every is 0; it must be at least 1 and at most"),
         ({"every": 2.5}, "every is 2.5"),
         ({"chunk": True}, "chunk is True"),
         ({"state": (1, 64)}, "state is .*None as the axis of the environments"),
