@@ -12,6 +12,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, TypeVar
 
@@ -97,34 +98,32 @@ def _wrong_arguments(
 ) -> str | None:
     """Return a sentence about arguments that do not fit a function; None: they fit."""
     signature = inspect.signature(function)
-    try:
+    with suppress(TypeError):
         signature.bind(*args, **named)
-    except TypeError:
-        pass
-    else:
         return None
     parameters = list(signature.parameters.values())
-    owner = None
+    owner: Any = None
     if parameters and parameters[0].name in ("self", "cls") and args:
         owner = args[0] if isinstance(args[0], type) else type(args[0])
         parameters = parameters[1:]
         args = args[1:]
     makes = function.__name__ == "__init__" and owner is not None
-    name = owner.__name__ if makes and owner is not None else function.__name__
+    name = owner.__name__ if makes else function.__name__
     who, what = (name, "setting") if makes and is_dataclass(owner) else (f"{name}()", "argument")
-    by_name = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     if makes and not parameters:
         example = next((f"{k} = {short(v, 40)}" for k, v in named.items()), "")
         advice = f"write {example} in the body of the class, or give" if example else "give"
         return f"{who} takes no arguments: {advice} it an __init__ of its own"
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    parameters = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_name = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY]
     if not takes_all and (unknown := [k for k in named if k not in by_name]):
         first = unknown[0]
         end = suggest(first, by_name, {} if owner is None else _other_places(owner, makes))
         if first in ABSENT and not (first in ELSEWHERE and "skills" in by_name):
             end = f": {ABSENT[first]}"
         return f"{who} has no {what} {first!r}{end}"
-    ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    ordered = [p for p in parameters if p.kind is not p.KEYWORD_ONLY]
     if len(args) > len(ordered):
         most = f"at most {len(ordered)}" if ordered else "none"
         rest = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in named]
@@ -133,8 +132,7 @@ def _wrong_arguments(
     if twice := [p.name for p in ordered[: len(args)] if p.name in named]:
         return f"{who} was given {twice[0]} twice, by position and by name: leave one of them out"
     given = {p.name for p in ordered[: len(args)]} | named.keys()
-    needed = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_POSITIONAL]
-    needed = [p for p in needed if p.kind is not p.VAR_KEYWORD]
+    needed = [p for p in parameters if p.default is p.empty]
     lacking = " and ".join(p.name for p in needed if p.name not in given)
     example = ", ".join(f"{p.name}=..." if p.kind is p.KEYWORD_ONLY else p.name for p in needed)
     return f"{who} needs {lacking}: write {name}({example})"

@@ -610,7 +610,7 @@ CHANGED = {
     "steps": (-4, "steps is -4"),
     "apart": ({"skill_steps": 5}, "write Apart(skill_steps=5)"),
     "skills": ([Good], "write Center(), not Center"),
-    "reflexes": (None, "reflexes=[Reflex(...)]"),
+    "reflexes": (None, "each entry an instance of Reflex"),
     "env": (None, "it must be a Gymnasium id"),
 }
 

@@ -98,16 +98,7 @@ def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
     Raises:
         DeclarationError: the argument is no list of reflexes.
     """
-    if isinstance(reflexes, str) or not isinstance(reflexes, Sequence):
-        raise DeclarationError(
-            f"reflexes is {short(reflexes)}; it must be a list: reflexes=[Reflex(...)]"
-        )
-    for reflex in reflexes:
-        if not isinstance(reflex, Reflex):
-            raise DeclarationError(
-                f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, action)"
-            )
-    return tuple(reflexes)
+    return tuple(fitted(Sequence[Reflex], reflexes, "reflexes"))
 
 
 def check_level(level: Level) -> None:

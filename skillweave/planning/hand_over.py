@@ -21,6 +21,7 @@ from skillweave.planning.neighbours import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
+from skillweave.schema import fitted
 from skillweave.types import Array
 
 START = "start"
@@ -262,11 +263,7 @@ def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
     won = log.succeeded.copy()
     if done is None:
         return won
-    if not isinstance(done, Mapping):
-        raise DeclarationError(
-            f"done is {short(done)}; give events by skill: done={{'hover': in_box}}"
-        )
-    for name, event in done.items():
+    for name, event in fitted(Mapping[str, Any], done, "done").items():
         rows = np.flatnonzero(log.skill == log.number(name))
         won[rows] = happened(log.take(rows), as_event(event, f"done of {name!r}"))
     return won

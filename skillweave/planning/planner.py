@@ -111,9 +111,8 @@ class Planner(ReadySelector):
     ) -> None:
         super().__init__("planner")
         check_features(features, "Planner")
-        if not isinstance(log, CallLog):
-            raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
-        self.log, self.task = log, as_task(task, predicates)
+        self.log = fitted(CallLog, log, "Planner: log")
+        self.task = as_task(task, predicates)
         self.skills, self.lengths = log.skills, log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.plan.pays:
             raise DeclarationError(

@@ -174,14 +174,10 @@ def as_event(value: Any, where: str) -> Event:
 
 def named_predicates(values: Mapping[str, Any], where: str) -> dict[str, Event]:
     """Return events by the names under which a text refers to them."""
-    if not isinstance(values, Mapping):
-        raise DeclarationError(
-            f"{where}: the predicates are {short(values)}; give a dict by name: {{'left': is_left}}"
-        )
     named: dict[str, Event] = {}
-    for name, value in values.items():
+    for name, value in fitted(Mapping[str, Any], values, f"{where}: predicates").items():
         event = as_event(value, f"{where}: {short(name)}")
-        if not isinstance(name, str) or not re.fullmatch(WORD, name):
+        if not re.fullmatch(WORD, name):
             raise DeclarationError(
                 f"{where}: a predicate is named {short(name)}; a name is one word that begins with "
                 "a letter"

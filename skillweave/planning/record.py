@@ -128,8 +128,7 @@ def with_returns(
         raise DeclarationError(
             f"record_calls(): {short(skills)} has no skills; give a run's policy, run.policy"
         )
-    if isinstance(info, str):
-        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    fitted(Sequence[str], info, "info")
     if isinstance(choose, str) and choose == "explore":
         choose = Explorer()
     skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out

@@ -254,17 +254,15 @@ class PolicyMapping:
             DeclarationError: a field has a wrong value; the message names it.
         """
         code = code or {}
-        if not isinstance(data, Mapping):
-            raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
+        fitted(Mapping[str, Any], data, "the mapping")
         for name in ("sees", "scaling"):
-            if not isinstance(value := data.get(name, {}), Mapping):
-                raise DeclarationError(f"{name} is {short(value)}; it must be an object of inputs")
+            fitted(Mapping[str, Any], data.get(name, {}), name)
         sees, goal, acts = (data.get(name) for name in ("sees", "goal", "acts"))
         if sees is not None:
             sees = {
                 name: tuple(
                     _from_json(None, part, code, f"sees[{name!r}][{i}]")
-                    for i, part in enumerate(_list(parts, f"sees[{name!r}]"))
+                    for i, part in enumerate(fitted(list[Any], parts, f"sees[{name!r}]"))
                 )
                 for name, parts in sees.items()
             }
@@ -276,8 +274,8 @@ class PolicyMapping:
             k: _from_json(Scaling, v, code, f"scaling[{k!r}]")
             for k, v in data.get("scaling", {}).items()
         }
-        states = _list(data.get("state", []), "state")
-        state = tuple(tuple(_list(entry, "state")) for entry in states)
+        states = fitted(list[Any], data.get("state", []), "state")
+        state = tuple(tuple(fitted(list[Any], entry, "state")) for entry in states)
         single = data.get("single_state", False)
         every, chunk = data.get("every", 1), data.get("chunk")
         return cls(sees, goal, acts, every, chunk, state, single, scaling)
@@ -465,8 +463,7 @@ def _check(settings: Any, convert: Callable[[Any, str], Any], *names: str) -> No
     for name in names:
         value = getattr(settings, name)
         if value is not None or getattr(kind, name) is not None:
-            prefix = "" if kind is PolicyMapping else f"{kind.__name__}."
-            where = f"{prefix}{name} is {short(value)}; it must be"
+            where = f"{kind.__name__}.{name} is {short(value)}; it must be"
             object.__setattr__(settings, name, convert(value, where))
 
 
@@ -573,8 +570,7 @@ def _from_json(kind: type[Any] | None, data: Any, code: Mapping[str, Any], where
             raise DeclarationError(
                 f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
             )
-    if not isinstance(data, Mapping):
-        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
+    fitted(Mapping[str, Any], data, where)
     given = {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
     if kind is Computed:
         given["function"] = _function(data.get("function"), code, where)
@@ -589,9 +585,3 @@ def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any],
     if not callable(function):
         raise DeclarationError(f"{where} needs the function {short(name)}: give it in code")
     return function  # type: ignore[no-any-return]
-
-
-def _list(value: Any, where: str) -> Sequence[Any]:
-    if not isinstance(value, list | tuple):
-        raise DeclarationError(f"{where} is {short(value)}; it must be a list")
-    return value

@@ -409,8 +409,7 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
 
 def check_logged(policy: Policy, info: Sequence[str]) -> None:
     """Raise a DeclarationError where the calls of a policy cannot be logged."""
-    if isinstance(info, str):
-        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    fitted(Sequence[str], info, "info")
     if isinstance(getattr(policy, "skill", None), Skill):
         raise DeclarationError(
             "a skill that acts alone is not called, so there are no calls to log: leave out skill, "

@@ -92,7 +92,10 @@ def test_a_wrong_declaration_names_the_skill_and_the_field(case):
 
 
 NOT_CHECKED = {
-    "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "not a Reflex"),
+    "a reflex that is only a function": (
+        lambda: declare(reflexes=[zeros]),
+        "must be an instance of Reflex",
+    ),
     "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
     "a policy's class": (lambda: declare(named("x", policy=ScriptedPolicy)), "'x'.*policy"),
 }

@@ -192,7 +192,7 @@ def wrong(make: Any, message: str) -> Any:
     [
         wrong(lambda: RewardMachine([A]), "transitions are"),
         wrong(lambda: RewardMachine({"a": A}), "transition is from 'a'; write"),
-        wrong(lambda: RewardMachine({("a", 3): A}), "state is named 3"),
+        wrong(lambda: RewardMachine({("a", 3): A}), "state is 3; it must be a text"),
         wrong(lambda: RewardMachine({("a", "b"): "x"}), "'x' is no predicate"),
         wrong(lambda: RewardMachine({("a", "b"): (A, "x")}), "reward is 'x'"),
         *(

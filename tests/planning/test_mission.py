@@ -289,7 +289,7 @@ def wrong(make: Any, message: str) -> Any:
         wrong(lambda: either(P[0]), "has 1 part; give 2 to 6"),
         wrong(lambda: Mission(Mission(P[0], P[1], repeat=None)), "say it of the whole mission"),
         wrong(lambda: Mission.from_text(3, {}), "a mission is 3; it must be a text"),
-        wrong(lambda: Mission.from_text("a", [P[0]]), "give a dict by name"),
+        wrong(lambda: Mission.from_text("a", [P[0]]), "it must be a dict"),
         wrong(lambda: Mission.from_text("a", {"a b": P[0]}), "a name is one word"),
         wrong(lambda: Mission.from_text("a", {"then": P[0]}), "a word of missions"),
         wrong(

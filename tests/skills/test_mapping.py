@@ -457,7 +457,7 @@ def test_functions_of_one_name_are_told_apart() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("sees", [], "sees is .*an object of inputs"),
+        ("sees", [], "sees is .*it must be a dict"),
         ("sees", {"": [{"source": "camera"}]}, r"sees\[''\]\[0\] is .*its field source must be"),
         ("sees", {"": [{"source": "goal", "low": "x"}]}, r"sees\[''\]\[0\]: Goal.low is 'x'"),
         ("acts", {"to": [0, -1]}, r"acts: Acts.to is \[0, -1\]"),
