@@ -171,7 +171,7 @@ class _Fitting:
             whole = isinstance(found, int)
             if not whole and not math.isfinite(found):
                 raise _Unfit(path, found, text or _FINITE)
-            bits = BITS if self.file is None else 63
+            bits = BITS if self.file is None and kind is int else 63
             largest, limit = (2**bits, f"2^{bits}") if whole else (LARGEST_FLOAT, "3.4e38")
             if abs(found) >= largest:
                 raise _Unfit(path, found, f"below {limit}" if found > 0 else f"above -{limit}")
