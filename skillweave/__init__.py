@@ -260,11 +260,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # Names are imported when first used: torch takes two seconds, which `--help` must not pay.
     if name not in _HOME:
-        from difflib import get_close_matches
+        from skillweave.messages import suggest
 
-        near = get_close_matches(name, __all__, n=1)
-        hint = f": is {near[0]!r} meant?" if near else ""
-        raise AttributeError(f"module 'skillweave' has no attribute {name!r}{hint}")
+        end = suggest(name, __all__, listed=False)
+        raise AttributeError(f"module 'skillweave' has no attribute {name!r}{end}")
     return getattr(importlib.import_module(f"skillweave.{_HOME[name]}"), name)
 
 

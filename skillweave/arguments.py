@@ -11,51 +11,15 @@ import functools
 import inspect
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
-from difflib import SequenceMatcher
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import short
+from skillweave.messages import ELSEWHERE, short, suggest
 
 T = TypeVar("T", bound=Callable[..., Any])
-
-SIMILAR = 0.6
-"""The least similarity of a name to the one that is suggested: the ratio of ``difflib``."""
-
-ELSEWHERE = {
-    "clip_epsilon": "clip_coef",
-    "clip_range": "clip_coef",
-    "discount": "gamma",
-    "discount_factor": "gamma",
-    "entropy_coef": "ent_coef",
-    "env_id": "env",
-    "env_kwargs": "kwargs",
-    "epochs": "update_epochs",
-    "eval_freq": "eval_every",
-    "hidden_layers": "hidden",
-    "hidden_sizes": "hidden",
-    "horizon": "n_steps",
-    "lam": "gae_lambda",
-    "log_dir": "run_dir",
-    "lr": "learning_rate",
-    "max_episode_steps": "max_steps",
-    "minibatch_size": "batch_size",
-    "n_envs": "num_envs",
-    "n_epochs": "update_epochs",
-    "n_eval_episodes": "episodes",
-    "net_arch": "hidden",
-    "num_epochs": "update_epochs",
-    "num_steps": "n_steps",
-    "options": "skills",
-    "polyak": "tau",
-    "total_steps": "steps",
-    "total_timesteps": "steps",
-    "value_coef": "vf_coef",
-}
-"""Names that other libraries give to settings, with the names that they have here."""
-
 
 STARTS = (
     "options",
@@ -111,7 +75,7 @@ def checked_names(target: T) -> T:
     kind: Any = target
     kind.__init__ = _checked(kind.__init__)
     if "__dataclass_params__" in vars(kind):
-        _check_attributes(kind, kind.__dataclass_params__.frozen)
+        kind.__setattr__ = _set
     return target
 
 
@@ -129,44 +93,37 @@ def _checked(function: Callable[..., Any]) -> Callable[..., Any]:
     return checked
 
 
-# Arguments
-
-
 def _wrong_arguments(
     function: Callable[..., Any], args: tuple[Any, ...], named: dict[str, Any]
 ) -> str | None:
     """Return a sentence about arguments that do not fit a function; None: they fit."""
     signature = inspect.signature(function)
-    try:
+    with suppress(TypeError):
         signature.bind(*args, **named)
-    except TypeError:
-        pass
-    else:
         return None
     parameters = list(signature.parameters.values())
-    owner = None
+    owner: Any = None
     if parameters and parameters[0].name in ("self", "cls") and args:
         owner = args[0] if isinstance(args[0], type) else type(args[0])
         parameters = parameters[1:]
         args = args[1:]
     makes = function.__name__ == "__init__" and owner is not None
-    name = owner.__name__ if makes and owner is not None else function.__name__
+    name = owner.__name__ if makes else function.__name__
     who, what = (name, "setting") if makes and is_dataclass(owner) else (f"{name}()", "argument")
-    by_name = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     if makes and not parameters:
         example = next((f"{k} = {short(v, 40)}" for k, v in named.items()), "")
         advice = f"write {example} in the body of the class, or give" if example else "give"
         return f"{who} takes no arguments: {advice} it an __init__ of its own"
     takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    parameters = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    by_name = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY]
     if not takes_all and (unknown := [k for k in named if k not in by_name]):
-        places = [_Place(k, "", "") for k in by_name]
-        if owner is not None:
-            places += _other_places(owner, makes)
-        if unknown[0] in ABSENT and not (unknown[0] in ELSEWHERE and "skills" in by_name):
-            return f"{who} has no {what} {unknown[0]!r}: {ABSENT[unknown[0]]}"
-        end = meant(unknown[0], places, f"its {what}s are")
-        return f"{who} has no {what} {unknown[0]!r}{end}"
-    ordered = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        first = unknown[0]
+        end = suggest(first, by_name, {} if owner is None else _other_places(owner, makes))
+        if first in ABSENT and not (first in ELSEWHERE and "skills" in by_name):
+            end = f": {ABSENT[first]}"
+        return f"{who} has no {what} {first!r}{end}"
+    ordered = [p for p in parameters if p.kind is not p.KEYWORD_ONLY]
     if len(args) > len(ordered):
         most = f"at most {len(ordered)}" if ordered else "none"
         rest = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in named]
@@ -175,91 +132,32 @@ def _wrong_arguments(
     if twice := [p.name for p in ordered[: len(args)] if p.name in named]:
         return f"{who} was given {twice[0]} twice, by position and by name: leave one of them out"
     given = {p.name for p in ordered[: len(args)]} | named.keys()
-    needed = [p for p in parameters if p.default is p.empty and p.kind is not p.VAR_POSITIONAL]
-    needed = [p for p in needed if p.kind is not p.VAR_KEYWORD]
+    needed = [p for p in parameters if p.default is p.empty]
     lacking = " and ".join(p.name for p in needed if p.name not in given)
     example = ", ".join(f"{p.name}=..." if p.kind is p.KEYWORD_ONLY else p.name for p in needed)
     return f"{who} needs {lacking}: write {name}({example})"
 
 
-class _Place(NamedTuple):
-    """A place where an argument of some name can be given."""
-
-    name: str
-    where: str
-    """Part of a sentence: "a setting of apart"; empty: the place where it was written."""
-    example: str
-
-
-def meant(name: str, places: Sequence[_Place | str], otherwise: str, least: float = SIMILAR) -> str:
-    """Return the end of a sentence about an unknown name: where a similar one can be given.
-
-    Args:
-        name: what was written.
-        places: what exists, by name.
-        otherwise: introduces all names where none is similar; empty: they are not listed.
-        least: how similar a name must be, from 0 to 1.
-
-    Returns:
-        A text that begins with a colon or a semicolon, or nothing.
-    """
-    known = [_Place(p, "", "") if isinstance(p, str) else p for p in places]
-    wanted = name.lower().replace("-", "_")
-    for spelling in (wanted, ELSEWHERE.get(wanted, "")):
-        # Names of this place come first.
-        exact = [p for p in known if p.name == spelling]
-        if exact and (exact[0].where or exact[0].name != name):
-            return _where(exact[0], exact=spelling == name)
-    similar = [(SequenceMatcher(None, wanted, p.name).ratio(), p) for p in known]
-    if similar:
-        likeness, place = max(similar, key=lambda pair: (pair[0], not pair[1].where))
-        if likeness >= least:
-            return _where(place, exact=False)
-    here = ", ".join(p.name for p in known if not p.where)
-    return f"; {otherwise} {here}" if here and otherwise else ""
+def _other_places(owner: type, makes: bool) -> dict[str, str]:
+    """Return the other places of a class's arguments by name: its settings, ``train``."""
+    if not makes:
+        return _settings(owner, owner.__name__, f"{owner.__name__}({{}})")
+    train: Any = getattr(owner, "train", None)
+    names = inspect.signature(train).parameters if callable(train) else {}
+    places = {k: f"an argument of train(): write train({k}=...)" for k in names if k != "self"}
+    return places | _settings(owner, "", "{}")
 
 
-def _where(place: _Place, exact: bool) -> str:
-    if not place.where:
-        return f": is {place.name!r} meant?"
-    if exact:
-        return f"; it is {place.where}: write {place.example}"
-    return f": is {place.name!r} meant, {place.where}? Write {place.example}"
-
-
-def _other_places(owner: type, makes: bool) -> Iterator[_Place]:
-    """Yield the other places of a class's arguments: its groups of settings, ``train``."""
-    if makes:
-        yield from _groups(owner, "{}")
-        train = getattr(owner, "train", None)
-        for name in _names(train) if callable(train) else ():
-            yield _Place(name, "an argument of train()", f"train({name}=...)")
-        return
-    if is_dataclass(owner):
-        for field in fields(owner):
-            example = f"{owner.__name__}({field.name}=...)"
-            yield _Place(field.name, f"a setting of {owner.__name__}", example)
-        yield from _groups(owner, f"{owner.__name__}({{}})")
-
-
-def _names(function: Callable[..., Any]) -> list[str]:
-    """Return the arguments of a method that have names."""
-    parameters = list(inspect.signature(function).parameters.values())
-    return [p.name for p in parameters if p.name != "self" and p.kind is not p.VAR_KEYWORD]
-
-
-def _groups(owner: Any, example: str) -> Iterator[_Place]:
-    """Yield the settings in the fields of a dataclass that hold settings, and below them."""
-    if not is_dataclass(owner):
-        return
-    for field in fields(owner):
-        if (group := _group(owner, field)) is None:
-            continue
-        below = example.format(f"{field.name}={group.__name__}({{}})")
-        for part in fields(group):
-            text = below.format(f"{part.name}=...")
-            yield _Place(part.name, f"a setting of {field.name}", text)
-        yield from _groups(group, below)
+def _settings(kind: Any, group: str, example: str) -> dict[str, str]:
+    """Return where the settings of a dataclass, and of groups in it, are given, by name."""
+    inside: dict[str, str] = {}
+    own = fields(kind) if is_dataclass(kind) else ()
+    for field in reversed(own):
+        if (below := _group(kind, field)) is not None:
+            call = example.format(f"{field.name}={below.__name__}({{}})")
+            inside |= _settings(below, field.name, call)
+    texts = {f.name: example.format(f"{f.name}=...") for f in own}
+    return inside | {k: f"a setting of {group}: write {text}" for k, text in texts.items()}
 
 
 def _group(owner: Any, field: Any) -> Any:
@@ -277,40 +175,26 @@ def _group(owner: Any, field: Any) -> Any:
     return one if isinstance(one, type) and is_dataclass(one) else None
 
 
-# Attributes
-
-
-def _check_attributes(kind: Any, frozen: bool) -> None:
-    kind.__setattr__ = _refuse_change if frozen else _set_known
-
-
-def _refuse_change(self: Any, name: str, value: Any) -> None:
-    kind = type(self).__name__
-    own = [f.name for f in fields(self)]
-    if name not in own:
-        raise DeclarationError(f"{kind} has no setting {name!r}{meant(name, own, 'they are')}")
-    raise DeclarationError(
-        f"{kind} cannot be changed: make another one, with "
-        f"dataclasses.replace(..., {name}={short(value)})"
-    )
-
-
-def _set_known(self: Any, name: str, value: Any) -> None:
-    """Set an attribute that exists, or a private one."""
+def _set(self: Any, name: str, value: Any) -> None:
+    """Set an attribute that exists, or a private one; none where the dataclass is frozen."""
     kind = type(self)
     own = [f.name for f in fields(self)]
-    if not name.startswith("_") and name not in own and not hasattr(kind, name):
-        places = [_Place(k, "", "") for k in own]
-        if kind.__module__.split(".")[0] == __name__.split(".")[0]:
-            groups = list(_groups(kind, "{}"))
-            end = meant(name, places + groups, "its settings are")
-            raise DeclarationError(f"{kind.__name__} has no setting {name!r}{end}")
+    frozen = kind.__dataclass_params__.frozen
+    if name not in own and (frozen or not (name.startswith("_") or hasattr(kind, name))):
         # A user's subclass may have attributes of its own, but none that looks like a misspelt one.
-        if end := meant(name, places, "", 0.85):
+        free = not frozen and kind.__module__.split(".")[0] != __name__.split(".")[0]
+        places = {} if free else _settings(kind, "", "{}")
+        end = suggest(name, own, places, least=0.85 if free else 0.6, listed=not free)
+        if end or not free:
             raise DeclarationError(f"{kind.__name__} has no setting {name!r}{end}")
+    if frozen:
+        raise DeclarationError(
+            f"{kind.__name__} cannot be changed: make another one, with "
+            f"dataclasses.replace(..., {name}={short(value)})"
+        )
     if isinstance(computed := getattr(kind, name, None), property) and computed.fset is None:
         raise DeclarationError(f"{kind.__name__}.{name} is computed; it cannot be set")
     object.__setattr__(self, name, value)
 
 
-__all__ = ["checked_names", "meant"]
+__all__ = ["checked_names"]

@@ -3,17 +3,45 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-
-import numpy as np
+from types import MappingProxyType
 
 from skillweave.errors import DeclarationError, RunError
 from skillweave.tracebacks import place
 
-MOST = 10**12
-"""The largest whole number that an argument may be: a million times it fits into 64 bits."""
+ELSEWHERE = {
+    "clip_epsilon": "clip_coef",
+    "clip_range": "clip_coef",
+    "discount": "gamma",
+    "discount_factor": "gamma",
+    "entropy_coef": "ent_coef",
+    "env_id": "env",
+    "env_kwargs": "kwargs",
+    "epochs": "update_epochs",
+    "eval_freq": "eval_every",
+    "hidden_layers": "hidden",
+    "hidden_sizes": "hidden",
+    "horizon": "n_steps",
+    "lam": "gae_lambda",
+    "log_dir": "run_dir",
+    "lr": "learning_rate",
+    "max_episode_steps": "max_steps",
+    "minibatch_size": "batch_size",
+    "n_envs": "num_envs",
+    "n_epochs": "update_epochs",
+    "n_eval_episodes": "episodes",
+    "net_arch": "hidden",
+    "num_epochs": "update_epochs",
+    "num_steps": "n_steps",
+    "options": "skills",
+    "polyak": "tau",
+    "total_steps": "steps",
+    "total_timesteps": "steps",
+    "value_coef": "vf_coef",
+}
+"""Names that other libraries give to settings, with the names that they have here."""
 
 
 def short(value: object, longest: int = 100) -> str:
@@ -31,10 +59,38 @@ def shortened(text: str, longest: int = 500) -> str:
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
 
 
-def close_matches(name: str, known: Iterable[str]) -> str:
-    """Return a sentence after a space with up to four known names like ``name``; "" if none is."""
-    near = difflib.get_close_matches(name, known, n=4, cutoff=0.6)
-    return f" Close matches: {', '.join(near)}." if near else ""
+def suggest(
+    name: object,
+    known: Iterable[str],
+    elsewhere: Mapping[str, str] = MappingProxyType({}),
+    *,
+    least: float = 0.6,
+    listed: bool = True,
+) -> str:
+    """Return the end of a sentence about an unknown name: the known one that is probably meant.
+
+    Args:
+        name: what was written.
+        known: the names that exist there.
+        elsewhere: by the names that exist at other places, where: "a setting of apart: …".
+        least: how similar a name must be, from 0 to 1, as ``difflib``'s ratio.
+        listed: name all that are known where none is similar.
+
+    Returns:
+        A text that begins with a colon or a semicolon, or nothing.
+    """
+    here = list(known)
+    places = {**elsewhere, **dict.fromkeys(here, "")}
+    spelled = {p.lower().replace("-", "_"): p for p in places}
+    wanted = str(name).lower().replace("-", "_")
+    similar = difflib.get_close_matches(wanted, spelled, 1, least)
+    for spelling in (wanted, ELSEWHERE.get(wanted, ""), *similar):
+        if near := spelled.get(spelling):
+            where = f"it is {places[near]}" if places[near] else ""
+            if near == name:
+                return f"; {where}"
+            return f": is {near!r} meant?{where and f' I{where[1:]}'}"
+    return f"; there are: {', '.join(here)}" if here and listed else ""
 
 
 def error_text(error: BaseException) -> str:
@@ -46,22 +102,6 @@ def error_text(error: BaseException) -> str:
     text = type(error).__name__ + (f": {shortened(message)}" if message else "")
     where = place(error)
     return f"{text.removesuffix('.')} ({where})" if where else text
-
-
-def whole_number(value: object, name: str, least: int) -> int:
-    """Return ``value`` as an int.
-
-    Raises:
-        DeclarationError: it is no whole number, less than ``least``, or more than ``MOST``; the
-            message begins with ``name``.
-    """
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise DeclarationError(f"{name} is {short(value)}; it must be a whole number")
-    if value < least:
-        raise DeclarationError(f"{name} is {short(value)}; it must be at least {least}")
-    if value > MOST:
-        raise DeclarationError(f"{name} is {short(value)}; it must be at most {MOST:,}")
-    return int(value)
 
 
 def absolute(path: str | Path) -> Path:

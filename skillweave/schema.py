@@ -30,15 +30,17 @@ from typing import (
 
 import numpy as np
 
-from skillweave.arguments import checked_names, meant
+from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.policies.files import shown
 
 C = TypeVar("C", bound=type[Any])
 
 LARGEST = 2**63
-"""The limit of whole numbers."""
+"""The limit of whole numbers in files."""
+BITS = 43
+"""Those that are declared need no more bits: a million times they fit into 64."""
 LARGEST_FLOAT = 3.4e38
 """The limit of other numbers, which tensors of float32 must represent."""
 LONGEST_TEXT = 4096
@@ -169,7 +171,8 @@ class _Fitting:
             whole = isinstance(found, int)
             if not whole and not math.isfinite(found):
                 raise _Unfit(path, found, text or _FINITE)
-            largest, limit = (LARGEST, "2^63") if whole else (LARGEST_FLOAT, "3.4e38")
+            bits = BITS if self.file is None and kind is int else 63
+            largest, limit = (2**bits, f"2^{bits}") if whole else (LARGEST_FLOAT, "3.4e38")
             if abs(found) >= largest:
                 raise _Unfit(path, found, f"below {limit}" if found > 0 else f"above -{limit}")
         return found
@@ -350,7 +353,7 @@ def _hint(kind: Any, value: Any) -> str:
         known = [f.name for f in fields(kinds[0])]
         for name in value:
             if name not in known:
-                return f" ({group} has no setting {name!r}{meant(name, known, 'they are')})"
+                return f" ({group} has no setting {name!r}{suggest(name, known)})"
         given = ", ".join(f"{k}={short(v, 40)}" for k, v in value.items())
         return f" (write {group}({given}))"
     return ""

@@ -75,7 +75,7 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
         lambda: sw.PPO(hidden=(8,)),
         "'hidden'; it is a setting of network: write network=Network(hidden=...)",
     ),
-    (lambda: sw.Network(zzzz=1), "its settings are hidden, activation, layer_norm, cnn"),
+    (lambda: sw.Network(zzzz=1), "there are: hidden, activation, layer_norm, cnn"),
     (lambda: sw.DQN.rainbow(doble=True), "DQN has no setting 'doble': is 'double' meant"),
     (lambda: dataclasses.replace(sw.SAC(), tua=1), "SAC has no setting 'tua': is 'tau' meant"),
     (lambda: sw.Reflex(print, acton=1), "Reflex() has no argument 'acton': is 'action' meant"),
@@ -87,7 +87,7 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: plan(rnn=1), "write algorithm=PPO(network=Network(rnn=...))"),
     (lambda: plan(call_step=5), "Plan has no setting 'call_step': is 'call_steps' meant"),
     (lambda: plan().train("runs", gamma=1.0), "write Plan(algorithm=PPO(gamma=...))"),
-    (lambda: plan().train("runs", verbose_=1), "its arguments are run_dir, seed, quiet"),
+    (lambda: plan().train("runs", verbose_=1), "there are: run_dir, seed, quiet"),
     # Too few and too many
     (lambda: Plan(), "Plan needs env and skills: write Plan(env, skills)"),
     (lambda: Plan("CartPole-v1"), "Plan needs skills: write Plan(env, skills)"),

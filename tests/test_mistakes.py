@@ -121,7 +121,7 @@ def by_chance(**members: Any) -> sw.Run:
 AXIS = "the first axis of every array is that of the environments"
 MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
     # Environments
-    "misspelt env id": (lambda: train("CartPol-v1"), "EnvError", "Close matches: CartPole-v1"),
+    "misspelt env id": (lambda: train("CartPol-v1"), "EnvError", "is 'CartPole-v1' meant?"),
     "old env id": (lambda: train("LunarLander-v2"), "EnvError", "use `LunarLander-v3` instead"),
     "env not imported": (
         lambda: train("ALE/Pong-v5"),
@@ -335,7 +335,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
     "misspelt keyword of Hierarchy": (
         lambda: declare(skill_step=5),
         "DeclarationError",
-        "is 'skill_steps' meant, a setting of apart? Write apart=Apart(skill_steps=...)",
+        "is 'skill_steps' meant? It is a setting of apart: write apart=Apart(skill_steps=...)",
     ),
     "keyword of a group": (
         lambda: declare(skill_steps=5),
@@ -531,7 +531,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
     "misspelt tracker": (
         lambda: declare().train("runs/tr", track=["tensorbord"]),
         "DeclarationError",
-        "no tracker 'tensorbord'; there are: tensorboard, wandb, mlflow",
+        "no tracker 'tensorbord': is 'tensorboard' meant?",
     ),
     "features as text": (
         lambda: declare(features="x"),
@@ -561,7 +561,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
     "wrong key in sees": (
         lambda: in_room(sees=("hold",)),
         "DeclarationError",
-        "its parts are held, place",
+        "is 'held' meant?",
     ),
     "seed as text": (
         lambda: declare().train("runs/sd", seed="1"),
@@ -610,7 +610,7 @@ CHANGED = {
     "steps": (-4, "steps is -4"),
     "apart": ({"skill_steps": 5}, "write Apart(skill_steps=5)"),
     "skills": ([Good], "write Center(), not Center"),
-    "reflexes": (None, "reflexes=[Reflex(...)]"),
+    "reflexes": (None, "each entry an instance of Reflex"),
     "env": (None, "it must be a Gymnasium id"),
 }
 

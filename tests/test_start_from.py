@@ -443,8 +443,8 @@ def test_what_is_wrong_with_several_runs_is_a_sentence(source, other_runs, tmp_p
     _, plain = other_runs
     for start, says in (
         ({}, r"start_from is \{\}; name the run of each"),
-        ({"lefft": source}, r"names 'lefft', which does not learn here.*Close matches: left"),
-        ({"push": source}, r"names 'push', which does not learn here; here learn left, other"),
+        ({"lefft": source}, r"names 'lefft', which does not learn here.*is 'left' meant"),
+        ({"push": source}, r"names 'push', which does not learn here; there are: left, other"),
         ({"left": tmp_path / "no"}, "holds no run"),
         ({"left": 5}, r"start_from\['left'\] is 5; it must be a path"),
         ({"selector": plain}, r"'selector' cannot start with what it learnt in .*plain"),

@@ -14,6 +14,7 @@ import gymnasium as gym
 
 from skillweave.algorithms.schedules import LearningRate, check_rate
 from skillweave.errors import DeclarationError, EnvError, RunError
+from skillweave.messages import suggest
 from skillweave.named import Named
 from skillweave.networks.config import Network, check_critic
 from skillweave.policies.files import shown
@@ -584,7 +585,7 @@ def named_config(name: str, where: str) -> AlgorithmConfig:
         if known.lower() == name.lower():
             config: AlgorithmConfig = make()
             return config
-    raise DeclarationError(f"{where}: no algorithm {name!r}; there are: {', '.join(presets)}")
+    raise DeclarationError(f"{where}: no algorithm {name!r}{suggest(name, presets)}")
 
 
 def config_to_json(config: AlgorithmConfig) -> dict[str, Any]:

@@ -58,7 +58,7 @@ from skillweave.hierarchy.weights import (
     write_agent,
     write_weights,
 )
-from skillweave.messages import as_path, short, shown_path, whole_number
+from skillweave.messages import as_path, short, shown_path
 from skillweave.notices import notice
 from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
@@ -73,6 +73,7 @@ from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
 from skillweave.runs.trackers import track_film
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -422,7 +423,7 @@ class TrainedPolicy:
         policy = self._policy(skill, goal, "render()")
         path = self._film_path(skill) if path is None else as_path(path, "path")
         must_be_own(path.parent)
-        seed = whole_number(seed, "seed", 0)
+        seed = fitted(Count, seed, "seed")
         plain = isinstance(self.declaration, PlainAgent)
         roles = None if plain else roles_of(self.hierarchy)
         film = render_policy(
@@ -858,7 +859,7 @@ class PlannedRun(TrainedPolicy):
         config: Any = PPO() if algorithm is None else algorithm
         declared = Hierarchy(
             **to_train(spec, self.policy, planner, self.hierarchy.rest, config, target_kl),
-            steps=whole_number(steps, "with_selector(): steps", 1),
+            steps=fitted(AtLeastOne, steps, "with_selector(): steps"),
         )
         declared._starts = partial(start_of, planner, self.policy, declared.spec, config)
         return declared

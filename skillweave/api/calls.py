@@ -8,7 +8,7 @@ from pathlib import Path
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
-from skillweave.messages import shown_path, whole_number
+from skillweave.messages import shown_path
 from skillweave.planning import CallLog
 from skillweave.planning.run_log import (
     RECORD,
@@ -20,6 +20,7 @@ from skillweave.planning.run_log import (
 )
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.schema import Count, fitted
 from skillweave.skills.base import RecordedSkill
 from skillweave.types import Policy
 
@@ -55,7 +56,7 @@ class RunCalls:
             so_far = self._read()
         if so_far is not None and (skills := skills_below(policy)) is not None:
             _check_code(so_far, skills)
-        seed = next_seed(so_far) if seed is None else whole_number(seed, "seed", 0)
+        seed = next_seed(so_far) if seed is None else fitted(Count, seed, "seed")
         if so_far is None or isinstance(info, str):  # which is refused later
             return seed, info
         return seed, (*so_far.info, *(key for key in info if key not in so_far.info))

@@ -10,7 +10,7 @@ from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
-from skillweave.messages import short, whole_number
+from skillweave.schema import AtLeastOne, Share, fitted
 from skillweave.seeding import Seeds, global_generators
 
 
@@ -33,10 +33,8 @@ def make_options_env(
     Raises:
         DeclarationError: a skill has no policy; the message names it.
     """
-    num_envs = whole_number(num_envs, "num_envs", 1)
-    real = isinstance(gamma, int | float) and not isinstance(gamma, bool)
-    if not real or not 0.0 < gamma <= 1.0:
-        raise DeclarationError(f"gamma is {short(gamma)}; it must be over 0 and at most 1")
+    num_envs = fitted(AtLeastOne, num_envs, "num_envs")
+    gamma = fitted(Share, gamma, "gamma")
     if isinstance(hierarchy, TrainedPolicy):
         if not isinstance(hierarchy.policy, HierarchyPolicy):
             raise DeclarationError("this is the run of a plain agent: it has no skills to call")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from skillweave import schema
 from skillweave.arguments import checked_names
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, PolicyError, RunError
@@ -49,8 +50,7 @@ def save_policy(
     """
     folder = as_path(path, "path")
     for name, text in (("licence", licence), ("origin", origin)):
-        if not isinstance(text, str):
-            raise DeclarationError(f"{name} is {short(text)}; it must be a text")
+        schema.fitted(str, text, name)
     if not (hasattr(policy, "act") and hasattr(policy, "start")):
         raise DeclarationError(
             f"policy is {short(policy)}, which is no policy; give from_function(...) or "
@@ -99,8 +99,7 @@ def load_policy(
         MissingExtra: an extra is not installed.
     """
     folder = as_path(path, "path")
-    if code is not None and not (isinstance(code, Mapping) and all(map(callable, code.values()))):
-        raise DeclarationError(f"code is {short(code)}; it must be a dict of functions by name")
+    schema.fitted(Mapping[str, Callable[..., Any]] | None, code, "code")
     if not folder.exists():
         name = str(path)
         if folder.is_absolute() or name.count("/") != 1 or name.startswith("."):

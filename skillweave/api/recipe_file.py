@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib.util
 import sys
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from skillweave.api.running import READING
 from skillweave.collecting.shipping import add_folder
 from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.hierarchy.declaration import Declaration
-from skillweave.messages import error_text
+from skillweave.messages import error_text, suggest
 from skillweave.shipped import FOLDER, file_of, names
 from skillweave.tracebacks import place
 
@@ -31,18 +30,14 @@ def hierarchy_in(recipe: str, kind: type[H]) -> H:
         kind: ``Hierarchy``.
 
     Raises:
-        DeclarationError: no such recipe (with close matches) or file, no hierarchy in it, the file
+        DeclarationError: no such recipe (with a similar one) or file, no hierarchy in it, the file
             trains as soon as it is read, or it raises an error.
     """
     path = file_of(recipe)
     if path.suffix == ".py" and path.is_file():
         module = read_recipe_file(path, recipe, shipped=path.parent == FOLDER)
     else:
-        near = difflib.get_close_matches(recipe, names(), n=3, cutoff=0.4)
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
-        raise DeclarationError(
-            f"no recipe or Python file {recipe!r}.{hint} Shipped recipes: {', '.join(names())}"
-        )
+        raise DeclarationError(f"no recipe or Python file {recipe!r}{suggest(recipe, names())}")
     declared = {k: v for k, v in vars(module).items() if isinstance(v, kind)}
     if "hierarchy" not in declared and len(declared) != 1:
         raise DeclarationError(

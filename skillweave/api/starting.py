@@ -14,7 +14,7 @@ from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.user_code import changes
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.messages import as_path, close_matches, short
+from skillweave.messages import as_path, short, suggest
 from skillweave.notices import notice
 from skillweave.paths import AGENT, decides
 from skillweave.policies.files import shown
@@ -214,10 +214,8 @@ def _learnt_by_name(
     known: dict[Path, dict[str, Learnt]] = {}
     for name, run in start_from.items():
         if name not in here:
-            near = close_matches(str(name), here)
             raise DeclarationError(
-                f"start_from names {short(name)}, which does not learn here; here learn "
-                f"{', '.join(here)}.{near}"
+                f"start_from names {short(name)}, which does not learn here{suggest(name, here)}"
             )
         if isinstance(run, Learnt):
             learnt[name] = run

@@ -22,8 +22,7 @@ from skillweave.collecting.cluster import Ray
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.evolution.plan import Evolve
-from skillweave.messages import short, whole_number
-from skillweave.schema import fitted
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.callback import Callback, check_callback
 from skillweave.training.options import RECORDED, CallReports, Continuing, Reports, Starting
 
@@ -66,10 +65,7 @@ class Going(Watched):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.cluster, Ray | None):
-            raise DeclarationError(
-                f"cluster is {short(self.cluster)}; write cluster=Ray(collectors=8)"
-            )
+        fitted(Ray | None, self.cluster, "cluster")
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,8 @@ class AgentOptions(Going, Reports, Starting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        seed, track = whole_number(self.seed, "seed", 0), self.track
+        seed = fitted(Count, self.seed, "seed")
+        track = fitted(str | Sequence[str], self.track, "track")
         for word in ("resume", "overwrite"):
             if fitted(bool, getattr(self, word), word) and self.run_dir is None:
                 raise DeclarationError(
@@ -114,8 +111,6 @@ class AgentOptions(Going, Reports, Starting):
                 "resume continues the run in run_dir, and overwrite replaces it: leave out one of "
                 "them"
             )
-        if not isinstance(track, Sequence):
-            raise DeclarationError(f"track is {short(track)}; it must be a list: track=['wandb']")
         object.__setattr__(self, "seed", seed)
         object.__setattr__(self, "track", (track,) if isinstance(track, str) else tuple(track))
 
@@ -187,9 +182,8 @@ class RepairOptions(Watched, _Pair):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("steps", 1), ("calls", 1), ("seed", 0)):
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, whole_number(value, name, least))
+        for name, kind in (("steps", AtLeastOne | None), ("calls", AtLeastOne), ("seed", Count)):
+            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
 
     @property
     def training(self) -> AgentOptions:

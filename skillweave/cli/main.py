@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 import sys
@@ -76,9 +75,9 @@ def _unknown_command(words: Sequence[str], known: Sequence[str]) -> str:
     """Return a sentence about a first word that is no command; empty if it is one, or none."""
     if not words or words[0] in known or words[0].startswith("-"):
         return ""
-    near = difflib.get_close_matches(words[0], known, n=1)
-    hint = f"is {near[0]!r} meant?" if near else f"the commands are {', '.join(known)}"
-    return f"no command {words[0]!r}: {hint} (skillweave --help)"
+    from skillweave.messages import suggest
+
+    return f"no command {words[0]!r}{suggest(words[0], known)} (skillweave --help)"
 
 
 def _with_addresses(words: Sequence[str]) -> list[str]:

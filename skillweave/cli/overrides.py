@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import re
 import typing
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from skillweave.collecting.lengths import Lengths
 from skillweave.errors import DeclarationError
 from skillweave.evolution.config import Evolution, Range, Tournament, Truncation
 from skillweave.hierarchy.declaration import Declaration
+from skillweave.messages import suggest
 from skillweave.schema import annotations_of, described, flat, options_of
 from skillweave.skills import Skill, is_trained
 
@@ -50,7 +50,7 @@ def apply_overrides(declaration: Declaration, overrides: Sequence[str]) -> None:
     The name of an agent alone sets its algorithm: ``selector=DQN``, ``skills.center=SAC``.
 
     Raises:
-        DeclarationError: no such setting (with close matches), or a value out of range.
+        DeclarationError: no such setting (with a similar one), or a value out of range.
     """
     configs: dict[tuple[str, ...], dict[str, str]] = {}
     kinds: dict[tuple[str, ...], str] = {}
@@ -173,7 +173,7 @@ def parse_evolve(
     takes that selection, ``ranges.gamma=0.9,0.999,complement`` lets a setting mutate.
 
     Raises:
-        DeclarationError: no such setting (with close matches), or a value out of range.
+        DeclarationError: no such setting (with a similar one), or a value out of range.
     """
     if not settings:
         return None
@@ -301,6 +301,5 @@ def _parse(name: str, text: str, hint: Any) -> Any:
 
 
 def _unknown(name: str, known: Sequence[str]) -> DeclarationError:
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    hint = f"; did you mean {', '.join(near)}?" if near else ""
-    return DeclarationError(f"no setting {name!r}{hint} (skillweave info RECIPE lists them)")
+    end = suggest(name, known, listed=False)
+    return DeclarationError(f"no setting {name!r}{end} (skillweave info RECIPE lists them)")

@@ -32,8 +32,9 @@ from skillweave.collecting.shipping import packed, unpacked
 from skillweave.envs.make import cores
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
-from skillweave.messages import error_text, short, whole_number
+from skillweave.messages import error_text, short
 from skillweave.reporting.report.groups import over_seeds
+from skillweave.schema import AtLeastOne, fitted
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
 
@@ -96,9 +97,8 @@ class Job:
 
 def sweep(command: commands.Sweep) -> tuple[dict[str, Any], str]:
     """Train all runs of a sweep; return the results as JSON and for people."""
-    whole_number(command.evaluate, "evaluate", 1)
-    if command.jobs is not None:
-        whole_number(command.jobs, "jobs", 1)
+    fitted(AtLeastOne, command.evaluate, "evaluate")
+    fitted(AtLeastOne | None, command.jobs, "jobs")
     seeds = parse_seeds(command.seeds)
     choices = parse_choices(command.set_each)
     if len(seeds) * len(choices) > MOST:

@@ -18,13 +18,13 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
 from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
+from skillweave.schema import Count, fitted
 from skillweave.training.options import Continuing, Starting
 
 
 def train(command: commands.Train) -> None:
     """Train a recipe, and perhaps the flat baseline after it."""
-    if command.evaluate < 0:
-        raise DeclarationError(f"evaluate is {command.evaluate}; it must be at least 0")
+    fitted(Count, command.evaluate, "evaluate")
     if command.versus_flat and command.flat:
         raise DeclarationError("--flat trains the baseline alone: leave out --versus-flat")
     if command.versus_flat and not command.evaluate:

@@ -22,7 +22,7 @@ from skillweave.envs.infos import ActionMasks, random_actions
 from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
-from skillweave.messages import close_matches, error_text, short, shortened
+from skillweave.messages import error_text, short, shortened, suggest
 from skillweave.policies.infos import batched_infos
 from skillweave.schema import AtLeastOne, Check, check_fields, to_json
 from skillweave.seeding import Seeds, global_generators
@@ -158,7 +158,7 @@ class EnvSpec:
             The environment, whose steps are checked.
 
         Raises:
-            EnvError: the environment does not exist (with close matches), or cannot be made.
+            EnvError: the environment does not exist (with a similar one), or cannot be made.
             MissingExtra: a dependency is not installed.
         """
         try:
@@ -205,15 +205,14 @@ class EnvSpec:
             if entry is not None and entry.entry_point is None and entry.vector_entry_point:
                 raise refuse_batched(env_id) from error
             others = gym.registry.keys() - {env_id}
-            why = shortened(str(error)).rstrip(".")
-            advice = close_matches(env_id, others)
+            advice = suggest(env_id, others, listed=False)
             if not advice and ":" not in env_id:
                 advice = (
-                    " If another package registers it, install and import that package, or write "
-                    f"its module first: 'module:{env_id}'."
+                    "; if another package registers it, install and import that package, or write "
+                    f"its module first: 'module:{env_id}'"
                 )
-            why += "" if why.endswith("?") else "."
-            raise EnvError(f"no environment {short(env_id)}: {why}{advice}") from error
+            why = shortened(str(error)).rstrip(".")
+            raise EnvError(f"no environment {short(env_id)} ({why}){advice}") from error
 
     def observation_names(self) -> ObsNames | None:
         """Return the names of an observation's numbers; None: they have no names.

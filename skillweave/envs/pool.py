@@ -14,7 +14,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, EnvError, MissingExtra
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.spaces import pack, unpack
 from skillweave.types import Array
 
@@ -238,12 +238,12 @@ def envpool(env_id: str, num_envs: int, threads: int, seed: int, **kwargs: Any) 
 
     Raises:
         MissingExtra: EnvPool is not installed.
-        EnvError: EnvPool has no such environment (with close matches).
+        EnvError: EnvPool has no such environment (with a similar one).
     """
     package = installed()
     if env_id not in (known := package.list_all_envs()):
-        near = close_matches(env_id, known)
-        raise EnvError(f"EnvPool has no environment {short(env_id)}.{near}")
+        end = suggest(env_id, known, listed=False)
+        raise EnvError(f"EnvPool has no environment {short(env_id)}{end}")
     with no_precision_warnings():
         pool = package.make_gymnasium(
             env_id, num_envs=num_envs, num_threads=min(threads, num_envs), seed=seed, **kwargs

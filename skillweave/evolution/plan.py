@@ -14,7 +14,8 @@ from skillweave.evolution.config import Evolution, evolution_to_json
 from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
-from skillweave.messages import short
+from skillweave.messages import short, suggest
+from skillweave.schema import fitted
 from skillweave.training.joint import agents_of
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
 
@@ -87,20 +88,13 @@ def make_learner(
 
 def _by_stage(stages: list[str], evolve: Evolve) -> dict[str, Evolution]:
     """Return the stages that evolve."""
+    evolve = fitted(Evolve, evolve, "evolve")
     if evolve is None:
         return {}
     if isinstance(evolve, Evolution):
         return dict.fromkeys(stages, evolve)
-    if not isinstance(evolve, Mapping):
-        raise DeclarationError(
-            f"evolve is {short(evolve)}; it must be an Evolution(), or one for each stage by name"
-        )
-    for name, how in evolve.items():
+    for name in evolve:
         if name not in stages:
-            known = ", ".join(stages)
-            raise DeclarationError(f"evolve: no stage {short(name)} is trained; there are: {known}")
-        if not isinstance(how, Evolution | None):
-            raise DeclarationError(
-                f"evolve[{name!r}] is {short(how)}; it must be an Evolution() or None"
-            )
+            end = suggest(name, stages)
+            raise DeclarationError(f"evolve: no stage {short(name)} is trained{end}")
     return {name: how for name, how in evolve.items() if how is not None}

@@ -11,7 +11,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
 from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.paths import name_of
 from skillweave.schema import fitted
 from skillweave.selectors import Automaton
@@ -98,16 +98,7 @@ def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
     Raises:
         DeclarationError: the argument is no list of reflexes.
     """
-    if isinstance(reflexes, str) or not isinstance(reflexes, Sequence):
-        raise DeclarationError(
-            f"reflexes is {short(reflexes)}; it must be a list: reflexes=[Reflex(...)]"
-        )
-    for reflex in reflexes:
-        if not isinstance(reflex, Reflex):
-            raise DeclarationError(
-                f"reflexes holds {short(reflex)}, which is not a Reflex: Reflex(condition, action)"
-            )
-    return tuple(reflexes)
+    return tuple(fitted(Sequence[Reflex], reflexes, "reflexes"))
 
 
 def check_level(level: Level) -> None:
@@ -202,8 +193,8 @@ def _check_start_calls(level: Level) -> None:
     for name in calls if isinstance(calls, tuple) else ():
         if name not in level.names:
             raise DeclarationError(
-                f"apart.start_calls names {short(name)}, which is no skill here; there are: "
-                f"{', '.join(level.names)}.{close_matches(name, level.names)}"
+                f"apart.start_calls names {short(name)}, which is no skill here"
+                f"{suggest(name, level.names)}"
             )
 
 

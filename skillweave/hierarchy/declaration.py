@@ -21,12 +21,12 @@ from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_s
 from skillweave.hierarchy.roles import Level, Nestable, Roles, hierarchies_of, roles_of
 from skillweave.hierarchy.schedule import DEFAULT_STEPS, budgets_of, stages_of
 from skillweave.hierarchy.settings import Settings, settings_in
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
 from skillweave.planning.neighbours import check_features
 from skillweave.planning.predicates import named_predicates
-from skillweave.schema import check_fields, fitted
+from skillweave.schema import Positive, check_fields, fitted
 from skillweave.skills import Skill, is_trained
 from skillweave.spaces import action_codec, obs_codec
 from skillweave.training.checks import check_env
@@ -115,7 +115,7 @@ class Declaration(Settings, Nestable, Declared):
         """
         skills = roles_of(self).skills
         if not isinstance(name, str) or name not in skills:
-            raise DeclarationError(f"no skill {short(name)}; there are: {', '.join(skills)}")
+            raise DeclarationError(f"no skill {short(name)}{suggest(name, skills)}")
         return skills[name]
 
     def stages(self) -> list[Stage]:
@@ -137,8 +137,7 @@ class Declaration(Settings, Nestable, Declared):
         Raises:
             DeclarationError: the factor is not positive and finite.
         """
-        if not 0.0 < factor < float("inf"):
-            raise DeclarationError(f"scale is {factor}; it must be positive and finite")
+        fitted(Positive, factor, "scale")
         for path, hierarchy in hierarchies_of(self).items():
             for skill in hierarchy.skills:
                 if is_trained(skill):

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from skillweave.errors import DeclarationError
+from skillweave.messages import suggest
 from skillweave.networks.config import Network
 from skillweave.networks.encoders import Encoder, ImageEncoder, Inputs, make_encoder, part, under
 from skillweave.networks.stacked import (
@@ -190,8 +191,8 @@ def _part(key: str, obs: ObsCodec) -> list[int]:
         )
     if not places:
         known = [leaf.name for leaf in obs.leaves if leaf.name]
-        hint = f"its parts are {', '.join(known)}" if known else "it has no parts"
+        end = suggest(key, known) or "; it has no parts"
         raise DeclarationError(
-            f"Network.sees names {key!r}, a part of the observation that does not exist; {hint}"
+            f"Network.sees names {key!r}, a part of the observation that does not exist{end}"
         )
     return places

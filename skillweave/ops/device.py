@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from skillweave.errors import DeclarationError
+from skillweave.schema import fitted
 
 FLOAT: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
 INT: dict[str, Any] = {"dtype": torch.int64, "device": "cpu"}
 BOOL: dict[str, Any] = {"dtype": torch.bool, "device": "cpu"}
 """Types of new tensors: the user may have changed PyTorch's (``torch.set_default_dtype``)."""
-DEVICES = ("cpu", "cuda", "auto")
+DeviceName = Literal["cpu", "cuda", "auto"]
 """Valid device names of settings."""
 
 
@@ -28,8 +29,7 @@ def resolve_device(name: str) -> torch.device:
     Raises:
         DeclarationError: the name is unknown, or PyTorch finds no such device.
     """
-    if name not in DEVICES:
-        raise DeclarationError(f"device is {name!r}; it must be one of {', '.join(DEVICES)}")
+    fitted(DeviceName, name, "device")
     available = torch.cuda.is_available()
     if name == "cuda" and not available:
         raise DeclarationError(

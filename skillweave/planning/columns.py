@@ -16,7 +16,7 @@ import numpy as np
 from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO
-from skillweave.messages import close_matches, shortened
+from skillweave.messages import shortened, suggest
 from skillweave.policies.core import CallEnd
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Step
@@ -201,13 +201,10 @@ class CallColumns:
         """Return the place of a skill in ``skills``.
 
         Raises:
-            DeclarationError: the log has no skill of this name; similar names are given.
+            DeclarationError: the log has no skill of this name; a similar one is given.
         """
         if skill not in self.skills:
-            raise DeclarationError(
-                f"the log has no skill {skill!r}; its skills are: {', '.join(self.skills)}."
-                f"{close_matches(str(skill), self.skills)}"
-            )
+            raise DeclarationError(f"the log has no skill {skill!r}{suggest(skill, self.skills)}")
         return self.skills.index(skill)
 
     def of(self, skill: str) -> Self:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
@@ -90,8 +90,7 @@ def feature_maps(
     for name in by_skill:
         if name not in names:
             raise DeclarationError(
-                f"features= names {short(name)}, which is no skill of the log; its skills are: "
-                f"{', '.join(names)}.{close_matches(str(name), names)}"
+                f"features= names {short(name)}, which is no skill of the log{suggest(name, names)}"
             )
     return [
         FeatureMap(

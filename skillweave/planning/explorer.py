@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError
-from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import check_features, check_number
+from skillweave.planning.neighbours import check_features
 from skillweave.planning.states import planning_states
 from skillweave.policies.core import Memory, Policy, Turn
+from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
 from skillweave.types import Array
 
 PER_FEATURE = 0.25
 """Standard deviations of each feature from which on a call is new."""
+_Temperature = Annotated[float, Check("from 1e-06 to 10", lambda x: 1e-6 <= x <= 10)]
 
 
 @checked_names
@@ -55,17 +55,12 @@ class Explorer(Policy):
         temperature: float = 0.03,
         every: int = 4_000,
     ) -> None:
-        if radius is not None:
-            real = isinstance(radius, int | float) and not isinstance(radius, bool)
-            if not real or not 0 < radius < np.inf:
-                raise DeclarationError(f"Explorer: radius is {short(radius)}; it must be positive")
         check_features(features, "Explorer")
-        check_number("Explorer: gamma", gamma, 0.0, 1.0)
-        check_number("Explorer: temperature", temperature, 1e-6, 10.0)
-        self.every = whole_number(every, "Explorer: every", 1)
-        self._radius, self._features, self._gamma = radius, features, gamma
-        self._neighbours = whole_number(neighbours, "Explorer: neighbours", 1)
-        self._temperature = temperature
+        self.every = fitted(AtLeastOne, every, "Explorer: every")
+        self._radius = fitted(Positive | None, radius, "Explorer: radius")
+        self._features, self._gamma = features, fitted(Fraction, gamma, "Explorer: gamma")
+        self._neighbours = fitted(AtLeastOne, neighbours, "Explorer: neighbours")
+        self._temperature = fitted(_Temperature, temperature, "Explorer: temperature")
         self._choices = 0
         self._graph: CallGraph | None = None
         self._worth = self._far = np.zeros(0)

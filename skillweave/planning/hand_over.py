@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import short
+from skillweave.messages import short, suggest
 from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
@@ -21,6 +21,7 @@ from skillweave.planning.neighbours import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
+from skillweave.schema import fitted
 from skillweave.types import Array
 
 START = "start"
@@ -77,7 +78,7 @@ class HandOver:
         for name, known in ((skill, self.skills), (after, self.before)):
             if name not in known:
                 raise DeclarationError(
-                    f"the log has no skill {short(name)}; its skills are: {', '.join(self.skills)}"
+                    f"the log has no skill {short(name)}{suggest(name, self.skills)}"
                 )
         place = self.before.index(after), self.skills.index(skill)
         return float(self.rate[place]), int(self.calls[place])
@@ -262,11 +263,7 @@ def calls_done(log: CallColumns, done: Mapping[str, Any] | None) -> Array:
     won = log.succeeded.copy()
     if done is None:
         return won
-    if not isinstance(done, Mapping):
-        raise DeclarationError(
-            f"done is {short(done)}; give events by skill: done={{'hover': in_box}}"
-        )
-    for name, event in done.items():
+    for name, event in fitted(Mapping[str, Any], done, "done").items():
         rows = np.flatnonzero(log.skill == log.number(name))
         won[rows] = happened(log.take(rows), as_event(event, f"done of {name!r}"))
     return won

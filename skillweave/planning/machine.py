@@ -15,10 +15,11 @@ from gymnasium.spaces import Box
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, short
+from skillweave.messages import short, suggest
 from skillweave.planning.predicates import Event, Held, Predicate, as_event
 from skillweave.policies.plan import Machine
-from skillweave.selectors.automaton import Automaton, check_name, check_transitions
+from skillweave.schema import fitted
+from skillweave.selectors.automaton import Automaton, StateName, check_transitions
 from skillweave.selectors.base import Wrapped, checked_function, function_name, listed
 from skillweave.types import LARGEST_REWARD, Array, Step
 
@@ -381,7 +382,7 @@ def _skills_of(arrow: Arrow, skills: Mapping[str, Any]) -> list[str]:
         if name not in skills:
             raise DeclarationError(
                 f"automaton(): the event {name!r} has no skill; give one: "
-                f"automaton({{{name!r}: 'a_skill', ...}}).{close_matches(name, skills)}"
+                f"automaton({{{name!r}: 'a_skill', ...}}){suggest(name, skills, listed=False)}"
             )
         chosen += _names(skills[name])
     return chosen
@@ -403,7 +404,7 @@ def _declared(transitions: Any, start: Any, accepting: Any, failing: Any, each_s
     named: dict[str, int] = {}
     for pair in transitions:
         for state in pair:
-            named.setdefault(check_name(state, "a RewardMachine's"), len(named))
+            named.setdefault(fitted(StateName, state, "a RewardMachine's state"), len(named))
     if not named:
         named[start if isinstance(start, str) and start else "always"] = 0
     ends = [

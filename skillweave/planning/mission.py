@@ -7,7 +7,6 @@ from typing import Any
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
-from skillweave.messages import whole_number
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission_text import parse
 from skillweave.planning.parts import (
@@ -26,6 +25,7 @@ from skillweave.planning.predicates import (
     as_predicate,
     named_predicates,
 )
+from skillweave.schema import AtLeastOne, fitted
 
 
 @checked_names
@@ -85,7 +85,7 @@ class Mission(RewardMachine):
             raise DeclarationError(
                 f"Mission: {both[0]!r} must be done and must be avoided: leave out one of them"
             )
-        self.repeat = None if repeat is None else whole_number(repeat, "Mission: repeat", 1)
+        self.repeat = fitted(AtLeastOne | None, repeat, "Mission: repeat")
         self._build(compile_mission(self.legs, self.avoid, self.repeat))
 
     @classmethod

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, NoReturn
 
 from skillweave.errors import DeclarationError
-from skillweave.messages import close_matches, short
+from skillweave.messages import suggest
 from skillweave.planning.parts import (
     MOST_TOGETHER,
     AnyOrder,
@@ -19,6 +19,7 @@ from skillweave.planning.parts import (
     sequence,
 )
 from skillweave.planning.predicates import LONGEST_HOLD, Event, Held, Predicate
+from skillweave.schema import fitted
 
 KEYWORDS = ("then", "or", "and", "not", "for", "avoid", "repeat")
 RESERVED = (*KEYWORDS, "forever", "steps", "step")
@@ -46,8 +47,7 @@ def parse(
     Raises:
         DeclarationError: a word is unknown or out of place; the message points at it.
     """
-    if not isinstance(text, str):
-        raise DeclarationError(f"a mission is {short(text)}; give a text: 'left then right'")
+    fitted(str, text, "a mission")
     if len(text) > LONGEST:
         raise DeclarationError(f"a mission has {len(text):,} characters; at most {LONGEST:,}")
     for name in predicates:
@@ -145,9 +145,8 @@ class _Parser:
             if not self.predicates:
                 name = token.text
                 self.fail(f"{name!r} is no known predicate: give predicates={{{name!r}: …}}", token)
-            known = ", ".join(self.predicates)
-            close = close_matches(token.text, self.predicates)
-            self.fail(f"{token.text!r} is no known predicate; known are: {known}.{close}", token)
+            end = suggest(token.text, self.predicates)
+            self.fail(f"{token.text!r} is no known predicate{end}", token)
         event = self.predicates[token.text]
         if negated is None:
             return event

@@ -46,13 +46,6 @@ def check_features(features: Any, who: str) -> None:
             )
 
 
-def check_number(name: str, value: Any, low: float, high: float) -> None:
-    """Raise a DeclarationError where a number is no number, or out of its range."""
-    real = isinstance(value, int | float | np.floating) and not isinstance(value, bool)
-    if not real or not low <= value <= high:
-        raise DeclarationError(f"{name} is {short(value)}; it must be from {low:g} to {high:g}")
-
-
 class Standard:
     """Values standardised by the mean and deviation of most of the known ones; constants are 0.
 

@@ -6,7 +6,7 @@ import json
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import columns_of
@@ -22,18 +22,20 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.lacking import check_possible, obstacle, read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import check_features, check_number
+from skillweave.planning.neighbours import check_features
 from skillweave.planning.states import planning_states
 from skillweave.planning.task import Task, as_task
 from skillweave.policies.files import checksum
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned
 from skillweave.policies.spaces import space_of
+from skillweave.schema import AtLeastOne, Check, Fraction, fitted
 from skillweave.selectors.base import ReadySelector
 from skillweave.types import Array
 
 MOST_GOALS = 256
 """Goals whose plans are kept."""
+_ToTen = Annotated[float, Check("from 0 to 10", lambda x: 0 <= x <= 10)]
 
 
 @checked_names
@@ -108,13 +110,9 @@ class Planner(ReadySelector):
         temperature: float = 0.0,
     ) -> None:
         super().__init__("planner")
-        check_number("Planner: gamma", gamma, 0.0, 1.0)
-        check_number("Planner: caution", caution, 0.0, 10.0)
-        check_number("Planner: temperature", temperature, 0.0, 10.0)
         check_features(features, "Planner")
-        if not isinstance(log, CallLog):
-            raise DeclarationError(f"Planner: log is {short(log)}; give a CallLog")
-        self.log, self.task = log, as_task(task, predicates)
+        self.log = fitted(CallLog, log, "Planner: log")
+        self.task = as_task(task, predicates)
         self.skills, self.lengths = log.skills, log.lengths
         if isinstance(self.task, RewardMachine) and not self.task.plan.pays:
             raise DeclarationError(
@@ -124,11 +122,13 @@ class Planner(ReadySelector):
         self.graph = CallGraph(
             log,
             features,
-            whole_number(neighbours, "Planner: neighbours", 1),
+            fitted(AtLeastOne, neighbours, "Planner: neighbours"),
             _skill_set(log, skills),
             self.task if isinstance(self.task, RewardMachine) else None,
         )
-        self.gamma, self.caution, self.temperature = gamma, caution, temperature
+        self.gamma = fitted(Fraction, gamma, "Planner: gamma")
+        self.caution = fitted(_ToTen, caution, "Planner: caution")
+        self.temperature = fitted(_ToTen, temperature, "Planner: temperature")
         self._plans: OrderedDict[bytes, Array] = OrderedDict()
         self.over = _over(self.task, self.graph)
         """(E,) bool, the ends of calls after which nothing follows."""

@@ -13,7 +13,8 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, SkillError
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
+from skillweave.schema import AtLeastOne, fitted
 from skillweave.selectors.base import function_name
 from skillweave.skills import Skill
 from skillweave.skills.outputs import answer
@@ -51,10 +52,7 @@ class Predicate:
             raise DeclarationError(
                 f"a predicate is {short(function)}; give a function of observations or of a step"
             )
-        if reads not in (None, "obs", "step"):
-            raise DeclarationError(
-                f"a predicate's reads is {short(reads)}; it must be 'obs' or 'step'"
-            )
+        fitted(Reads | None, reads, "a predicate's reads")
         self.function = function
         self.name = name or function_name(function)
         self.reads: Reads = reads or _argument(function)
@@ -146,7 +144,7 @@ def held(predicate: Any, steps: int) -> Event:
         DeclarationError: the predicate is no function, or the number is not whole.
     """
     predicate = as_predicate(predicate, "held()")
-    steps = whole_number(steps, "held(): steps", 1)
+    steps = fitted(AtLeastOne, steps, "held(): steps")
     if steps > LONGEST_HOLD:
         raise DeclarationError(
             f"held(): steps is {steps:,}; an episode has at most {LONGEST_HOLD:,} steps"
@@ -176,14 +174,10 @@ def as_event(value: Any, where: str) -> Event:
 
 def named_predicates(values: Mapping[str, Any], where: str) -> dict[str, Event]:
     """Return events by the names under which a text refers to them."""
-    if not isinstance(values, Mapping):
-        raise DeclarationError(
-            f"{where}: the predicates are {short(values)}; give a dict by name: {{'left': is_left}}"
-        )
     named: dict[str, Event] = {}
-    for name, value in values.items():
+    for name, value in fitted(Mapping[str, Any], values, f"{where}: predicates").items():
         event = as_event(value, f"{where}: {short(name)}")
-        if not isinstance(name, str) or not re.fullmatch(WORD, name):
+        if not re.fullmatch(WORD, name):
             raise DeclarationError(
                 f"{where}: a predicate is named {short(name)}; a name is one word that begins with "
                 "a letter"

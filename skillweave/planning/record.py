@@ -17,7 +17,7 @@ from skillweave.envs.engine import Engine, GymnasiumEngine, episode_seed
 from skillweave.envs.infos import allowed_rows
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import DeclarationError, Interrupted
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
@@ -25,6 +25,7 @@ from skillweave.policies.core import Around, CallEnd, Turn, World, restart
 from skillweave.policies.core import Memory as InPlaceMemory
 from skillweave.policies.core import Policy as InPlace
 from skillweave.policies.parts import GOAL
+from skillweave.schema import AtLeastOne, fitted
 from skillweave.seeding import Seeds, global_generators
 from skillweave.selectors import ReadySelector, ready_selector
 from skillweave.skills.goal_spaces import blank_choices
@@ -121,14 +122,13 @@ def with_returns(
     Raises:
         Interrupted: Ctrl-C has stopped the recording; the message says what was kept.
     """
-    steps, num_envs = whole_number(steps, "steps", 1), whole_number(num_envs, "num_envs", 1)
+    steps, num_envs = fitted(AtLeastOne, steps, "steps"), fitted(AtLeastOne, num_envs, "num_envs")
     skill_set = skills if isinstance(skills, SkillSet) else skills_below(skills)
     if skill_set is None:
         raise DeclarationError(
             f"record_calls(): {short(skills)} has no skills; give a run's policy, run.policy"
         )
-    if isinstance(info, str):
-        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    fitted(Sequence[str], info, "info")
     if isinstance(choose, str) and choose == "explore":
         choose = Explorer()
     skill_set = replace(skill_set, interruption=None)  # it belongs to a selector that is left out

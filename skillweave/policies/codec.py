@@ -216,7 +216,7 @@ class Reader:
         own, values = written_fields(made), dict[str, Any]()
         if wrong := [name for name in entry if name not in own and name != "type"]:
             near = get_close_matches(str(wrong[0]), own, 1)
-            hint = f": is {near[0]!r} meant" if near else f"; it has {', '.join(own)}"
+            hint = f": is {near[0]!r} meant?" if near else f"; there are: {', '.join(own)}"
             raise PolicyError(f"{where}.{shown(wrong[0])} is unknown{hint}")
         if "who" in made.__dataclass_fields__ and "who" not in own:
             values["who"] = where

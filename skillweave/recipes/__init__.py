@@ -20,7 +20,7 @@ def load(recipe: str) -> Hierarchy:
     others that lie beside it.
 
     Raises:
-        DeclarationError: no such recipe (with close matches) or file, no hierarchy in it, the file
+        DeclarationError: no such recipe (with a similar one) or file, no hierarchy in it, the file
             trains as soon as it is read, or it raises an error.
     """
     from skillweave import Hierarchy

@@ -6,23 +6,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, MissingExtra, RunError
-from skillweave.messages import as_path, close_matches, short
+from skillweave.messages import as_path, short, suggest
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped, on_one_grid
 from skillweave.reporting.report.verdict import is_binary
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.several import open_runs
+from skillweave.schema import Check, fitted
 from skillweave.training.evaluation_file import load_evaluation
 from skillweave.types import Array
 
 Band = Literal["iqr", "range", "none"]
+_Inches = Annotated[float, Check("from 1 to 40 inches", lambda x: 1 <= x <= 40)]
 Paths: TypeAlias = str | Path | Sequence[str | Path]
 Curve: TypeAlias = list[tuple[int, float]]
 
@@ -108,11 +110,9 @@ def plot_curves(
         MissingExtra: the extra 'plot' is not installed.
     """
     out = as_path(out, "out")
-    if band not in get_args(Band):
-        raise DeclarationError(f"band is {short(band)}; it must be one of {', '.join(BANDS)}")
+    fitted(Band, band, "band")
     for name, size in (("width", width), ("height", height)):
-        if size is not None and not (isinstance(size, int | float) and 1 <= size <= 40):
-            raise DeclarationError(f"{name} is {short(size)}; it must be from 1 to 40 inches")
+        fitted(_Inches | None, size, name)
     must_be_own(out.parent)
     groups = _groups(runs)
     groups = _renamed(groups, labels) if labels is not None else groups
@@ -167,8 +167,8 @@ def _metric(runs: Sequence[RunDirectory], metric: str | None, agent: str | None)
                     f"{run.path} has no metrics of {whose}; there are metrics of: {agents}"
                 )
             raise DeclarationError(
-                f"{run.path} has no metric {short(metric)} of {whose}."
-                f"{close_matches(metric, metrics) or ' There are: ' + ', '.join(sorted(metrics))}"
+                f"{run.path} has no metric {short(metric)} of {whose}"
+                f"{suggest(metric, sorted(metrics))}"
             )
     return metric
 

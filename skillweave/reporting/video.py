@@ -16,12 +16,13 @@ from skillweave.envs.checks import LONG_EPISODE
 from skillweave.envs.engine import GymnasiumEngine
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import EnvError
-from skillweave.messages import error_text, whole_number
+from skillweave.messages import error_text
 from skillweave.notebooks import Markup, joined, paragraph
 from skillweave.reporting.palette import BAND, BLACK, LINE, PALETTE, RGB, WHITE, color_of, is_light
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import hint, without_screen
 from skillweave.reporting.video_file import VideoWriter, extra
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
@@ -76,10 +77,10 @@ def render_policy(
         EnvError: the environment gives no frames; see VideoWriter for more.
         MissingExtra: the extra 'video' is not installed.
     """
-    episodes = whole_number(episodes, "episodes", 1)
-    every = whole_number(every, "every", 1)
-    seed = whole_number(seed, "seed", 0)
-    limit = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
+    episodes = fitted(AtLeastOne, episodes, "episodes")
+    every = fitted(AtLeastOne, every, "every")
+    seed = fitted(Count, seed, "seed")
+    limit = LONG_EPISODE if max_steps is None else fitted(AtLeastOne, max_steps, "max_steps")
     rng = rng or (Seeds(seed) / "render").numpy()
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")

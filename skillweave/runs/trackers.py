@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from skillweave.errors import DeclarationError, MissingExtra, RunError
-from skillweave.messages import error_text
+from skillweave.messages import error_text, suggest
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
 from skillweave.terminal import say
@@ -294,7 +294,7 @@ def make_trackers(names: Sequence[str], run: RunDirectory | None) -> tuple[Track
     """
     for name in names:
         if name not in TRACKERS:
-            raise DeclarationError(f"no tracker {name!r}; there are: {', '.join(TRACKERS)}")
+            raise DeclarationError(f"no tracker {name!r}{suggest(name, TRACKERS)}")
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(f"tracking with {name}", name)
     return () if run is None else tuple(MAKE[name](run) for name in names)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
@@ -18,6 +18,7 @@ from skillweave.policies import selectors
 from skillweave.policies.errors import PolicyError
 from skillweave.policies.files import checksum
 from skillweave.policies.selectors import skill_and_goal
+from skillweave.schema import Check, fitted
 from skillweave.selectors.base import (
     ReadySelector,
     checked_function,
@@ -30,6 +31,8 @@ Event = Callable[[Step], Any] | str
 """The event of a transition: a function of a ``Step``, (n,) bool, or "success" or "failure"."""
 Choices = str | tuple[str, Any] | Sequence[Any] | set[Any] | frozenset[Any]
 """The skills of a state."""
+StateName = Annotated[str, Check("a text", bool)]
+"""The name of a state."""
 
 
 @checked_names
@@ -91,7 +94,7 @@ class Automaton(ReadySelector):
         self.goals: dict[tuple[str, str], Any] = {}
         """The goals by state and skill, where skills have some."""
         self.states = {
-            check_name(name, "an Automaton's"): _skills(name, skills, self.goals)
+            fitted(StateName, name, "an Automaton's state"): _skills(name, skills, self.goals)
             for name, skills in states.items()
         }
         self.state_names = tuple(self.states)
@@ -161,17 +164,6 @@ def check_transitions(transitions: Any, whose: str) -> None:
             raise DeclarationError(
                 f"{whose} transition is from {short(pair)}; write ('from', 'to'): event"
             )
-
-
-def check_name(state: Any, whose: str) -> str:
-    """Return the name of a state.
-
-    Raises:
-        DeclarationError: it is no text.
-    """
-    if not isinstance(state, str) or not state:
-        raise DeclarationError(f"{whose} state is named {short(state)}; it must be text")
-    return state
 
 
 def _skills(

@@ -36,6 +36,7 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies.selectors import Status as Status
 from skillweave.policies.selectors import function_name, skill_and_goal
+from skillweave.schema import fitted
 from skillweave.types import Array
 
 
@@ -82,10 +83,8 @@ class Composite:
         where = f"tree: {type(self).__name__}"
         if not children:
             raise DeclarationError(f"{where} has no children: give skills' names or conditions")
-        if not isinstance(memory, bool):
-            raise DeclarationError(f"{where}: memory is {short(memory)}; it must be True or False")
         self.children = tuple(_child(c, where) for c in children)
-        self.memory = memory
+        self.memory = fitted(bool, memory, f"{where}: memory")
 
 
 class Sequence(Composite):

@@ -203,7 +203,7 @@ class Skill:
                 "choose another name"
             )
         kinds = annotations_of(Skill)
-        for field in ("max_steps", "call_steps", *_OF_TRAINING):
+        for field in ("max_steps", "call_steps", "needs_info", "reward_changes", *_OF_TRAINING):
             value = getattr(self, field)
             converted = fitted(kinds[field], value, f"{where}: {field}")
             if converted is not value and (is_trained(self) or field not in _OF_TRAINING):
@@ -213,20 +213,6 @@ class Skill:
             raise DeclarationError(
                 f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
                 "0 to 255: color = (230, 80, 60)"
-            )
-        if not isinstance(self.reward_changes, bool | np.bool_):
-            raise DeclarationError(
-                f"{where}: reward_changes is {short(self.reward_changes)}; it must be True or False"
-            )
-        keys = self.needs_info
-        if keys is not None and (
-            isinstance(keys, str)
-            or not isinstance(keys, Sequence)
-            or not all(isinstance(key, str) for key in keys)
-        ):
-            raise DeclarationError(
-                f"{where}: needs_info is {short(keys)}; it must be a tuple of keys of info: "
-                "needs_info = ('key',)"
             )
         self._check_goals(where)
         if self.sees is not None:
@@ -347,8 +333,7 @@ class Reflex:
             raise DeclarationError(
                 f"a Reflex's condition is {short(condition)}; it must be a function of observations"
             )
-        if not isinstance(name, str | None):
-            raise DeclarationError(f"a Reflex's name is {short(name)}; it must be text")
+        fitted(str | None, name, "a Reflex's name")
         self.condition, self.action = condition, action
         self.name = name or getattr(condition, "__name__", "reflex")
 

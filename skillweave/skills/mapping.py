@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import count
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.named import named
 from skillweave.policies.mapped import LONGEST
+from skillweave.schema import Check, check_fields, fitted
+
+_Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
 
 # Parts of an input
 
@@ -66,15 +69,8 @@ class Part(Scaling):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.key, str):
-            raise DeclarationError(
-                f"Part.key is {short(self.key)}; it must be the name of a part of the observation"
-            )
+        check_fields(self)
         _check(self, _places, "places")
-        if not isinstance(self.one_hot, bool):
-            raise DeclarationError(
-                f"Part.one_hot is {short(self.one_hot)}; it must be True or False"
-            )
 
 
 @checked_names
@@ -218,7 +214,8 @@ class PolicyMapping:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "goal", checked_goal(self.goal))
-        _check(self, _count, "every", "chunk")
+        for name, kind in (("every", _Steps), ("chunk", _Steps | None)):
+            object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
                 "goal is given, but the policy does not take it: write Goal() at its place in sees"
@@ -257,17 +254,15 @@ class PolicyMapping:
             DeclarationError: a field has a wrong value; the message names it.
         """
         code = code or {}
-        if not isinstance(data, Mapping):
-            raise DeclarationError(f"the mapping is {short(data)}; it must be an object")
+        fitted(Mapping[str, Any], data, "the mapping")
         for name in ("sees", "scaling"):
-            if not isinstance(value := data.get(name, {}), Mapping):
-                raise DeclarationError(f"{name} is {short(value)}; it must be an object of inputs")
+            fitted(Mapping[str, Any], data.get(name, {}), name)
         sees, goal, acts = (data.get(name) for name in ("sees", "goal", "acts"))
         if sees is not None:
             sees = {
                 name: tuple(
                     _from_json(None, part, code, f"sees[{name!r}][{i}]")
-                    for i, part in enumerate(_list(parts, f"sees[{name!r}]"))
+                    for i, part in enumerate(fitted(list[Any], parts, f"sees[{name!r}]"))
                 )
                 for name, parts in sees.items()
             }
@@ -279,8 +274,8 @@ class PolicyMapping:
             k: _from_json(Scaling, v, code, f"scaling[{k!r}]")
             for k, v in data.get("scaling", {}).items()
         }
-        states = _list(data.get("state", []), "state")
-        state = tuple(tuple(_list(entry, "state")) for entry in states)
+        states = fitted(list[Any], data.get("state", []), "state")
+        state = tuple(tuple(fitted(list[Any], entry, "state")) for entry in states)
         single = data.get("single_state", False)
         every, chunk = data.get("every", 1), data.get("chunk")
         return cls(sees, goal, acts, every, chunk, state, single, scaling)
@@ -468,8 +463,7 @@ def _check(settings: Any, convert: Callable[[Any, str], Any], *names: str) -> No
     for name in names:
         value = getattr(settings, name)
         if value is not None or getattr(kind, name) is not None:
-            prefix = "" if kind is PolicyMapping else f"{kind.__name__}."
-            where = f"{prefix}{name} is {short(value)}; it must be"
+            where = f"{kind.__name__}.{name} is {short(value)}; it must be"
             object.__setattr__(settings, name, convert(value, where))
 
 
@@ -498,12 +492,6 @@ def _range(value: Any, where: str) -> tuple[float, ...]:
     if not isinstance(ends, tuple) or len(ends) != 2 or ends[0] > ends[1]:
         raise DeclarationError(f"{where} the lowest and the highest number: (-1.0, 1.0)")
     return ends
-
-
-def _count(value: Any, where: str) -> int:
-    if not _is_whole(value) or not 1 <= value <= LONGEST:
-        raise DeclarationError(f"{where} a whole number, at least 1 and at most {LONGEST:,}")
-    return int(value)
 
 
 def _places(value: Any, where: str) -> slice | tuple[int, ...]:
@@ -582,8 +570,7 @@ def _from_json(kind: type[Any] | None, data: Any, code: Mapping[str, Any], where
             raise DeclarationError(
                 f"{where} is {short(data)}; its field source must be one of {', '.join(KINDS)}"
             )
-    if not isinstance(data, Mapping):
-        raise DeclarationError(f"{where} is {short(data)}; it must be an object")
+    fitted(Mapping[str, Any], data, where)
     given = {entry.name: data[entry.name] for entry in fields(kind) if entry.name in data}
     if kind is Computed:
         given["function"] = _function(data.get("function"), code, where)
@@ -598,9 +585,3 @@ def _function(name: Any, code: Mapping[str, Any], where: str) -> Callable[[Any],
     if not callable(function):
         raise DeclarationError(f"{where} needs the function {short(name)}: give it in code")
     return function  # type: ignore[no-any-return]
-
-
-def _list(value: Any, where: str) -> Sequence[Any]:
-    if not isinstance(value, list | tuple):
-        raise DeclarationError(f"{where} is {short(value)}; it must be a list")
-    return value

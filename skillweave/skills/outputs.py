@@ -10,9 +10,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from skillweave.arguments import meant
 from skillweave.errors import PolicyError, SkillError, SkillweaveError
-from skillweave.messages import error_text, short
+from skillweave.messages import error_text, short, suggest
 from skillweave.policies.infos import NUMBERS
 from skillweave.skills.info_words import missing_key, odd_key
 from skillweave.skills.probing import probe, watch
@@ -220,8 +219,7 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
     if step and ("not subscriptable" in text or name in dir(np.ndarray)):
         return f"; its argument is a Step: write {example}"
     if step and name is not None and getattr(error, "obj", None) is argument:
-        known = [f.name for f in fields(Step)]
-        return meant(name, known, "a Step has").replace(": is", "; is")
+        return suggest(name, [f.name for f in fields(Step)])
     if isinstance(argument, np.ndarray) and name in Step.__slots__:
         return f"; its argument is observations, not a Step: write {example}"
     if keys and (

@@ -19,9 +19,8 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.spaces import Box, Dict, Discrete
 
-from skillweave.arguments import meant
 from skillweave.errors import DeclarationError, PolicyError
-from skillweave.messages import short, shortened
+from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data
@@ -185,7 +184,7 @@ def _filled(
         given = dict.fromkeys(space.parts, rest) if isinstance(rest, str) else rest
         for key in given:
             if key not in space.parts:
-                hint = meant(str(key), list(space.parts), "it has")
+                hint = suggest(key, space.parts)
                 raise DeclarationError(f"{where} has {key!r}, which the action does not have{hint}")
         for key, part in space.parts.items():
             inside = zero[key], given.get(key, ZERO), part, f"{where}[{key!r}]"
@@ -259,7 +258,7 @@ def _named(names: tuple[str, ...], space: Data, who: str) -> tuple[Data, Paths]:
         for key in path:
             part = None if part is None else (part.parts or {}).get(key)
         if part is None:
-            hint = meant(name, [".".join(p) for p in space.leaves], "its parts are")
+            hint = suggest(name, [".".join(p) for p in space.leaves])
             raise DeclarationError(
                 f"{who}: acts names {name!r}, a part of the action that does not exist{hint}"
             )

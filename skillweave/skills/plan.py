@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium import Space
 
-from skillweave.arguments import meant
 from skillweave.errors import PolicyError
-from skillweave.messages import short, shortened
+from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import (
     Input,
     Linear,
@@ -132,8 +131,8 @@ class _Reader:
             )
         if not paths:
             raise PolicyError(
-                f"{where} reads {key!r}, which the observation does not have; its parts are "
-                f"{', '.join(names.values())}"
+                f"{where} reads {key!r}, which the observation does not have"
+                f"{suggest(key, names.values())}"
             )
         if len(paths) == 1 and part.places is None:
             shape = self.leaves[paths[0]].shape
@@ -207,7 +206,7 @@ def for_model(inputs: dict[str, Input], expected: Shapes, who: str) -> dict[str,
         if name not in expected:
             raise PolicyError(
                 f"{who}: sees has an input {name!r}, which the policy does not take"
-                + meant(name, list(expected), "it takes")
+                + suggest(name, expected)
             )
         wanted, has = expected[name], given.shape
         if fits_shape(has, wanted) or wanted is None:

@@ -18,6 +18,7 @@ from skillweave.notices import notice
 from skillweave.policies.core import Turn
 from skillweave.policies.files import check_file, checksum, read_file
 from skillweave.policies.mapped import Shapes
+from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import made_up
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, array_of, layers_of, no_mapping
 from skillweave.skills.mapping import Part, PolicyMapping, Scaling, mapping_of
@@ -201,8 +202,7 @@ def from_sb3(
         DeclarationError: an argument has a wrong type.
     """
     options = {"sees": sees, "goal": goal, "acts": acts, "every": every}
-    if not isinstance(learn, bool):
-        raise DeclarationError(f"from_sb3(): learn is {short(learn)}; it must be True or False")
+    fitted(bool, learn, "from_sb3(): learn")
     file, origin = None, dict[str, str]()
     if isinstance(model, str | Path):
         file = Path(model)

@@ -17,6 +17,7 @@ from skillweave.messages import short, shortened
 from skillweave.policies.core import Turn
 from skillweave.policies.files import checksum, read_file
 from skillweave.policies.mapped import invoke, of_model, parted, rows_first, states_of
+from skillweave.schema import fitted
 from skillweave.skills.foreign_policy import qualified
 from skillweave.skills.learnable import PLAIN_PPO, Learnable, layers_of, no_mapping
 from skillweave.skills.mapped import MappedPolicy
@@ -245,8 +246,7 @@ def from_torch(
         RunError: the file does not exist.
     """
     mapping = mapping_of("from_torch()", sees, goal, acts, every, chunk, state)
-    if not isinstance(learn, bool):
-        raise DeclarationError(f"from_torch(): learn is {short(learn)}; it must be True or False")
+    fitted(bool, learn, "from_torch(): learn")
     if learn and mapping != PolicyMapping():
         raise DeclarationError(
             no_mapping("from_torch(learn=True): the module", "sees, acts and the like")

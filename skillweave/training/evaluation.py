@@ -21,12 +21,12 @@ from skillweave.envs.infos import reported_success
 from skillweave.envs.make import EngineName, EnvSpec, in_pool, make_engine
 from skillweave.envs.pool import POOL_SEEDS
 from skillweave.errors import DeclarationError, SkillweaveError
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
 from skillweave.notebooks import joined, paragraph, table
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.policies.parts import OWN_GOAL
-from skillweave.schema import AtLeastOne, Count
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.foreign_policy import Foreign, check_spaces
@@ -296,10 +296,10 @@ def evaluate(
             skills, of a skill that acts alone, or more than 4 GiB of them.
         EnvError: the environment cannot be made, or not in a pool, or sets no such key of ``info``.
     """
-    episodes = whole_number(episodes, "episodes", 1)
-    seed = whole_number(seed, "seed", 0)
-    limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
-    n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
+    episodes = fitted(AtLeastOne, episodes, "episodes")
+    seed = fitted(Count, seed, "seed")
+    limit = fitted(AtLeastOne | None, max_steps, "max_steps")
+    n = USUAL_ENVS if num_envs is None else fitted(AtLeastOne, num_envs, "num_envs")
     if log_calls:
         check_logged(policy, info)
     elif len(info):
@@ -409,8 +409,7 @@ def _check_starts_again(envs: Engine, seed: int, first: Array, name: str) -> Non
 
 def check_logged(policy: Policy, info: Sequence[str]) -> None:
     """Raise a DeclarationError where the calls of a policy cannot be logged."""
-    if isinstance(info, str):
-        raise DeclarationError(f"info is {info!r}; give a tuple of keys: info=({info!r},)")
+    fitted(Sequence[str], info, "info")
     if isinstance(getattr(policy, "skill", None), Skill):
         raise DeclarationError(
             "a skill that acts alone is not called, so there are no calls to log: leave out skill, "

@@ -10,7 +10,7 @@ from torch import Tensor
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.envs.checks import LONG_EPISODE, LONGEST_EPISODE
 from skillweave.errors import RunError, SkillweaveError, reworded
-from skillweave.messages import close_matches
+from skillweave.messages import suggest
 from skillweave.notices import notice
 from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
@@ -165,11 +165,10 @@ class StageLog:
         absent = [key for key in tally.absent if key not in self.run.reported_absent]
         self.run.reported_absent |= set(absent)
         others = sorted(tally.others - set(absent))
-        content = f"its keys there were {', '.join(others)}" if others else "it was empty there"
         for key in absent:
             self.message(
-                f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info); "
-                f"{content}.{close_matches(key, others)}"
+                f"none of {tally.ended} episodes ended with a number in info[{key!r}] (log_info)"
+                f"{suggest(key, others) or '; it was empty there'}"
             )
 
     def report_endless(self, tally: EpisodeTally) -> None:

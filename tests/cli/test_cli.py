@@ -421,7 +421,7 @@ def test_calls_are_logged_shown_and_planned_on(
     recipe.write_text(CODED.replace("    algorithm=small", tilted))
     assert "after" not in call("info", run).out
     unknown = call("plan", run, "tilt", "--recipe", recipe)
-    assert (unknown.code, "Close matches: tilted" in unknown.err) == (1, True)
+    assert (unknown.code, "is 'tilted' meant?" in unknown.err) == (1, True)
     assert not (run / "calls.safetensors").exists(), "an unknown word is named before recording"
     answer = call("log", run, "--recipe", recipe, "--steps", 300)
     assert answer.code == 0, answer.err
@@ -650,7 +650,7 @@ def test_list_shows_recipes_and_the_runs_here_even_a_damaged_one(
 # Mistakes
 
 MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
-    "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "Did you mean lunar-lander"]),
+    "recipe": (["train", "lunar-landr"], 1, ["'lunar-landr'", "is 'lunar-lander' meant?"]),
     "recipe file": (["train", "nowhere.py"], 1, ["'nowhere.py'", "lunar-lander"]),
     "setting": (["train", "PLAIN", "--set", "selector.gama=0.9"], 1, ["selector.gamma"]),
     "plain setting": (["train", "PLAIN", "--set", "call_step=9"], 1, ["call_steps"]),
@@ -668,7 +668,7 @@ MISTAKES: dict[str, tuple[list[str], int, list[str]]] = {
     "seed of episodes": (["evaluate", "RUN", "--seed", "-1"], 1, ["seed", "-1"]),
     "episodes": (["evaluate", "RUN", "--episodes", "0"], 1, ["episodes", "at least 1"]),
     "final episodes": (["train", "PLAIN", "--evaluate", "-1"], 1, ["evaluate", "-1"]),
-    "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "left, balance"]),
+    "skill": (["evaluate", "RUN", "--skill", "lift"], 1, ["'lift'", "is 'left' meant?"]),
     "flat skill": (["evaluate", "FLAT", "--skill", "left"], 1, ["plain agent"]),
     "target": (["evaluate", "nothing"], 1, ["nothing is neither a run nor a weights file"]),
     "target is a recipe": (["evaluate", "lunar-lander"], 1, ["--pretrained"]),

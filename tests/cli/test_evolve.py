@@ -72,7 +72,7 @@ def test_settings_become_a_plan_for_each_stage():
     ("setting", "said"),
     [
         ("population", "write name=value"),
-        ("populatio=3", "no setting 'populatio'; did you mean population"),
+        ("populatio=3", "no setting 'populatio': is 'population' meant?"),
         ("left.generations=x", "left.generations=x: expected a whole number"),
         ("selection=best", "expected one of tournament, truncation"),
         ("ranges.gamma=0.9", "write low,high"),

@@ -375,7 +375,7 @@ def test_a_network_that_leaves_out_the_goal_is_refused():
 
 def test_a_network_that_sees_what_is_not_there_is_named_with_its_skill():
     wrong = sw.PPO(network=sw.Network((8,), sees=("observatoin", "goal")))
-    words = "skill 'go_to': Network.sees names 'observatoin', .* its parts are observation"
+    words = "skill 'go_to': Network.sees names 'observatoin', .* is 'observation' meant"
     with pytest.raises(DeclarationError, match=words):
         declared(algorithm=wrong).check_spaces()
 

@@ -92,7 +92,10 @@ def test_a_wrong_declaration_names_the_skill_and_the_field(case):
 
 
 NOT_CHECKED = {
-    "a reflex that is only a function": (lambda: declare(reflexes=[zeros]), "not a Reflex"),
+    "a reflex that is only a function": (
+        lambda: declare(reflexes=[zeros]),
+        "must be an instance of Reflex",
+    ),
     "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
     "a policy's class": (lambda: declare(named("x", policy=ScriptedPolicy)), "'x'.*policy"),
 }
@@ -274,12 +277,12 @@ def test_settings_apply_in_order_and_the_skills_class_is_left_alone():
 KNOWN = "PPO, SelfImitationPPO, DQN, TD3, SAC"
 WRONG_SETTINGS = {
     "call_steps": "name=value",
-    "call_step=4": "call_step'.*did you mean call_steps",
-    "selecter.gamma=1": "selecter.gamma.*did you mean.*selector.gamma",
-    "selector.gama=0.9": "selector.gama.*did you mean.*selector.gamma",
-    "skills.center.learning_rat=1": "learning_rat'.*did you mean.*skills.center.learning_rate",
-    "selector.network.hiden=3": "hiden.*did you mean.*selector.network.hidden",
-    "skills.centre.gamma=1": "'centre'.*center, lean",
+    "call_step=4": "call_step'.*is 'call_steps' meant",
+    "selecter.gamma=1": "selecter.gamma.*is 'selector.gamma",
+    "selector.gama=0.9": "selector.gama.*is 'selector.gamma",
+    "skills.center.learning_rat=1": "learning_rat'.*is 'skills.center.learning_rate",
+    "selector.network.hiden=3": "hiden.*is 'selector.network.hidden",
+    "skills.centre.gamma=1": "'centre'.*is 'center' meant",
     "skills.center=4": f"skills.center=4: no algorithm '4'; there are: {KNOWN}",
     "selector=4": f"selector=4: no algorithm '4'; there are: {KNOWN}, .*Rainbow, DDPG",
     "skills.nobody=DQN": "no skill 'nobody'",
@@ -590,7 +593,7 @@ def test_a_rollout_that_does_not_fit_into_memory_is_refused(tmp_path):
         ({"seed": -1}, "seed is -1"),
         ({"run_dir": 5}, "run_dir is 5; it must be a path"),
         ({"track": 5}, "track is 5"),
-        ({"evolve": 3}, r"evolve is 3; it must be an Evolution\(\)"),
+        ({"evolve": 3}, r"evolve is 3; it must be Evolution\(\)"),
     ],
 )
 def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):

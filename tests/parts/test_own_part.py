@@ -244,7 +244,7 @@ def test_what_a_skill_cannot_declare(attributes, says):
         (None, "arm", 0.0, ROBOT, "give a dict by its keys"),
         (None, "arm", None, ROBOT, "rest is None; it must be 'zero', 'hold'"),
         (None, 0, "keep", BOX, "rest is 'keep'; it must be"),
-        ("legs", None, "zero", BOX, "skill 'x': sees reads 'legs'.*its parts are"),
+        ("legs", None, "zero", BOX, "skill 'x': sees reads 'legs'.*there are: arm"),
         ((9,), None, "zero", BOX, "sees.places is .* but there are 6 numbers"),
         (("arm", "camera"), None, "zero", BOX, "sees joins an image with other parts.*its own"),
     ],

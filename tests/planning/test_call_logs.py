@@ -313,7 +313,7 @@ def test_a_log_of_other_skills_says_so(log: CallLog) -> None:
     elsewhere = replace(log, observation_space=gym.spaces.Box(0, 1, (2,)))
     with pytest.raises(RunError, match="record a log in this environment"):
         elsewhere.check_skills(skill_set(call_steps=5))
-    with pytest.raises(DeclarationError, match=r"no skill 'get_kay'.*Close matches: get_key"):
+    with pytest.raises(DeclarationError, match=r"no skill 'get_kay'.*is 'get_key' meant"):
         log.of("get_kay")
 
 

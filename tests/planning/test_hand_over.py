@@ -165,9 +165,9 @@ def test_where_calls_end(log: CallLog) -> None:
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
-        (lambda log: log.hand_over({"sty": len}), DeclarationError, "Close matches: stay"),
+        (lambda log: log.hand_over({"sty": len}), DeclarationError, "is 'stay' meant"),
         (lambda log: log.hand_over({"go": 3}), DeclarationError, "done of 'go': 3 is no pred"),
-        (lambda log: log.hand_over(3), DeclarationError, "give events by skill"),
+        (lambda log: log.hand_over(3), DeclarationError, "done is 3; it must be a dict"),
         (lambda log: log.hand_over().of("go", "x"), DeclarationError, "no skill 'x'"),
         (lambda log: log.chain(), DeclarationError, "needs the names of skills"),
         (lambda log: log.chain("go", "gone"), DeclarationError, "no skill 'gone'"),

@@ -192,7 +192,7 @@ def wrong(make: Any, message: str) -> Any:
     [
         wrong(lambda: RewardMachine([A]), "transitions are"),
         wrong(lambda: RewardMachine({"a": A}), "transition is from 'a'; write"),
-        wrong(lambda: RewardMachine({("a", 3): A}), "state is named 3"),
+        wrong(lambda: RewardMachine({("a", 3): A}), "state is 3; it must be a text"),
         wrong(lambda: RewardMachine({("a", "b"): "x"}), "'x' is no predicate"),
         wrong(lambda: RewardMachine({("a", "b"): (A, "x")}), "reward is 'x'"),
         *(
@@ -223,7 +223,7 @@ def wrong(make: Any, message: str) -> Any:
         wrong(lambda: held(A, 3) & A, r"combine predicates inside it: held\(a & b"),
         wrong(lambda: Predicate(A) | held(A, 3), "is an event over several steps"),
         wrong(lambda: Predicate(3), "a predicate is 3"),
-        wrong(lambda: Predicate(A, reads="steps"), "must be 'obs' or 'step'"),
+        wrong(lambda: Predicate(A, reads="steps"), "must be one of obs, step"),
         wrong(
             lambda: RewardMachine({("a", "b"): A}).automaton({"b": "x"}),
             r"event 'a' has no skill; give one",

@@ -211,7 +211,7 @@ def test_texts_and_what_they_mean() -> None:
 @pytest.mark.parametrize(
     ("text", "reason", "word"),
     [
-        ("a then bb then c", "'bb' is no known predicate; known are: a, b, c, d", "bb"),
+        ("a then bb then c", "'bb' is no known predicate: is 'b' meant", "bb"),
         ("a then", "the name of a predicate is expected", ""),
         ("", "the name of a predicate is expected", ""),
         ("a b", "'then', 'or', 'and', or a comma is expected", "b"),
@@ -265,7 +265,7 @@ def test_equal_names_are_numbered_in_linear_time() -> None:
 
 def test_the_nearest_name_is_given_and_long_texts_are_cut() -> None:
     known = {"hover": P[0], "left": P[1]}
-    with pytest.raises(DeclarationError, match="Close matches: hover") as caught:
+    with pytest.raises(DeclarationError, match="is 'hover' meant") as caught:
         Mission.from_text(" then ".join(["hover", "left"] * 40 + ["hovr"]), known)
     _, line, pointer = str(caught.value).split("\n")
     assert line[pointer.index("^") :] == "hovr"
@@ -288,8 +288,8 @@ def wrong(make: Any, message: str) -> Any:
         wrong(lambda: Mission(P[0], avoid=held(P[1], 3)), "event over several steps"),
         wrong(lambda: either(P[0]), "has 1 part; give 2 to 6"),
         wrong(lambda: Mission(Mission(P[0], P[1], repeat=None)), "say it of the whole mission"),
-        wrong(lambda: Mission.from_text(3, {}), "a mission is 3; give a text"),
-        wrong(lambda: Mission.from_text("a", [P[0]]), "give a dict by name"),
+        wrong(lambda: Mission.from_text(3, {}), "a mission is 3; it must be a text"),
+        wrong(lambda: Mission.from_text("a", [P[0]]), "it must be a dict"),
         wrong(lambda: Mission.from_text("a", {"a b": P[0]}), "a name is one word"),
         wrong(lambda: Mission.from_text("a", {"then": P[0]}), "a word of missions"),
         wrong(

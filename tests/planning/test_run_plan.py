@@ -115,7 +115,7 @@ def test_what_cannot_be_planned_is_refused(run: Run, log: CallLog, tmp_path: Pat
             written()
     with pytest.raises(DeclarationError, match="plan\\(\\) takes no skills"):
         run.plan(at_four, log, skills=run.policy)
-    with pytest.raises(DeclarationError, match="'four' is no known predicate; known are: open"):
+    with pytest.raises(DeclarationError, match="'four' is no known predicate; there are: open"):
         run.plan("four", log)
     nothing = {("on", "there"): at_four}
     with pytest.raises(DeclarationError, match="pays nothing"):
@@ -225,7 +225,7 @@ def test_what_cannot_choose_is_refused(run: Run, choose: Any, says: str) -> None
 def test_functions_choose(run: Run) -> None:
     log = run.log_calls(50, choose=lambda obs: ["wait"] * len(obs))
     assert set(log.choice) == {3}
-    with pytest.raises(DeclarationError, match=r"info=\('door',\)"):
+    with pytest.raises(DeclarationError, match=r"info is 'door'; it must be a list"):
         run.log_calls(50, info="door")
     with pytest.raises(DeclarationError, match=r"join\(\[log"):
         join(log)

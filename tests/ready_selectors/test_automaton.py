@@ -123,7 +123,7 @@ WRONG = {
     "an empty set": (lambda: Automaton({"a": set()}, {}), "state 'a' has no skill"),
     "a number as a skill": (lambda: Automaton({"a": 3}, {}), "state 'a' has 3; give a skill's"),
     "a number among skills": (lambda: Automaton({"a": [3]}, {}), "state 'a' has 3 among its"),
-    "a state's name": (lambda: Automaton({3: "wait"}, {}), "state is named 3"),
+    "a state's name": (lambda: Automaton({3: "wait"}, {}), "state is 3; it must be a text"),
     "the start": (lambda: Automaton(STATES, {}, "begin"), "start names the state 'begin'.*search"),
     "to an unknown state": (
         lambda: Automaton(STATES, {("search", "fre"): got_key}),

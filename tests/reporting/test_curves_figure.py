@@ -111,7 +111,7 @@ def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("how", "says"),
     [
-        ({"metric": "retrun"}, "has no metric 'retrun' of the whole policy. Close matches: return"),
+        ({"metric": "retrun"}, "has no metric 'retrun' of the whole policy: is 'return' meant"),
         ({"agent": "lefft"}, "has no metrics of 'lefft'; there are metrics of: left, balance"),
         ({"band": "std"}, "band is 'std'; it must be one of iqr, range, none"),
         ({"labels": ["a", "b"]}, "2 labels for 1 lines"),

@@ -287,7 +287,7 @@ def zeros(x: Array) -> Array:
             r"goal is \(1.0,\), out of the range.*Goal.high",
         ),
         ({"sees": sw.Goal(), "goal": "north"}, "goal is 'north'; it must be finite numbers"),
-        ({"every": 0}, "every is 0; it must be a whole number, at least 1"),
+        ({"every": 0}, "every is 0; it must be at least 1 and at most"),
         ({"every": 2.5}, "every is 2.5"),
         ({"chunk": True}, "chunk is True"),
         ({"state": (1, 64)}, "state is .*None as the axis of the environments"),
@@ -328,7 +328,7 @@ def test_settings_that_are_wrong_are_named(make: Any, message: str) -> None:
             {"sees": ("gyro", "gyroo")},
             r"sees\[1\] reads 'gyroo', which the observation does not ha",
         ),
-        ({"sees": "gyroo"}, "its parts are"),
+        ({"sees": "gyroo"}, "is 'gyro' meant"),
         (
             {"sees": sw.Part("gyro", slice(0, 4))},
             r"sees.places is slice\(0, 4.*there are 3 numbers",
@@ -457,7 +457,7 @@ def test_functions_of_one_name_are_told_apart() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        ("sees", [], "sees is .*an object of inputs"),
+        ("sees", [], "sees is .*it must be a dict"),
         ("sees", {"": [{"source": "camera"}]}, r"sees\[''\]\[0\] is .*its field source must be"),
         ("sees", {"": [{"source": "goal", "low": "x"}]}, r"sees\[''\]\[0\]: Goal.low is 'x'"),
         ("acts", {"to": [0, -1]}, r"acts: Acts.to is \[0, -1\]"),

@@ -5,10 +5,11 @@ import pytest
 from gymnasium.spaces import Box, Discrete
 
 from skillweave.errors import SkillweaveError
-from skillweave.messages import short, whole_number
+from skillweave.messages import short
 from skillweave.policies.core import Policy
 from skillweave.policies.parts import Reflexes
 from skillweave.policies.spaces import space_of
+from skillweave.schema import Count, fitted
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.outputs import checked
 from skillweave.types import Step
@@ -321,10 +322,10 @@ def test_long_values_are_shortened_and_what_cannot_be_shown_is_named():
 @pytest.mark.parametrize("bad", [None, 1.5, "x", True, np.bool_(1), [1], np.nan])
 def test_what_is_no_whole_number_is_told(bad):
     with pytest.raises(SkillweaveError, match=r"seed is .*; it must be a whole number"):
-        whole_number(bad, "seed", 0)
+        fitted(Count, bad, "seed")
 
 
 def test_whole_numbers_become_ints():
-    assert type(whole_number(np.int64(3), "seed", 0)) is int
+    assert type(fitted(Count, np.int64(3), "seed")) is int
     with pytest.raises(SkillweaveError, match="seed is -1; it must be at least 0"):
-        whole_number(-1, "seed", 0)
+        fitted(Count, -1, "seed")

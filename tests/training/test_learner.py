@@ -373,7 +373,7 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back():
 
 
 def test_a_store_that_does_not_fit_into_memory_is_refused_before_training():
-    config = replace(CONFIG, buffer_size=10**13)
+    config = replace(CONFIG, buffer_size=10**12)
     algorithm = make_algorithm(config, Identity.observation_space, Identity.action_space)
     with pytest.raises(SkillweaveError, match="lower buffer_size"):
         store_of(algorithm, 4)

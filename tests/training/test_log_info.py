@@ -192,15 +192,14 @@ def test_a_key_that_never_occurs_is_said_once_with_those_that_do(tmp_path: Path)
     assert len(found) == 2
     keys = "far, flag, late, nested, none, one, seldom, t, two, word"
     assert found[0].startswith("odd: none of ")
-    assert f"in info['lte'] (log_info); its keys there were {keys}. Close" in found[0]
-    assert "Close matches: late" in found[0]
-    assert "info['nan']" in found[1]
+    assert found[0].endswith("in info['lte'] (log_info): is 'late' meant?")
+    assert found[1].endswith(f"in info['nan'] (log_info); there are: {keys}")
 
 
 def test_an_info_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
     agent = Agent(EnvSpec("CartPole-v1", engine="sync", workers=1), ON, 320)
     (found,) = said(agent, tmp_path / "run", log_info=["fuel"])
-    assert found.endswith("in info['fuel'] (log_info); it was empty there.")
+    assert found.endswith("in info['fuel'] (log_info); it was empty there")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.skills import Skill
 
 SMALL = {"num_envs": 4, "batch_size": 8, "learning_starts": 40, "network": Network((4,))}
-HUGE = {"buffer_size": 10**13, **SMALL}
+HUGE = {"buffer_size": 10**12, **SMALL}
 
 
 class Left(Skill):

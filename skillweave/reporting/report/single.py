@@ -11,7 +11,6 @@ from typing import Any
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
-from skillweave.messages import whole_number
 from skillweave.paths import AGENT, join
 from skillweave.planning.hand_over import wilson
 from skillweave.planning.run_log import load_calls
@@ -52,6 +51,7 @@ from skillweave.reporting.report.page import Section, library, write_page
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import must_be_own
+from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.seeding import Seeds, global_generators
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -203,9 +203,9 @@ def write_report(
         MissingExtra: the extra 'report' is not installed.
     """
     began = time.perf_counter()
-    episodes = whole_number(episodes, "episodes", 1)
-    seed = whole_number(seed, "seed", 0)
-    filmed = whole_number(filmed, "films", 0)
+    episodes = fitted(AtLeastOne, episodes, "episodes")
+    seed = fitted(Count, seed, "seed")
+    filmed = fitted(Count, filmed, "films")
     library()  # a missing extra is reported before anything is played
     must_be_own(path.parent)
     all_curves = read_curves(run)

@@ -8,6 +8,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from skillweave.compat.agilerl.agents import DDPG, DQN, PPO, TD3, RainbowDQN
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
+from skillweave.messages import suggest
 
 _KINDS: dict[str, Any] = {kind.algo: kind for kind in (PPO, DQN, RainbowDQN, DDPG, TD3)}
 
@@ -47,7 +48,7 @@ def initialPopulation(
     """
     given = locals() | {"critic_networks": critic_network}
     if algo not in _KINDS:
-        raise DeclarationError(f"no algorithm {algo!r} here; there are: {', '.join(_KINDS)}")
+        raise DeclarationError(f"no algorithm {algo!r} here{suggest(algo, _KINDS)}")
     known = inspect.signature(_KINDS[algo]).parameters
     settings = {k: INIT_HP[k.upper()] for k in known if k.upper() in INIT_HP}
     settings |= {k: v for k, v in given.items() if k in known}
