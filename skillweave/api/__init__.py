@@ -72,6 +72,7 @@ from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.runs.manifest import as_json
 from skillweave.runs.trackers import track_film
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
@@ -131,8 +132,8 @@ class Agent(PlainAgent):
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
         """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
         (stage,) = manifest["stages"]
-        config = config_from_json(stage["algorithm"])
-        agent = cls(spec_of(manifest), config, int(stage["budget"]))
+        config = config_from_json(stage.algorithm)
+        agent = cls(spec_of(manifest), config, stage.budget)
         agent.recorded = True
         return agent
 
@@ -776,7 +777,8 @@ class Run(TrainedPolicy):
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
         known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        return run.manifest | known | hand_over_json(hand_over_of(run))
+        content: dict[str, Any] = as_json(run.manifest)
+        return content | known | hand_over_json(hand_over_of(run))
 
     @Takes(RepairOptions)
     def repair(self, options: RepairOptions) -> Run:

@@ -110,7 +110,7 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
     here, there = settings(content), settings(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
-    evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
+    evolve = tuple(f"{s.name}." for s in run.manifest["stages"] if s.evolution)
     # A population's settings follow a plan. A file's place is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
     # Greediness that this declaration leaves open cannot differ.

@@ -141,16 +141,16 @@ def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
     """Train, or finish training, the repairs of a run; return the policies that it ends with."""
     run, done = course.run, course.done
     for entry in run.manifest["stages"]:
-        if "repair" not in entry:
+        if (repair := entry.repair) is None:
             continue
-        if "kept" not in entry and entry["repair"]["done"] and done is None:
+        if entry.kept is None and repair.done and done is None:
             raise RunError(
                 f"{run.path}: the repair is judged by done= of "
-                f"{', '.join(entry['repair']['done'])}, which is code: "
-                f"continue it by {repair_words(entry['repair'], run)}"
+                f"{', '.join(repair.done)}, which is code: "
+                f"continue it by {repair_words(repair, run)}"
             )
-        after = course.train([repair_stage(roles, entry, done)], policies)
-        if judge_repair(roles, course, entry, assembled(roles, after)):
+        after = course.train([repair_stage(roles, entry, repair, done)], policies)
+        if judge_repair(roles, course, entry, repair, assembled(roles, after)):
             policies = after
     return policies
 
@@ -180,8 +180,8 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
     """Return the trained policies of a finished run, by path."""
     policies: dict[str, Policy] = {}
     for entry in run.manifest["stages"]:
-        if entry.get("kept", {}).get("kept") != "before":
-            policies |= run.load_policies(entry["name"])
+        if not entry.undone:
+            policies |= run.load_policies(entry.name)
     return policies
 
 

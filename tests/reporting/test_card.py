@@ -10,15 +10,15 @@ import pytest
 
 from skillweave.reporting.card import text, write_card
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import StageEntry
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 from skillweave.training.skill_report import SkillReport
 
-STAGE = {
-    "name": "land", "kind": "skill", "learns": ["land"], "decides": None, "budget": 1000,
-    "algorithm": {"algorithm": "PPO"}, "status": "done", "steps": 1024, "seconds": 2.0,
-    "steps_per_second": 512.0, "final": {"return": 12.5},
-}  # fmt: skip
+STAGE = StageEntry(
+    "land", "skill", ["land"], None, 1000, {"algorithm": "PPO"}, None, "done",
+    steps=1024, seconds=2.0, steps_per_second=512.0, final={"return": 12.5},
+)  # fmt: skip
 
 
 @pytest.fixture
