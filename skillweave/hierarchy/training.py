@@ -23,6 +23,7 @@ from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import SkillEntry
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.skills.goals import goals_of
@@ -214,28 +215,30 @@ def _entry_of(run: RunDirectory, path: str) -> dict[str, Any]:
     """Return a run's entry of the level at ``path``."""
     if not path:
         return run.manifest
-    entries: list[dict[str, Any]] = run.manifest["skills"]
-    return next((s["hierarchy"] for s in entries if s["name"] == path), {})
+    entries: list[SkillEntry] = run.manifest["skills"]
+    return next((dict(s.hierarchy or {}) for s in entries if s.name == path), {})
 
 
-def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
+def _skill_entry(roles: Roles, path: str) -> SkillEntry:
     """Return a run's entry of a skill."""
     skill, inner = roles.skills[path], roles.levels.get(path)
     policy = ready_policy(skill) if inner is None else None
-    entry: dict[str, Any] = {"name": path, "max_steps": skill.max_steps}
-    entry["ready"] = policy is not None
-    if skill.call_steps is not None:
-        entry["call_steps"] = skill.call_steps
-    if skill.goal_space is not None:
-        goals_of(skill)  # a space that is not supported is named with its skill
-        entry["goal_space"] = space_to_json(skill.goal_space)
-    entry |= part_to_json(skill, roles[path].rest, f"skill {path!r}")
-    if isinstance(skill.policy, Residual) and (part := roles[path].part) is not None:
-        assert part.base is not None
-        entry["policy"] = source_of(part.base)
-    if inner is not None:
-        entry["hierarchy"] = _level_entry(roles, inner)
-    return entry if policy is None else entry | {"policy": source_of(policy)}
+    goals_of(skill)  # a space that is not supported is named with its skill
+    recorded, part = policy, roles[path].part
+    if policy is None and isinstance(skill.policy, Residual) and part is not None:
+        recorded = part.base
+    source: Any = None if recorded is None else source_of(recorded)
+    level: Any = None if inner is None else _level_entry(roles, inner)
+    return SkillEntry(
+        path,
+        skill.max_steps,
+        ready=policy is not None,
+        call_steps=skill.call_steps,
+        goal_space=None if skill.goal_space is None else space_to_json(skill.goal_space),
+        policy=source,
+        hierarchy=level,
+        **part_to_json(skill, roles[path].rest, f"skill {path!r}"),
+    )
 
 
 def _level_entry(roles: Roles, level: Level) -> dict[str, Any]:

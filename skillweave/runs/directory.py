@@ -576,7 +576,7 @@ def _check_replaceable(path: Path, run: RunDirectory | None) -> None:
 
 def _copies(run: RunDirectory) -> tuple[str, ...]:
     """Return patterns of the files of ready policies in a run."""
-    return tuple(f"{s['name'].replace('/', '.')}.*" for s in run.manifest.get("skills", ()))
+    return tuple(f"{file_name(s.name)}.*" for s in run.manifest.get("skills", ()))
 
 
 def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:

@@ -102,7 +102,7 @@ def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
     content = copy.deepcopy(dict(manifest))
     if content.get("track"):
         content["track"] = []
-    policies = [skill.get("policy", {}) for skill in content.get("skills", ())]
+    policies = [skill.policy or {} for skill in content.get("skills", ())]
     for holder, key in ((content, "recipe"), *((policy, "file") for policy in policies)):
         if holder.get(key):
             holder[key] = PureWindowsPath(holder[key]).name  # it splits at both kinds of slashes

@@ -83,8 +83,8 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
 def recorded_part(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """Return what a skill sees, what it acts on and its correction; None: of no skill."""
     for skill in manifest.get("skills", ()):
-        if skill["name"] == name:
-            return {key: skill.get(key) for key in ("sees", "acts", "residual")}
+        if skill.name == name:
+            return {key: getattr(skill, key) for key in ("sees", "acts", "residual")}
     return None
 
 
@@ -93,11 +93,11 @@ def options_of(manifest: Mapping[str, Any], name: str) -> Chooses:
     if not decides(name):
         return (), ()
     level = level_of(name)
-    paths = [skill["name"] for skill in manifest["skills"]]
+    paths = [skill.name for skill in manifest["skills"]]
     skills = tuple(name_of(path) for path in paths if level_of(path) == level)
     hierarchy: Mapping[str, Any] = manifest
     if level:
-        hierarchy = manifest["skills"][paths.index(level)]["hierarchy"]
+        hierarchy = manifest["skills"][paths.index(level)].hierarchy
     lengths = hierarchy.get("call_lengths", ()) if name_of(name) == SELECTOR else ()
     return skills, tuple(lengths)
 

@@ -62,24 +62,25 @@ class NestedEntry(TypedDict):
     call_cost: NonNegative
 
 
-class SkillEntry(TypedDict):
-    """The entry of a skill of the run, or of a hierarchy in it."""
+@dataclass(frozen=True)
+class SkillEntry:
+    """The entry of a skill of the run, or of a hierarchy in it; what is None is absent there."""
 
     name: NodePath
     max_steps: AtLeastOne | None
-    call_steps: NotRequired[AtLeastOne]
-    ready: NotRequired[bool]
-    policy: NotRequired[Source]
-    goal_space: NotRequired[dict[str, Any]]
+    ready: bool = False
+    call_steps: AtLeastOne | None = None
+    goal_space: dict[str, Any] | None = None
     """The space of its goals, if it has some."""
-    sees: NotRequired[Any]
+    sees: Any = None
     """The part of observations that it sees, and, below, of actions that it writes."""
-    acts: NotRequired[Any]
-    rest: NotRequired[Any]
+    acts: Any = None
+    rest: Any = None
     """The other numbers of the action."""
-    residual: NotRequired[Any]
+    residual: Any = None
     """The scale of a correction of ``policy``, which is ready, where the skill learns one."""
-    hierarchy: NotRequired[NestedEntry]
+    policy: Source | None = None
+    hierarchy: NestedEntry | None = None
     """Its parts, if the skill is a hierarchy."""
 
 
@@ -450,11 +451,9 @@ def _manifest_in(data: Mapping[str, Any], file: str) -> dict[str, Any]:
     manifest: dict[str, Any] = fit(Manifest, data, file)
     if manifest["kind"] == "hierarchy":
         manifest = fit(HierarchyManifest, data, file)
-    names_of = {
-        "skills": [skill["name"] for skill in manifest.get("skills", ())],
-        "stages": [stage.name for stage in manifest["stages"]],
-    }
-    for kind, names in names_of.items():
+    named = ("skills", "stages") if manifest["kind"] == "hierarchy" else ("stages",)
+    for kind in named:
+        names = [entry.name for entry in manifest[kind]]
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise RunError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")

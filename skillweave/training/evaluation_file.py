@@ -106,7 +106,7 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     if not path.exists():
         return None
     content: EvaluationFile = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
-    names = {entry["name"] for entry in run.manifest.get("skills", [])}
+    names = {entry.name for entry in run.manifest.get("skills", [])}
     ours = content.get("run") == run.manifest.get("id")
     top_level = {names_in(name)[0] for name in content["evaluation"].skills}
     if not ours or not top_level <= names:  # a ready hierarchy's own skills are not the run's

@@ -30,6 +30,7 @@ from skillweave.runs.manifest import (
     Generation,
     MemberEntry,
     Origin,
+    SkillEntry,
     StageEntry,
     versions,
 )
@@ -45,7 +46,7 @@ def manifest() -> dict[str, Any]:
         "env_kwargs": {},
         "seed": 7,
         "checkpoint_every": 100,
-        "skills": [{"name": "landing", "max_steps": None, "ready": False}],
+        "skills": [SkillEntry("landing", None)],
         "call_steps": 10,
         "learn": "apart",
         "interrupt": None,

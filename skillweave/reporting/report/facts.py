@@ -99,7 +99,7 @@ def facts(run: RunDirectory) -> list[tuple[str, str]]:
     rows.append(("Recipe", manifest.get("recipe") or "declared in Python"))
     rows += [("Seed", str(manifest["seed"])), ("Made", manifest["created"].replace("T", " "))]
     if manifest["kind"] == "hierarchy":
-        rows.append(("Skills", ", ".join(s["name"] for s in manifest["skills"])))
+        rows.append(("Skills", ", ".join(s.name for s in manifest["skills"])))
         rows.append(("A call lasts", _call_length(manifest)))
         selector = manifest.get("selector")
         rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
@@ -196,8 +196,8 @@ def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
     )
     values |= {k: manifest[k] for k in names if k in manifest}
     for skill in manifest.get("skills", ()):
-        fields = {k: v for k, v in skill.items() if k != "name"}
-        values |= flat(fields, f"skills.{skill['name']}.")
+        fields = {k: v for k, v in as_json(skill).items() if k != "name"}
+        values |= flat(fields, f"skills.{skill.name}.")
     for entry in manifest["stages"]:
         left_out = LEFT_OUT | MADE | {"name", "starts"}
         fields = {k: v for k, v in as_json(entry).items() if k not in left_out}

@@ -258,7 +258,7 @@ def _sentence(error: SkillweaveError) -> str:
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
-    names = [skill["name"] for skill in run.manifest.get("skills", ())]
+    names = [skill.name for skill in run.manifest.get("skills", ())]
     colors = {name: color_of(i) for i, name in enumerate(names)}
     colors |= {} if played is None else played.colors
     for entry in run.manifest["stages"]:
