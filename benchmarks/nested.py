@@ -67,16 +67,16 @@ def _half_done(path: Path) -> bool:
         return False
     run = RunDirectory.open(path)
     last = run.manifest["stages"][-1]
-    at = [x["steps"] for x in run.metrics() if x["stage"] == last["name"]]
-    return bool(at) and at[-1] > last["budget"] / 2
+    at = [x["steps"] for x in run.metrics() if x["stage"] == last.name]
+    return bool(at) and at[-1] > last.budget / 2
 
 
 def weights(run: RunDirectory) -> dict[str, dict[str, bytes]]:
     """Return all that every stage has learnt."""
     return {
-        f"{stage['name']}.{name}": {k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()}
+        f"{stage.name}.{name}": {k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()}
         for stage in run.manifest["stages"]
-        for name, policy in run.load_policies(stage["name"]).items()
+        for name, policy in run.load_policies(stage.name).items()
     }
 
 

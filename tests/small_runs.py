@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ import pytest
 from skillweave import DQN, PPO, RNN, Hierarchy, Network, Run, Skill
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import StageEntry
 from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.stage import assign_workers
 
@@ -31,6 +32,16 @@ on = PPO(num_envs=4, n_steps=8, batch_size=16, network=Network((8,)))
 env = EnvSpec('CartPole-v1', engine='sync', workers=1)
 hierarchy = Hierarchy(env, [Left()], algorithm=on, selector=on, steps=STEPS)
 """
+
+
+def stage_entry(
+    name: str,
+    status: Literal["waiting", "training", "done"] = "done",
+    budget: int = 4_000,
+    **more: Any,
+) -> StageEntry:
+    """The entry of a skill's stage."""
+    return StageEntry(name, "skill", [name], None, budget, {"num_envs": 4}, None, status, **more)
 
 
 class Left(Skill):

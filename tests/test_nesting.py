@@ -21,6 +21,7 @@ from small_runs import (
     lines,
     policies,
     reports_every,
+    stage_entry,
     stopped_run,
 )
 
@@ -39,6 +40,7 @@ from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
+from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.evaluation import episode_seeds, evaluate
@@ -236,13 +238,13 @@ def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, ki
 def test_all_learn_at_every_level_in_one_stream(whole, kind):
     _, path = whole(kind)
     entry = RunDirectory.open(path).manifest["stages"][-1]
-    assert entry["kind"] == "together"
-    told = {name for line in lines(path) if line["stage"] == entry["name"] for name in line}
-    deep = {k for k in entry["learns"] if "/" in k}
+    assert entry.kind == "together"
+    told = {name for line in lines(path) if line["stage"] == entry.name for name in line}
+    deep = {k for k in entry.learns if "/" in k}
     assert {k.rpartition("/")[2] for k in deep} >= {"selector", "balance", "right"}
     for name in deep:
         assert any(k.startswith(f"{name}.") for k in told), f"{name} has learnt nothing"
-    assert 450 <= entry["steps"] <= 450 + 32
+    assert 450 <= entry.steps <= 450 + 32
 
 
 def test_selectors_at_all_levels_stay_near_their_guides(whole):
@@ -294,7 +296,7 @@ def test_all_go_on_with_their_whole_states_by_path(tmp_path):
 def test_a_state_that_was_not_kept_is_not_gone_on_with(tmp_path):
     run = stopped_run(KINDS["then, inside and outside"](), tmp_path / "run", 20)
     like = SimpleNamespace()
-    run.stage("inner/together")["kept"]["kept"] = "before"
+    run.stage("inner/together").kept = Comparison("before")
     assert load_state(run, "inner/right", like) is None
 
 
@@ -326,9 +328,9 @@ def test_a_run_has_everyones_file_with_a_checksum(whole):
     names = {name.removesuffix(".safetensors") for name in policies(path)}
     own = {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
     assert names == own | {f"together.{name}" for name in own}
-    stages = {s["name"]: s for s in RunDirectory.open(path).manifest["stages"]}
+    stages = {s.name: s for s in RunDirectory.open(path).manifest["stages"]}
     assert set(stages) == {*(n.replace(".", "/") for n in own), "together"}
-    assert all("sha256" in s or all(s["policies"].values()) for s in stages.values())
+    assert all(s.sha256 or all(s.policies.values()) for s in stages.values())
 
 
 def test_a_policy_in_anothers_place_is_refused(tmp_path, whole):
@@ -504,10 +506,14 @@ def test_errors_of_skills_below_name_their_path(tmp_path):
 
 def stage(name, kept):
     """An entry of ``run.json``: done and judged, done, or still waiting."""
-    entry = {"name": name, "kind": "together", "status": "waiting" if kept == "waiting" else "done"}
     judged = kept in ("before", "greedy", "skills_sample")
-    told = {"compared": judged or kept == "unjudged", "greedy_judged": kept != "alone"}
-    return entry | told | ({"kept": {"kept": kept}} if judged else {})
+    return stage_entry(
+        name,
+        "waiting" if kept == "waiting" else "done",
+        compared=judged or kept == "unjudged",
+        greedy_judged=kept != "alone",
+        kept=Comparison(kept) if judged else None,
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_runs import stage_entry
 
 from skillweave import PPO, Agent, Evaluation, Hierarchy, Network, Run, Skill, tree
 from skillweave import notebooks as module
@@ -292,7 +293,7 @@ def test_progress_in_a_notebook_leaves_one_table(
 ) -> None:
     names = ["left", "right"]
     with Progress() as progress:
-        progress.plan([{"name": name, "budget": 100, "status": "new"} for name in names])
+        progress.plan([stage_entry(name, "waiting", budget=100) for name in names])
         for name in names:
             progress.stage(name, 100)
             progress.tick(name, 50, 0.5, {"return": 1.0})

@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_runs import assert_same
+from small_runs import assert_same, stage_entry
 
 import skillweave as sw
 from skillweave.algorithms import ppo
@@ -24,6 +24,7 @@ from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import HandOver, Mission, held, record_calls
 from skillweave.planning.record import RandomChoice
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Matrix, RepairEntry
 
 
 class Buttons(gym.Env[Any, Any]):
@@ -270,8 +271,9 @@ def test_the_event_of_a_repair_is_the_callers_or_success() -> None:
 def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     roles = roles_of(declare(Press(), Flip(), call_steps=5))
     policies = {name: RandomChoice(3) for name in roles.skills}
-    entry = {"name": "r", "budget": 100, "repair": {"skill": "press", "after": "flip"}}
-    collector = repair.repair_stage(roles, entry).learning_task(policies).collector(2, None)
+    entry = RepairEntry("press", "flip", 20, [], "", Matrix([], [], [], [], []))
+    stage = repair.repair_stage(roles, stage_entry("r"), entry)
+    collector = stage.learning_task(policies).collector(2, None)
     assert isinstance(collector, Collector)
     assert collector.call_limit == 5, "of 8 by itself"
 
@@ -400,7 +402,7 @@ def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
         repaired(run, tmp_path / "part", **SHORT)
     monkeypatch.setattr(repair, "verdict", judge)
     stages = RunDirectory.open(tmp_path / "part").manifest["stages"]
-    assert all(entry["status"] == "done" for entry in stages)
+    assert all(entry.done for entry in stages)
     with pytest.raises(RunError, match=r"run\.repair"):
         sw.load(tmp_path / "part", declare())
     assert_same(declare().resume(tmp_path / "part", quiet=True).path, whole.path)

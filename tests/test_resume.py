@@ -245,9 +245,9 @@ def test_a_run_killed_between_its_last_checkpoint_and_its_policy_loses_nothing(
     recipes.load(str(recipe)).resume(path, quiet=True)
     assert_same(path, whole)
     mine, theirs = (RunDirectory.open(p).stage("left") for p in (path, whole))
-    assert mine["steps"] == theirs["steps"]
-    assert mine["final"].keys() == theirs["final"].keys()
-    assert mine["final"]["policy_loss"] == theirs["final"]["policy_loss"]
+    assert mine.steps == theirs.steps
+    assert mine.final.keys() == theirs.final.keys()
+    assert mine.final["policy_loss"] == theirs.final["policy_loss"]
 
 
 def test_resuming_a_finished_run_changes_no_file(tmp_path: Path, reference: Reference) -> None:
@@ -418,7 +418,7 @@ def test_a_hierarchy_that_learns_from_replay_ends_as_if_it_had_not_been_stopped(
     recipe = str(tmp_path / "replay.py")
     recipes.load(recipe).train(tmp_path / "whole", seed=3, quiet=True)
     run = stopped_run(recipes.load(recipe), tmp_path / "run", 13)
-    assert [run.stage(n)["status"] for n in ("left", "balance", "selector")] == [
+    assert [run.stage(n).status for n in ("left", "balance", "selector")] == [
         "done", "done", "training",
     ]  # fmt: skip
     recipes.load(recipe).resume(run.path, quiet=True)

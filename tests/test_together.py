@@ -25,6 +25,7 @@ from small_runs import (
     new_run,
     policies,
     reports_every,
+    stage_entry,
 )
 
 from skillweave import (
@@ -44,7 +45,7 @@ from skillweave.api.applying import differences
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Checkpoint
+from skillweave.runs.manifest import Checkpoint, as_json
 from skillweave.training import joint
 from skillweave.training.episodes import Episodes
 from skillweave.training.skill_report import SkillReport
@@ -134,8 +135,8 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
     for name in ("selector", "left", "balance"):
         assert f"{name}.samples" in told
     (entry,) = RunDirectory.open(path).manifest["stages"]
-    assert entry["learns"] == ["selector", "left", "balance", "skill_critic"]
-    assert 450 <= entry["steps"] <= 450 + 32, "a stage ends within one rollout of its budget"
+    assert entry.learns == ["selector", "left", "balance", "skill_critic"]
+    assert 450 <= entry.steps <= 450 + 32, "a stage ends within one rollout of its budget"
 
 
 @pytest.mark.slow
@@ -200,7 +201,7 @@ def test_skills_that_grew_in_a_population_go_on_as_they_are(tmp_path):
 
 def test_the_better_of_before_and_after_is_kept(whole):
     _, path = whole("then")
-    told = RunDirectory.open(path).stage("together")["kept"]
+    told = as_json(RunDirectory.open(path).stage("together").kept)
     assert {"before", "greedy"} < set(told)
     assert told["kept"] in told
     names = {"selector", "left", "balance"}
@@ -235,7 +236,7 @@ def test_whether_skills_are_greedy_is_found_out_where_nobody_says_it(
     if not played:
         assert greedy == {asked is not False}
         return
-    kept = dict(RunDirectory.open(run.path).stage("together")["kept"])
+    kept = as_json(RunDirectory.open(run.path).stage("together").kept)
     best = kept.pop("kept")
     assert kept.pop("episodes") == 100
     assert set(kept) == played
@@ -278,7 +279,7 @@ def test_of_greedy_skills_and_ones_that_sample_the_better_are_kept(
     with closing(run):
         policy = training.train(hierarchy, run, (heard,))
     assert policy.skills.greedy is better
-    assert run.stage("together")["evaluation_steps"] == 30
+    assert run.stage("together").evaluation_steps == 30
     returns = (10.0, 5.0) if better else (5.0, 10.0)
     words = "greedy {:.4g}, with skills that sample {:.4g} (4 episodes each); kept: "
     compared = next(i for i, text in enumerate(heard.said) if "playing 4 episodes of each" in text)
@@ -308,7 +309,7 @@ def test_a_selector_samples_where_that_is_clearly_better(tmp_path, monkeypatch, 
     monkeypatch.setattr(select_best, "evaluate", played)
     run = declare().train(tmp_path / "run", quiet=True)
     entry = RunDirectory.open(run.path).stage("together")
-    assert entry["kept"]["kept"] == kept
+    assert entry.kept.kept == kept
     weights = run.save_weights(tmp_path / "weights")
     for found in (run, declare().load(run.path), declare().load_weights(weights)):
         policy = found.policy
@@ -361,7 +362,7 @@ def test_a_selector_that_was_better_with_exploration_is_named(
 def test_fewer_episodes_are_played_where_they_are_long(monkeypatch, steps, length, episodes):
     monkeypatch.setattr(select_best, "MOST", 100)
     monkeypatch.setattr(select_best, "SHORT_SHARE", 0.05)
-    entry = {"steps": steps, "final": {"length": length}, "algorithm": {"num_envs": 4}}
+    entry = stage_entry("together", steps=steps, final={"length": length})
     assert select_best._episodes(entry) == episodes
 
 
@@ -398,7 +399,7 @@ def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch
         declare().load(tmp_path / "run")
     declare().resume(tmp_path / "run", quiet=True)
     runs = [RunDirectory.open(path) for path in (tmp_path / "run", whole.path)]
-    assert runs[0].stage("together")["kept"] == runs[1].stage("together")["kept"]
+    assert runs[0].stage("together").kept == runs[1].stage("together").kept
 
 
 @pytest.mark.parametrize(("learn", "said"), [("apart", True), ("together", None)])
@@ -506,7 +507,7 @@ def test_success_is_judged_by_all_calls_of_a_stage_and_its_rate_by_the_last(
     log.done({}, {})
     run.close()
     entry = RunDirectory.open(run.path).stage("left")
-    assert entry.get("succeeded") is succeeded
+    assert entry.succeeded is succeeded
     assert success_rate(entry) == rate
 
 
@@ -517,7 +518,7 @@ def test_lines_that_name_no_stage_say_nothing_of_success_and_words_are_refused(t
     for other in (1.0, True, None):
         run.log({"success": other})
     log.done({}, {})
-    assert run.stage("left")["succeeded"] is False
+    assert run.stage("left").succeeded is False
     run.log({"stage": "left", "success": "often"})
     with pytest.raises(SkillweaveError, match=r"metrics\.jsonl: 'left' has .* 'often', .* resume"):
         log.done({}, {})
@@ -579,9 +580,9 @@ def test_a_stage_ends_early_at_its_target(tmp_path):
     path = tmp_path / "run"
     hierarchy.train(path, seed=0, quiet=True)
     (entry,) = RunDirectory.open(path).manifest["stages"]
-    assert entry["reached"]["value"] >= 5.0
-    assert 200 <= entry["steps"] < 500
-    assert entry["evaluation_steps"] > 10
+    assert entry.reached.value >= 5.0
+    assert 200 <= entry.steps < 500
+    assert entry.evaluation_steps > 10
 
 
 def test_what_cannot_evolve_together_learns_apart_and_says_so_once(tmp_path, capsys):

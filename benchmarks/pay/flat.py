@@ -47,7 +47,7 @@ class Flat(Agent):
             run = RunDirectory.open(path)
         else:
             content = self.manifest(seed)
-            content["stages"][0]["workers"] = 1  # runs go side by side
+            content["stages"][0].workers = 1  # runs go side by side
             learnt = {} if self.starts_from is None else learners_of_run(self.starts_from)
             if self.starts_from is not None:
                 record_initial_policies(content["stages"], learnt, str(self.starts_from))

@@ -157,8 +157,8 @@ def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int
     run = RunDirectory.open(path)
     before, total = {}, 0
     for stage in run.manifest["stages"]:
-        before[stage["name"]] = total
-        total += int(stage.get("steps", 0))
+        before[stage.name] = total
+        total += stage.steps or 0
     found = []
     for line in (path / "metrics.jsonl").read_text().splitlines():
         entry = json.loads(line)

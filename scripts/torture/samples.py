@@ -50,6 +50,7 @@ from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import as_json
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.types import Policy
@@ -115,7 +116,7 @@ def looked_at(run: Path, changed: str) -> None:
     if changed.endswith(".jsonl"):
         list(found.metrics())
         for stage in found.manifest["stages"]:
-            read_lineage(found, stage["name"])
+            read_lineage(found, stage.name)
         file = run.parent / changed
         if zlib.crc32(file.read_bytes() if file.is_file() else b"") % PLOTTED == 0:
             plot_run(found, run / "plots")
@@ -135,7 +136,7 @@ def from_data(folder: Path, changed: str) -> Play:
     """Load a run that says itself what it is."""
     run = folder / "run"
     looked_at(run, changed)
-    manifest = RunDirectory.open(run).manifest
+    manifest = as_json(RunDirectory.open(run).manifest)
     kind = Agent if manifest["kind"] == "agent" else Hierarchy
     return play(kind.from_manifest(manifest).load(run))
 

@@ -72,8 +72,9 @@ from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
+from skillweave.runs.manifest import SkillEntry, StageEntry, as_json
 from skillweave.runs.trackers import track_film
-from skillweave.schema import AtLeastOne, Count, fitted
+from skillweave.schema import AtLeastOne, Count, fit, fitted
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -131,9 +132,10 @@ class Agent(PlainAgent):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
         """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
-        (stage,) = manifest["stages"]
-        config = config_from_json(stage["algorithm"])
-        agent = cls(spec_of(manifest), config, int(stage["budget"]))
+        (recorded,) = manifest["stages"]
+        stage: StageEntry = fit(StageEntry, recorded, "")
+        config = config_from_json(stage.algorithm)
+        agent = cls(spec_of(manifest), config, stage.budget)
         agent.recorded = True
         return agent
 
@@ -255,25 +257,24 @@ class Hierarchy(Declaration):
         spec = spec_of(manifest)
         skills: dict[str, list[Skill]] = {}  # by the path of their level
         rests: dict[str, Any] = {}  # as well
-        for entry in reversed(manifest["skills"]):  # the skills of a hierarchy follow it
-            path = entry["name"]
-            attributes: dict[str, Any] = {
-                k: entry[k] for k in ("max_steps", "call_steps") if k in entry
-            }
-            attributes["name"] = name_of(path)
-            attributes |= part_from_json(entry)
-            rests[level_of(path)] = entry.get("rest", rests.get(level_of(path), ZERO))
-            if "hierarchy" in entry:
+        entries: list[SkillEntry] = fit(list[SkillEntry], manifest["skills"], "")
+        for entry in reversed(entries):  # the skills of a hierarchy follow it
+            name, level = name_of(entry.name), level_of(entry.name)
+            attributes: dict[str, Any] = {"name": name, "max_steps": entry.max_steps}
+            if entry.call_steps is not None:
+                attributes["call_steps"] = entry.call_steps
+            attributes |= part_from_json(as_json(entry))
+            rests[level] = rests.get(level, ZERO) if entry.rest is None else entry.rest
+            if entry.hierarchy is not None:
                 attributes["policy"] = cls._recorded(
-                    spec, entry["hierarchy"], skills.pop(path), rests[path]
+                    spec, entry.hierarchy, skills.pop(entry.name), rests[entry.name]
                 )
-            skill = type(attributes["name"], (RecordedSkill,), attributes)()
-            skills.setdefault(level_of(path), []).insert(0, skill)
+            skills.setdefault(level, []).insert(0, type(name, (RecordedSkill,), attributes)())
         return cls._recorded(spec, manifest, skills[""], rests[""])
 
     @classmethod
     def _recorded(
-        cls, spec: EnvSpec, entry: dict[str, Any], skills: list[Skill], rest: Any
+        cls, spec: EnvSpec, entry: Mapping[str, Any], skills: list[Skill], rest: Any
     ) -> Hierarchy:
         """Return a run's hierarchy, or one below it, from its entry and its skills."""
         hierarchy = cls(spec, skills, call_steps=calls_from_json(entry), rest=rest)
@@ -777,7 +778,8 @@ class Run(TrainedPolicy):
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
         known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        return run.manifest | known | hand_over_json(hand_over_of(run))
+        content: dict[str, Any] = as_json(run.manifest)
+        return content | known | hand_over_json(hand_over_of(run))
 
     @Takes(RepairOptions)
     def repair(self, options: RepairOptions) -> Run:

@@ -24,6 +24,7 @@ from skillweave.paths import SELECTOR
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import SkillEntry, as_json
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json
@@ -68,10 +69,10 @@ def apply_manifest(declared: D, run: RunDirectory) -> D:
 
 def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
     """Return the roles of a declaration with the settings that a run records."""
-    entries = {entry["name"]: entry for entry in run.manifest["skills"]}
+    entries: dict[str, SkillEntry] = {entry.name: entry for entry in run.manifest["skills"]}
 
     def recorded(level: Level) -> Level:
-        entry = entries[level.path]["hierarchy"] if level.path else run.manifest
+        entry: Any = entries[level.path].hierarchy if level.path else run.manifest
         where = f"{run.path}: {level.path}" if level.path else str(run.path)
         check_guided(level.guide is not None, "guide" in entry, where)
         guide = level.guide
@@ -91,12 +92,12 @@ def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
     return roles.changed(recorded)
 
 
-def _limited(skill: Skill, entry: Mapping[str, Any]) -> Skill:
+def _limited(skill: Skill, entry: SkillEntry) -> Skill:
     """Return a copy of a skill with the limits of its calls that a run records."""
     limited = copy.copy(skill)
     for field in ("max_steps", "call_steps"):
-        if getattr(skill, field) != entry.get(field):
-            setattr(limited, field, entry.get(field))
+        if getattr(skill, field) != getattr(entry, field):
+            setattr(limited, field, getattr(entry, field))
     return limited
 
 
@@ -110,7 +111,7 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
     here, there = settings(content), settings(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
-    evolve = tuple(f"{s['name']}." for s in run.manifest["stages"] if s.get("evolution"))
+    evolve = tuple(f"{s.name}." for s in run.manifest["stages"] if s.evolution)
     # A population's settings follow a plan. A file's place is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
     # Greediness that this declaration leaves open cannot differ.
@@ -143,7 +144,7 @@ def check_run(declared: Declared, run: RunDirectory) -> None:
 def _check_roles(roles: Roles, run: RunDirectory) -> None:
     """Raise a RunError where a run was trained with other skills, selectors or reflexes."""
     mine = list(roles.skills)
-    theirs = [entry["name"] for entry in run.manifest["skills"]]
+    theirs = [entry.name for entry in run.manifest["skills"]]
     if mine != theirs:
         raise RunError(
             f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
@@ -151,27 +152,27 @@ def _check_roles(roles: Roles, run: RunDirectory) -> None:
         )
     entries: dict[str, dict[str, Any]] = {"": run.manifest}
     for entry in run.manifest["skills"]:
-        path = entry["name"]
-        if (path in roles.levels) != ("hierarchy" in entry):
+        path = entry.name
+        if (path in roles.levels) != (entry.hierarchy is not None):
             raise RunError(
                 f"{run.path}: skill {path!r} is a hierarchy in the run or in "
                 "this declaration, not in both; declare it as it was trained"
             )
         _check_goals(roles.skills[path], entry, f"{run.path}: skill {path!r}")
-        check_same_part(roles, path, entry, f"{run.path}: skill {path!r}")
-        if "hierarchy" in entry:
-            entries[path] = entry["hierarchy"]
+        check_same_part(roles, path, as_json(entry), f"{run.path}: skill {path!r}")
+        if entry.hierarchy is not None:
+            entries[path] = entry.hierarchy
     for path, level in roles.levels.items():
         where = f"{run.path}: {path}" if path else str(run.path)
         check_selector(level.ready_selector is not None, SELECTOR in entries[path], where)
         _check_reflexes(level, entries[path], where)
 
 
-def _check_goals(skill: Skill, entry: Mapping[str, Any], who: str) -> None:
+def _check_goals(skill: Skill, entry: SkillEntry, who: str) -> None:
     """Raise a RunError where a skill had other goals in its run."""
-    if skill.goal_space is None or "goal_space" not in entry:  # said where policies are fitted
+    if skill.goal_space is None or entry.goal_space is None:  # said where policies are fitted
         return
-    if says := other_goals(space_from_json(entry["goal_space"]), skill.goal_space):
+    if says := other_goals(space_from_json(entry.goal_space), skill.goal_space):
         raise RunError(f"{who} {says}")
 
 

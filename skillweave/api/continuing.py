@@ -13,6 +13,7 @@ from skillweave.paths import decides, is_below, level_of
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
+from skillweave.runs.manifest import StageEntry
 
 EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
@@ -65,7 +66,7 @@ def prepared(
     except BaseException:
         run.close()
         raise
-    if run.finished and not any(entry.get("reached") for entry in run.manifest["stages"]):
+    if run.finished and not any(entry.reached for entry in run.manifest["stages"]):
         more = "--set steps=N, or --scale" if from_command_line() else "more steps"
         sentences.append(
             f"{run.path} is finished, so nothing is trained; to train it for longer, give it {more}"
@@ -97,37 +98,32 @@ def _check_same(content: Mapping[str, Any], run: RunDirectory) -> None:
         )
 
 
-def _budgets(stages: list[dict[str, Any]], run: RunDirectory, evolve: Evolve) -> dict[str, int]:
+def _budgets(stages: list[StageEntry], run: RunDirectory, evolve: Evolve) -> dict[str, int]:
     """Return the budgets of a run's stages as they are declared now, where both have the stage.
 
     Args:
         stages: the entries of the stages that are declared now.
     """
     if run.manifest["kind"] == "hierarchy":
-        names = {stage["name"] for stage in stages}
+        names = {stage.name for stage in stages}
         if not isinstance(evolve, Mapping) or set(evolve) <= names:
             plan(stages, evolve)
-    theirs = {entry["name"]: entry for entry in run.manifest["stages"]}
+    theirs = {entry.name: entry for entry in run.manifest["stages"]}
     budgets = {}
     for stage in stages:
-        if (entry := theirs.get(stage["name"])) is not None:
-            members, known = _members(stage), _members(entry)
+        if (entry := theirs.get(stage.name)) is not None:
             # A population's budget is that of all members.
-            budgets[stage["name"]] = stage["budget"] // members * known
+            budgets[stage.name] = stage.budget // stage.members * entry.members
     return budgets
 
 
-def _members(entry: Mapping[str, Any]) -> int:
-    return int((entry.get("evolution") or {"population": 1})["population"])
-
-
-def _more(stages: Sequence[Mapping[str, Any]], budgets: Mapping[str, int]) -> dict[str, int]:
+def _more(stages: Sequence[StageEntry], budgets: Mapping[str, int]) -> dict[str, int]:
     """Return by stage the steps that its budget has grown by."""
     more: dict[str, int] = {}
     for entry in stages:
-        heir = _heir(stages, entry)["name"]
-        declared = budgets.get(entry["name"], entry["budget"])
-        more[heir] = more.get(heir, 0) + declared - entry["budget"]
+        heir = _heir(stages, entry).name
+        declared = budgets.get(entry.name, entry.budget)
+        more[heir] = more.get(heir, 0) + declared - entry.budget
     return more
 
 
@@ -137,32 +133,30 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     A stage whose learners learn again in a later one stays as it is, as the later one would not
     start from the new weights. The later one gets its steps, too.
     """
-    stages: list[dict[str, Any]] = run.manifest["stages"]
+    stages: list[StageEntry] = run.manifest["stages"]
     more = _more(stages, budgets)
     finished = run.finished
-    grown = list[dict[str, Any]]()
+    grown = list[StageEntry]()
     sentences = list[str]()
     for entry in stages:
-        name, budget = entry["name"], entry["budget"]
+        name, budget = entry.name, entry.budget
         wanted = budget + more.get(name, 0)
         if wanted < budget:
             sentences.append(f"{name} keeps its {budget:,} steps (declared now: {wanted:,})")
-        elif wanted > budget and entry.get("reached"):
+        elif wanted > budget and entry.reached:
             sentences.append(f"{name} has reached its target, so it gets no more steps")
-        elif wanted > budget and entry["status"] == "done" and not finished:
+        elif wanted > budget and entry.done and not finished:
             sentences.append(f"{name} can be given more steps once the run is finished")
         elif wanted > budget:
             sentences.append(f"{name} continues: {budget:,} → {wanted:,} steps")
             grown.append(entry)
     for entry in grown:
-        _check_grows(run, entry, more[entry["name"]])
+        _check_grows(run, entry, more[entry.name])
     for entry in grown:
-        entry["budget"] += more[entry["name"]]
-        if entry["status"] == "done":
-            entry["status"] = "waiting"
-            entry["continued"] = [*entry.get("continued", []), entry["steps"]]
-            for key in MADE_AT_THE_END:
-                entry.pop(key, None)
+        entry.budget += more[entry.name]
+        if entry.done:
+            entry.continued = [*entry.continued, entry.steps or 0]
+            entry.forget_end()
     if grown:
         run.save()
         for path in run.path.glob(EVALUATIONS):
@@ -170,37 +164,22 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     return sentences + _stale(stages, grown)
 
 
-MADE_AT_THE_END = (
-    "steps",
-    "seconds",
-    "steps_per_second",
-    "final",
-    "kept",
-    "succeeded",
-    "stopped",
-    "best",
-    "sha256",
-    "policies",
-)
-"""Fields of a stage's entry that training writes again when it has continued."""
-
-
-def _heir(stages: Sequence[Mapping[str, Any]], entry: Mapping[str, Any]) -> Mapping[str, Any]:
+def _heir(stages: Sequence[StageEntry], entry: StageEntry) -> StageEntry:
     """Return the latest stage with a learner of this one."""
-    learners = set(entry["learns"])
-    return next(other for other in reversed(stages) if learners & set(other["learns"]))
+    learners = set(entry.learns)
+    return next(other for other in reversed(stages) if learners & set(other.learns))
 
 
-def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None:
+def _check_grows(run: RunDirectory, entry: StageEntry, more: int) -> None:
     """Raise a RunError where a stage cannot be given more steps."""
-    name = entry["name"]
+    name = entry.name
     new = f"Start a new run from what it has learnt: {start_words(run)}"
-    if entry.get("evolution"):
+    if entry.evolution:
         raise RunError(
             f"{run.path}: stage {name!r} is a population, which cannot be given more steps, as "
             f"only its best member is kept. {new}"
         )
-    if entry["status"] != "done":
+    if not entry.done:
         return
     if is_copy_of_hub(run.path) or not run.final_path(name).exists():
         raise RunError(
@@ -208,10 +187,10 @@ def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None
             f"{name!r} (a copy from the hub does not, nor does a run whose disk was full). {new}"
         )
     tensors = run.final_tensors(name)
-    left = entry["budget"] + more - entry["steps"]
+    left = entry.budget + more - (entry.steps or 0)
     for learner, config in _algorithms(entry).items():
         waits = config.get("learning_starts", 0)
-        place = "extra.learner." + (f"{learner}." if "together" in entry else "") + "store."
+        place = "extra.learner." + (f"{learner}." if entry.together else "") + "store."
         if left <= waits and not any(tensor.startswith(place) for tensor in tensors):
             raise RunError(
                 f"{run.path}: {learner!r} would learn nothing in {left:,} more steps, as its "
@@ -220,30 +199,29 @@ def _check_grows(run: RunDirectory, entry: Mapping[str, Any], more: int) -> None
             )
 
 
-def _algorithms(entry: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _algorithms(entry: StageEntry) -> dict[str, dict[str, Any]]:
     """Return the settings of a stage's learners, by name."""
-    first = entry["decides"] if "together" in entry else entry["name"]
-    beside: dict[str, dict[str, Any]] = entry.get("algorithms", {})
-    return ({first: entry["algorithm"]} if first in entry["learns"] else {}) | beside
+    first = entry.decides if entry.together else entry.name
+    return ({first: entry.algorithm} if first in entry.learns else {}) | entry.algorithms
 
 
-def _stale(stages: Sequence[Mapping[str, Any]], grown: Sequence[Mapping[str, Any]]) -> list[str]:
+def _stale(stages: Sequence[StageEntry], grown: Sequence[StageEntry]) -> list[str]:
     """Return a sentence on each selector that stays as it is while its skills continue."""
     sentences = []
     for at, entry in enumerate(stages):
-        level = level_of(entry["name"])
-        if entry["status"] != "done" or entry in grown or not decides(str(entry["decides"])):
+        level = level_of(entry.name)
+        if not entry.done or entry in grown or not decides(str(entry.decides)):
             continue
         skills = [
             name
             for other in stages[:at]
             if other in grown
-            for name in other["learns"]
+            for name in other.learns
             if is_below(name, level)
         ]
         if skills:
             sentences.append(
-                f"{entry['name']} stays as it is, so it still chooses for {', '.join(skills)} as "
+                f"{entry.name} stays as it is, so it still chooses for {', '.join(skills)} as "
                 "they were; give it more steps, too"
             )
     return sentences

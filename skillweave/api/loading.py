@@ -16,6 +16,7 @@ from skillweave.messages import as_path, short
 from skillweave.runs import hub
 from skillweave.runs.command_words import python_string
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import as_json
 from skillweave.shipped import names
 from skillweave.training.plain_agent import Declared
 
@@ -128,7 +129,7 @@ def declared_by(
     manifest = run.manifest
     if recipe is None and not manifest.get(needs, True):
         kind = Agent if manifest["kind"] == "agent" else Hierarchy
-        return kind.from_manifest(manifest)
+        return kind.from_manifest(as_json(manifest))
     return declared_in(recipe or manifest.get("recipe"), recipe, str(run.path), ask)
 
 

@@ -97,12 +97,12 @@ def _stages(run: RunDirectory) -> Markup:
     """Return a table of a run's stages."""
     rows = []
     for stage in run.manifest["stages"]:
-        final = stage.get("final", {})
-        steps, seconds = stage.get("steps"), stage.get("seconds")
+        final = stage.final
+        steps, seconds = stage.steps, stage.seconds
         rows.append(
             (
-                stage["name"],
-                stage["status"],
+                stage.name,
+                stage.status,
                 "" if steps is None else f"{steps:,}",
                 "" if seconds is None else f"{seconds:,.0f}",
                 "" if final.get("return") is None else f"{final['return']:,.1f}",

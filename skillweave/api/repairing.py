@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -24,13 +23,13 @@ from skillweave.hierarchy.repair import (
     matrix_to_json,
     measure,
     rehearsed_obs,
-    repair_stage,
 )
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.messages import as_path, short, shown_path
 from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import RepairEntry, StageEntry
 from skillweave.skills.learnable import learn_on
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
@@ -42,8 +41,6 @@ USUAL_STEPS = 200_000
 """Steps of a repair for which none are given."""
 GOOD = 0.95
 """A hand-over that is done at least this often needs no repair."""
-MADE_ELSEWHERE = ("metrics_bytes", "lineage_bytes", "sha256", "policies", "starts", "continued")
-"""Fields of a stage's entry that belong to files of the run that it was trained in."""
 OF_THE_RUN = ("id", "sha256", "versions", "created", "stages", "track")
 """Fields of a manifest that a new run has of its own."""
 
@@ -80,13 +77,9 @@ def repair(
             "with the hierarchy that was trained: sw.load(directory, hierarchy)"
         )
     config = learnt.algorithm.config
-    entry: dict[str, Any] = {
-        "name": _stage_name(skill, {e["name"] for e in entries} | set(roles.skills)),
-        "budget": steps,
-        "repair": {"skill": skill, "after": after, "calls": calls, "done": sorted(done or ())},
-    }
-    entry = repair_stage(roles, entry).entry() | entry
-    entry["algorithm"] = config_to_json(config)
+    name = _stage_name(skill, {e.name for e in entries} | set(roles.skills))
+    recorded = config_to_json(config)
+    entry = StageEntry(name, "skill", [skill], None, steps, recorded, None, "waiting")
     check_stages([entry], None)
     if isinstance(config, OnPolicy) and steps < (one := config.n_steps * config.num_envs):
         raise DeclarationError(
@@ -95,11 +88,11 @@ def repair(
         )
     with Progress(quiet=options.quiet) as progress:
         found = _measured(roles, policy, skill, after, done, calls, config.num_envs, progress)
-    entry["repair"]["before"] = matrix_to_json(found.matrix)
     reason = str(found.log.blame(name_of(skill), name_of(after), done))
     reason += f" {found.shortage}" if found.shortage else ""
-    entry["repair"]["blame"] = reason
-    entry["repair"]["bonus"] = found.gain
+    before = matrix_to_json(found.matrix)
+    known = sorted(done or ())
+    entry.repair = RepairEntry(skill, after, calls, known, reason, before, found.gain)
     content |= {"stages": [entry], "seed": options.seed, "code": roles.code}
     rehearsal = None
     role = roles[skill]
@@ -111,7 +104,7 @@ def repair(
             f" {skill!r} learns on without rehearsal, so it may forget what it does elsewhere: "
             "only PPO without a memory rehearses."
         )
-    write = partial(_write, policies=policies, stage=entry["name"], rehearsal=rehearsal)
+    write = partial(_write, policies=policies, stage=entry.name, rehearsal=rehearsal)
     base = Base(entries, write, "repair")
     return begin(declared, content, options.training, reason, base, done)
 
@@ -124,13 +117,13 @@ def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Train
             f'repair({name_of(skill)!r}, after={name_of(after)!r}, run_dir="runs/a", resume=True)'
         )
     run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
-    repairs = [e["repair"] for e in run.manifest["stages"] if "repair" in e]
-    if not repairs or (repairs[-1]["skill"], repairs[-1]["after"]) != (skill, after):
+    repairs = [e for e in run.manifest["stages"] if e.repair is not None]
+    if not repairs or (repairs[-1].repair.skill, repairs[-1].repair.after) != (skill, after):
         raise RunError(
             f"{shown_path(run.path)} holds no repair of {skill!r} after {after!r}; leave out "
             "resume=True to start one in another directory"
         )
-    budget = next(e["budget"] for e in reversed(run.manifest["stages"]) if "repair" in e)
+    budget = repairs[-1].budget
     if options.steps not in (None, budget):
         raise DeclarationError(
             f"steps is {options.steps:,}, but this repair was started with {budget:,}: "
@@ -231,16 +224,15 @@ Policies = dict[str, dict[str, AgentPolicy]]
 
 def _content(
     declared: Declaration, source: Path, roles: Roles, policy: HierarchyPolicy
-) -> tuple[dict[str, Any], list[dict[str, Any]], Policies]:
+) -> tuple[dict[str, Any], list[StageEntry], Policies]:
     """Return a manifest without stages, entries of finished stages, and their policies."""
     if source.is_dir():
         run = RunDirectory.open(source)
         content = {k: v for k, v in run.manifest.items() if k not in OF_THE_RUN}
-        entries = [
-            {k: v for k, v in copy.deepcopy(entry).items() if k not in MADE_ELSEWHERE}
-            for entry in run.manifest["stages"]
-        ]
-        policies = {entry["name"]: run.load_policies(entry["name"]) for entry in entries}
+        entries = list[StageEntry](run.manifest["stages"])
+        policies = {entry.name: run.load_policies(entry.name) for entry in entries}
+        for entry in entries:
+            entry.forget_files()
         return content | {"eval_every": None, "keep": "last"}, entries, policies
     content = training.manifest(declared, seed=0)
     content |= {"eval_every": None, "keep": "last"}
@@ -248,11 +240,12 @@ def _content(
     policies = dict[str, dict[str, AgentPolicy]]()
     for entry in content.pop("stages"):
         # A weights file does not record its training: the declaration's steps stand for it.
-        entries.append(entry | {"status": "done", "steps": entry["budget"], "seconds": 0.0})
-        if entry["kind"] == "together":
-            entries[-1] |= {"compared": False, "greedy_judged": False}
-        learnt = {name: parts[name] for name in entry["learns"]}
-        policies[entry["name"]] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
+        entry.status, entry.steps, entry.seconds = "done", entry.budget, 0.0
+        if entry.kind == "together":
+            entry.compared = entry.greedy_judged = False
+        entries.append(entry)
+        learnt = {name: parts[name] for name in entry.learns}
+        policies[entry.name] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
     return content, entries, policies
 
 

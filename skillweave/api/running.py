@@ -41,7 +41,7 @@ from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import First, RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import copy_initial_policies
-from skillweave.runs.manifest import identity
+from skillweave.runs.manifest import StageEntry, identity
 from skillweave.runs.numbered import make_numbered
 from skillweave.runs.trackers import make_trackers
 from skillweave.seeding import Seeds, global_generators
@@ -141,7 +141,7 @@ def begin(
 class Base:
     """Finished stages with which a new run begins."""
 
-    stages: Sequence[dict[str, Any]]
+    stages: Sequence[StageEntry]
     """Their entries."""
     write: First
     """Writes their policies into the run."""
@@ -151,7 +151,7 @@ class Base:
 
 def _kept_by_populations(content: dict[str, Any]) -> str:
     """Return a sentence on the stages in which ``keep="best"`` changes nothing; may be empty."""
-    names = [stage["name"] for stage in content["stages"] if stage.get("evolution")]
+    names = [stage.name for stage in content["stages"] if stage.evolution]
     if content["keep"] != "best" or not names:
         return ""
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
@@ -181,7 +181,7 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
         return None
     run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
     _plan(declared, content, Going())
-    grown = any(stage.get("continued") for stage in run.manifest["stages"])
+    grown = any(stage.continued for stage in run.manifest["stages"])
     if grown or run.manifest.get("id") != identity(content):
         raise RunError(
             f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
@@ -199,7 +199,7 @@ def _plan(declared: Declared, content: dict[str, Any], options: Going) -> Mappin
     check_several(stages, spec)
     check_stages(stages, content["eval_every"], content["keep"])
     if steps := content.get("log_calls"):
-        if any(stage.get("evolution") for stage in stages):
+        if any(stage.evolution for stage in stages):
             raise DeclarationError(
                 "log_calls is set, but members of a population have policies of their own, so no "
                 "log of calls is kept while they evolve: leave out log_calls or evolve, and record "
@@ -209,17 +209,17 @@ def _plan(declared: Declared, content: dict[str, Any], options: Going) -> Mappin
     if cluster is not None and cluster.collectors is not None:
         spec = replace(spec, workers=cluster.collectors)
     assign_workers(stages, spec, declared)
-    if cluster is None and any(stage["workers"] > 1 for stage in stages):
+    if cluster is None and any(stage.workers > 1 for stage in stages):
         _must_not_run_again(spec)
     roles: Mapping[str, Role] = {AGENT: agent_role(declared.spec)}
     if content["kind"] == "hierarchy":
         assert isinstance(declared, Declaration)
         roles = roles_of(declared).by_path
     for stage in stages:
-        for path in stage["learns"]:
-            config = stage.get("algorithms", {}).get(path, stage["algorithm"])
+        for path in stage.learns:
+            config = stage.algorithms.get(path, stage.algorithm)
             if roles[path].kind != "critic":  # it has no replay
-                check_replay(stage | {"algorithm": config}, roles[path])
+                check_replay(replace(stage, algorithm=config), roles[path])
     return roles
 
 
@@ -333,15 +333,15 @@ def _where(
     """
     if cluster is None or run.finished:
         return LOCAL
-    left = [s for s in run.manifest["stages"] if s["status"] != "done"]
-    counts = [s.get("workers", 1) for s in left]
+    left = [s for s in run.manifest["stages"] if not s.done]
+    counts = [s.workers for s in left]
     wanted = cluster.collectors
-    if wanted is not None and any(s.get("workers", 1) != workers_of(s, wanted) for s in left):
+    if wanted is not None and any(s.workers != workers_of(s, wanted) for s in left):
         raise RunError(
             f"{run.path} was started with {', '.join(map(str, sorted(set(counts))))} collectors, "
             f"and continues with as many, as results depend on it; leave out collectors={wanted}"
         )
-    alone = [s["name"] for s in left if s.get("evolution") and s.get("workers", 1) == 1]
+    alone = [s.name for s in left if s.evolution and s.workers == 1]
     if alone:
         progress.message(
             f"{', '.join(alone)}: the population trains in this process, as no number of "

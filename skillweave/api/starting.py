@@ -27,6 +27,7 @@ from skillweave.runs.initial_policies import (
     recorded_part,
     same_shapes,
 )
+from skillweave.runs.manifest import StageEntry
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.skills.learnable import Learnable
@@ -86,7 +87,7 @@ def starts(
         if says := changes(learnt[names[0]].code, now):
             notice(f"start from {origin}: {says} since it was trained")
     for stage in content["stages"]:
-        for name in stage.get("starts", {}):
+        for name in stage.starts:
             role = roles[name]
             algorithm = make_algorithm(
                 _config_in(stage, name), role.observation_space, role.action_space
@@ -110,7 +111,7 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
         )
     goals = None if role.skill is None else role.skill.goal_space
     origin.check(role.observation_space, role.action_space, goals, f"start_from: {name!r}")
-    first = next(stage for stage in content["stages"] if name in stage["learns"])
+    first = next(stage for stage in content["stages"] if name in stage.learns)
     config = _config_in(first, name)
     fits = origin.learning_on(config, repr(name))
     changed = [
@@ -137,9 +138,9 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
     return Learnt(policy, origin.sha256(), origin.steps, origin.name, None, ((), ()))
 
 
-def _config_in(stage: Mapping[str, Any], name: str) -> Any:
+def _config_in(stage: StageEntry, name: str) -> Any:
     """Return the settings by which a learner learns in a stage of a manifest."""
-    return config_from_json(stage.get("algorithms", {}).get(name, stage["algorithm"]))
+    return config_from_json(stage.algorithms.get(name, stage.algorithm))
 
 
 def _place(run: Any, argument: str) -> Path:
@@ -209,7 +210,7 @@ def _learnt_by_name(
         DeclarationError: a name does not learn here.
         RunError: a name has not learnt in its run.
     """
-    here = sorted({name for entry in content["stages"] for name in entry["learns"]})
+    here = sorted({name for entry in content["stages"] for name in entry.learns})
     learnt: dict[str, Learnt] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     for name, run in start_from.items():

@@ -32,9 +32,9 @@ from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
-from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
+from skillweave.runs.manifest import as_json
 from skillweave.runs.several import open_runs
 from skillweave.terminal import one_line, say
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
@@ -251,7 +251,7 @@ def _info(command: commands.Info) -> None:
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
     matrix = hand_over_of(run)
     lines = [*run_lines(manifest, [saved, sampled], command.target), *_hand_over_lines(matrix)]
-    print_result(command, manifest | scores | hand_over_json(matrix), "\n".join(lines))
+    print_result(command, as_json(manifest) | scores | hand_over_json(matrix), "\n".join(lines))
 
 
 def _hand_over_lines(matrix: HandOver | str | None) -> list[str]:
@@ -280,35 +280,36 @@ def run_lines(
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
     for stage in manifest["stages"]:
-        final = stage.get("final", {}).get("return")
+        final = stage.final.get("return")
         lines.append(
-            f"  {stage['name']:<14} {stage['status']:<9} {stage.get('steps', 0):>10,} "
-            f"{stage.get('seconds', 0):>8.1f} {stage.get('steps_per_second', 0):>8,.0f} "
+            f"  {stage.name:<14} {stage.status:<9} {stage.steps or 0:>10,} "
+            f"{stage.seconds or 0:>8.1f} {stage.steps_per_second or 0:>8,.0f} "
             f"{'' if final is None else f'{final:.1f}':>8}"
         )
-        for name, start in stage.get("starts", {}).items():
-            run = "" if start["run"] is None else f" {start['run']}"
-            lines.append(f"    {name} starts from run{run}, after {start['steps']:,} steps there")
-        if continued := stage.get("continued"):
-            lines.append(f"    continued after {', '.join(f'{k:,}' for k in continued)} steps")
-        if reached := stage.get("reached"):
+        for name, start in stage.starts.items():
+            run = "" if start.run is None else f" {start.run}"
+            lines.append(f"    {name} starts from run{run}, after {start.steps:,} steps there")
+        if stage.continued:
+            steps = ", ".join(f"{k:,}" for k in stage.continued)
+            lines.append(f"    continued after {steps} steps")
+        if (reached := stage.reached) is not None:
             lines.append(
-                f"    target reached after {reached['steps']:,} of {stage['budget']:,} steps: "
-                f"{stage['target']['of']} {reached['value']:g}"
+                f"    target reached after {reached.steps:,} of {stage.budget:,} steps: "
+                f"{stage.target.of} {reached.value:g}"
             )
-        if stopped := stage.get("stopped"):
+        if stage.stopped is not None:
             lines.append(
-                f"    a callback ended it after {stopped['steps']:,} of {stage['budget']:,} steps"
+                f"    a callback ended it after {stage.stopped.steps:,} of {stage.budget:,} steps"
             )
-        if best := stage.get("best"):
-            lines.append(f"    {best_words(best)}")
-        if winner := stage.get("winner"):
+        if stage.best is not None:
+            lines.append(f"    {stage.best}")
+        if (winner := stage.winner) is not None:
             lines.append(
-                f"    winner: member {winner['member']} of generation {winner['generation'] + 1}, "
-                f"fitness {winner['fitness']:.1f} (skillweave plot {target})"
+                f"    winner: member {winner.member} of generation {winner.generation + 1}, "
+                f"fitness {winner.fitness:.1f} (skillweave plot {target})"
             )
-        if kept := stage.get("kept"):
-            lines.append(f"    {comparison_words(kept)}")
+        if stage.kept is not None:
+            lines.append(f"    {stage.kept}")
     lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest["versions"].items())]
     for score in saved:
         if score is not None:

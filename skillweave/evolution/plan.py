@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import Any
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.collecting.placement import LOCAL, Placement
@@ -15,6 +14,7 @@ from skillweave.evolution.mutation import check_mutations
 from skillweave.evolution.part import too_many
 from skillweave.evolution.stage import EvolvingPopulation
 from skillweave.messages import short, suggest
+from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import fitted
 from skillweave.training.joint import agents_of
 from skillweave.training.stage_run import MakeLearner, StageLearner, StageRun
@@ -23,40 +23,40 @@ Evolve = Evolution | Mapping[str, Evolution | None] | None
 """A population for every stage, or for the named ones."""
 
 
-def plan(stages: list[dict[str, Any]], evolve: Evolve) -> None:
+def plan(stages: list[StageEntry], evolve: Evolve) -> None:
     """Record in a manifest's stages which ones evolve, and count all members' steps.
 
     Raises:
         DeclarationError: a stage does not exist, or a mutation does not fit an agent.
     """
-    for name, how in _by_stage([p["name"] for p in stages], evolve).items():
-        entry = next(p for p in stages if p["name"] == name)
-        if "together" in entry:
+    for name, how in _by_stage([p.name for p in stages], evolve).items():
+        entry = next(p for p in stages if p.name == name)
+        if entry.together:
             raise DeclarationError(
-                f"stage {name!r}: {' and '.join(entry['learns'])} learn together there, so it "
+                f"stage {name!r}: {' and '.join(entry.learns)} learn together there, so it "
                 "cannot evolve; name the stages that should: evolve={'a_skill': Evolution(...)}"
             )
-        if "guide_kl" in entry:
+        if entry.guide_kl is not None:
             raise DeclarationError(
                 f"stage {name!r}: the guide has a target_kl, and populations are not kept near a "
                 "guide; omit it (restrict=True works), or name other stages: evolve={...}"
             )
-        check_mutations(config_from_json(entry["algorithm"]), how, f"stage {name!r}: ")
-        entry["evolution"] = evolution_to_json(how)
+        check_mutations(config_from_json(entry.algorithm), how, f"stage {name!r}: ")
+        entry.evolution = evolution_to_json(how)
         if how.target is not None:
-            entry["target"] = {"of": "return", "at_least": how.target}
-        entry["budget"] *= how.population
+            entry.target = Target("return", how.target)
+        entry.budget *= how.population
 
 
-def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
+def check_several(stages: Sequence[StageEntry], spec: EnvSpec) -> None:
     """Raise an EnvError where a stage evolves, but two environments cannot exist at once.
 
     Otherwise the stages before it would be trained for nothing.
     """
-    evolving = [entry for entry in stages if entry.get("evolution")]
+    evolving = [entry for entry in stages if entry.evolution]
     if not evolving:
         return
-    needed = max(e["evolution"]["population"] * e["algorithm"]["num_envs"] for e in evolving)
+    needed = max(e.members * e.num_envs for e in evolving)
     with closing(spec.make()):
         try:
             spec.make(number=1).close()
@@ -64,9 +64,7 @@ def check_several(stages: Sequence[Mapping[str, Any]], spec: EnvSpec) -> None:
             raise too_many(error, f"{needed} of them to train in") from error
 
 
-def make_learner(
-    stages: list[dict[str, Any]], evolve: Evolve, where: Placement = LOCAL
-) -> MakeLearner:
+def make_learner(stages: list[StageEntry], evolve: Evolve, where: Placement = LOCAL) -> MakeLearner:
     """Return a function that makes a stage's learner: a population, or one agent.
 
     ``evolve`` has selections of the user, of which a run records only names. ``where`` is the
@@ -75,10 +73,10 @@ def make_learner(
     Raises:
         DeclarationError: ``evolve`` names a stage that is not among ``stages``.
     """
-    by_stage = _by_stage([s["name"] for s in stages], evolve)
+    by_stage = _by_stage([s.name for s in stages], evolve)
 
     def make(stage: StageRun) -> StageLearner:
-        if stage.entry.get("evolution") is None:
+        if stage.entry.evolution is None:
             return agents_of(stage, where.collectors)
         how = by_stage.get(stage.name)
         return EvolvingPopulation(stage, None if how is None else how.selection, where)

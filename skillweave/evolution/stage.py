@@ -27,7 +27,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
-from skillweave.runs.manifest import BestEntry, Generation, MemberEntry
+from skillweave.runs.manifest import BestEntry, Generation, MemberEntry, Winner
 from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
@@ -63,7 +63,7 @@ class EvolvingPopulation:
         self.run = stage.run
         self.seeds = stage.seeds
         label = f"{stage.run.path}: stage {stage.name!r}"
-        self.evolution = evolution_from_json(stage.entry["evolution"], label, selection)
+        self.evolution = evolution_from_json(stage.entry.evolution or {}, label, selection)
         self.config = stage.config
         self.budget = stage.budget
         self.target = stage.target
@@ -102,7 +102,7 @@ class EvolvingPopulation:
 
     def _parts(self) -> Parts | None:
         """Return the parts at workers; None: members train in this process."""
-        parts = int(self.stage.entry.get("workers", 1))
+        parts = self.stage.entry.workers
         evolution = self.evolution
         if parts <= 1:
             return None
@@ -200,9 +200,8 @@ class EvolvingPopulation:
                 f"its budget of {self.budget:,} steps is spent after {self.done} of {generations} "
                 "generations: measuring fitness counts, too. Give it more steps, or fewer episodes"
             )
-        winner = {"member": self.best.number, "fitness": self.best.fitness}
-        winner |= {"generation": self.best.generation, "generations": self.done}
-        self.log.entry["winner"] = winner
+        best = self.best
+        self.log.entry.winner = Winner(best.number, best.fitness, best.generation, self.done)
         return self.best.policy
 
     def _until(self, spent: int) -> tuple[int, int]:

@@ -13,12 +13,13 @@ from skillweave.hierarchy.roles import Level, Nestable, Roles
 from skillweave.hierarchy.settings import Guide
 from skillweave.messages import short, suggest
 from skillweave.paths import name_of
+from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.selectors import Automaton
 from skillweave.skills import Reflex, Skill, ready_policy
 from skillweave.skills.learnable import learn_on
 from skillweave.skills.own_part import ZERO, checked_rest
-from skillweave.training.stage import Target, target_of
+from skillweave.training.stage import target_of
 
 
 def checked_skills(skills: object, reserved: Collection[str]) -> tuple[Skill, ...]:

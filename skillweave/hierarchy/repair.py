@@ -22,7 +22,9 @@ from skillweave.planning.hand_over import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
 from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.policies.core import Memory, Turn
+from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Matrix, RepairEntry, StageEntry
 from skillweave.skills import Skill
 from skillweave.skills.goals import goals_of
 from skillweave.skills.own_part import OwnPart
@@ -79,15 +81,17 @@ class Repair:
 
 
 def repair_stage(
-    roles: Roles, entry: Mapping[str, Any], done: Mapping[str, Any] | None = None
+    roles: Roles,
+    entry: StageEntry,
+    repair: RepairEntry,
+    done: Mapping[str, Any] | None = None,
 ) -> Stage:
     """Return the stage of a run's entry in which a skill is repaired.
 
     Args:
         done: as for ``hand_over``.
     """
-    repair = entry["repair"]
-    path = repair["skill"]
+    path = repair.skill
     level, role = roles.levels[level_of(path)], roles[path]
     calls, config = level.apart.start_calls, role.config
     assert config is not None
@@ -98,7 +102,7 @@ def repair_stage(
         limit = whole.limit(list(level.skills).index(path))
         assert role.skill is not None
         holds = event_of(role.skill, done)
-        bonus, gamma = repair.get("bonus", 0.0), float(config.gamma)
+        bonus, gamma = repair.bonus, float(config.gamma)
         learning = role
         if holds is not None and bonus:
             # As much as if a call that ends by the event went on, and the event held.
@@ -108,17 +112,17 @@ def repair_stage(
             level.skill_set(others),
             0 if calls is None else START_CALLS,
             level.apart.search_steps,
-            after=(name_of(repair["after"]),),
-            named_share=REHEARSED_SHARE if "rehearsal" in repair else NAMED_SHARE,
+            after=(name_of(repair.after),),
+            named_share=NAMED_SHARE if repair.rehearsal is None else REHEARSED_SHARE,
         )
         # Calls are what counts, and steps beyond their limit would take steps from the starts.
         return skill_task(learning, level.reflexes, starts, limit)
 
     return Stage(
-        entry["name"],
+        entry.name,
         "skill",
         config,
-        entry["budget"],
+        entry.budget,
         learning_task,
         level=level.path,
         learner=path,
@@ -314,45 +318,41 @@ def rehearsed_obs(
     return goals.join(obs, goals.space.of_numbers(log.goals[skill.name])[log.owner[steps]])
 
 
-def matrix_to_json(matrix: HandOver) -> dict[str, Any]:
-    """Return a matrix as plain JSON."""
-    counts = {k: getattr(matrix, k).tolist() for k in ("calls", "done", "cut")}
-    names = {"skills": list(matrix.skills), "by_itself": list(matrix.by_itself)}
-    return names | counts
+def matrix_to_json(matrix: HandOver) -> Matrix:
+    """Return a matrix as a run records it."""
+    calls, done, cut = (x.tolist() for x in (matrix.calls, matrix.done, matrix.cut))
+    return Matrix(list(matrix.skills), calls, done, cut, list(matrix.by_itself))
 
 
-def matrix_from_json(entry: Mapping[str, Any]) -> HandOver:
+def matrix_from_json(entry: Matrix) -> HandOver:
     """Return the matrix of ``matrix_to_json``."""
-    calls, done, cut = (np.array(entry[k], np.int64) for k in ("calls", "done", "cut"))
-    return HandOver(tuple(entry["skills"]), calls, done, cut, tuple(entry["by_itself"]))
+    calls, done, cut = (np.array(x, np.int64) for x in (entry.calls, entry.done, entry.cut))
+    return HandOver(tuple(entry.skills), calls, done, cut, tuple(entry.by_itself))
 
 
 def judge_repair(
-    roles: Roles, course: Course, entry: dict[str, Any], later: HierarchyPolicy
+    roles: Roles, course: Course, entry: StageEntry, repair: RepairEntry, later: HierarchyPolicy
 ) -> bool:
     """Measure a repaired skill once, and record whether it is kept; return that.
 
     Args:
         later: the hierarchy with the repaired weights.
     """
-    if "kept" not in entry:
-        repair = entry["repair"]
-        level = parts_of(roles, later)[level_of(repair["skill"])]
+    if entry.kept is None:
+        level = parts_of(roles, later)[level_of(repair.skill)]
         assert isinstance(level, HierarchyPolicy)
-        names = name_of(repair["skill"]), name_of(repair["after"])
+        names = name_of(repair.skill), name_of(repair.after)
         tell = partial(course.tell, entry)
-        num_envs = int(entry["algorithm"]["num_envs"])
         found = measure(
-            roles.spec, level.skills, *names, course.done, repair["calls"], num_envs, tell
+            roles.spec, level.skills, *names, course.done, repair.calls, entry.num_envs, tell
         )
-        is_kept, sentence = verdict(matrix_from_json(repair["before"]), found.matrix, *names)
-        repair["later"] = matrix_to_json(found.matrix)
+        is_kept, sentence = verdict(matrix_from_json(repair.before), found.matrix, *names)
+        repair.later = matrix_to_json(found.matrix)
         sentence += f". {found.shortage}" if found.shortage else ""
-        entry["kept"] = {"kept": "repaired" if is_kept else "before", "sentence": sentence}
+        entry.kept = Comparison("repaired" if is_kept else "before", sentence=sentence)
         course.run.save()
         tell(sentence)
-    kept: bool = entry["kept"]["kept"] == "repaired"
-    return kept
+    return not entry.undone
 
 
 def verdict(before: HandOver, later: HandOver, skill: str, after: str) -> tuple[bool, str]:
@@ -387,18 +387,17 @@ def repairs_of(run: RunDirectory) -> list[Repair]:
     """Return the repairs of a run that are judged, in their order."""
     repairs = []
     for entry in run.manifest["stages"]:
-        repair = entry.get("repair", {})
-        if "later" in repair:
-            kept = entry["kept"]
+        repair = entry.repair
+        if repair is not None and repair.later is not None:
             repairs.append(
                 Repair(
-                    repair["skill"],
-                    repair["after"],
-                    matrix_from_json(repair["before"]),
-                    matrix_from_json(repair["later"]),
-                    kept["kept"] == "repaired",
-                    repair["blame"],
-                    kept["sentence"],
+                    repair.skill,
+                    repair.after,
+                    matrix_from_json(repair.before),
+                    matrix_from_json(repair.later),
+                    not entry.undone,
+                    repair.blame,
+                    str(entry.kept),
                 )
             )
     return repairs

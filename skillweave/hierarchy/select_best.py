@@ -14,8 +14,9 @@ from skillweave.hierarchy.assembly import assembled
 from skillweave.hierarchy.roles import Level, Roles
 from skillweave.hierarchy.schedule import open_choices
 from skillweave.paths import join, level_of, levels_to
-from skillweave.runs.comparison import SAMPLING, comparison_words, needs_comparison
+from skillweave.runs.comparison import SAMPLING, Candidate, Comparison
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import StageEntry
 from skillweave.training.episodes import standard_error
 from skillweave.training.evaluation import Evaluation, evaluate
 from skillweave.training.skill_text import stuck_selector, useless_skills
@@ -52,10 +53,10 @@ def select_best(
     """
     run = course.run
     entry = run.stage(join(level.path, TOGETHER))
-    if "kept" not in entry and needs_comparison(entry):
+    if entry.kept is None and entry.needs_comparison:
         episodes = _episodes(entry)
         if not episodes:
-            entry["kept"] = {"kept": "skills_sample"}  # as they did while they learnt
+            entry.kept = Comparison("skills_sample")  # as they did while they learnt
             run.save()
             return after
         course.tell(
@@ -64,26 +65,28 @@ def select_best(
             "should be greedy",
         )
         scores = _scores(roles, level, run, before, after, episodes)
-        means = {name: score.mean for name, score in scores.items()}
-        entry["kept"] = means | {"episodes": episodes, "kept": _best(scores)}
-        entry["evaluation_steps"] += sum(sum(score.lengths) for score in scores.values())
+        means: dict[str, Any] = {name: score.mean for name, score in scores.items()}
+        entry.kept = Comparison(_best(scores), episodes=episodes, **means)
+        played = sum(sum(score.lengths) for score in scores.values())
+        entry.evaluation_steps = (entry.evaluation_steps or 0) + played
         run.save()
-        course.tell(entry, comparison_words(entry["kept"]))
-        best = scores[entry["kept"]["kept"]].skills
+        course.tell(entry, str(entry.kept))
+        best = scores[entry.kept.kept].skills
         learns = level.ready_selector is None
         hints = _exploration(entry, scores) if learns else []
         for hint in hints or useless_skills(best, episodes, selector_learns=learns):
             for listener in course.listeners:
                 listener.message(hint)
-    return before if entry.get("kept", {}).get("kept") == "before" else after
+    return before if entry.undone else after
 
 
-def _episodes(entry: Mapping[str, Any]) -> int:
+def _episodes(entry: StageEntry) -> int:
     """Return the number of episodes for each candidate: fewer where episodes are long, or 0."""
-    length = entry["final"].get("length") or entry["steps"] / entry["algorithm"]["num_envs"]
-    episodes = round(SHARE * entry["steps"] / length)
+    steps = entry.steps or 0
+    length = entry.final.get("length") or steps / entry.num_envs
+    episodes = round(SHARE * steps / length)
     if episodes < LEAST:
-        episodes = min(LEAST, int(SHORT_SHARE * entry["steps"] / length))
+        episodes = min(LEAST, int(SHORT_SHARE * steps / length))
     return min(episodes, MOST) if episodes >= FEWEST else 0
 
 
@@ -98,11 +101,11 @@ def _scores(
     """Return the evaluations of all candidates, by name."""
     entry = run.stage(join(level.path, TOGETHER))
     spec, seed = roles.spec, SEEDS + int(run.manifest["seed"])
-    num_envs = entry["algorithm"]["num_envs"]
+    num_envs = entry.num_envs
     max_steps = None
-    if not entry["final"].get("length"):
+    if not entry.final.get("length"):
         # No episode has ended, so no policy has learnt from longer ones than these.
-        max_steps = max(1, entry["steps"] // num_envs)
+        max_steps = max(1, (entry.steps or 0) // num_envs)
 
     def score(decided: Roles, policies: Policies) -> Evaluation:
         policy = assembled(decided, policies, level.path)
@@ -121,21 +124,21 @@ def _scores(
 
     scores = {"greedy": sampling("greedy")}
     skills_open, selector_open = open_choices(roles, level)
-    if entry["greedy_judged"] and skills_open:
+    if entry.greedy_judged and skills_open:
         scores["skills_sample"] = sampling("skills_sample")
-    if entry["greedy_judged"] and selector_open:
+    if entry.greedy_judged and selector_open:
         # Under a greedy selector that is stuck, no episode shows how skills should act.
         for name in ("selector_samples", "both_sample")[: len(scores)]:
             scores[name] = sampling(name)
-    if entry["compared"]:
+    if entry.compared:
         scores["before"] = score(resolve_greedy(roles, run), before)
     return scores
 
 
-def _best(scores: Mapping[str, Evaluation]) -> str:
+def _best(scores: Mapping[str, Evaluation]) -> Candidate:
     """Return the candidate with the best mean; a selector samples only if it is clearly better."""
-    by_mean = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
-    greedy = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
+    by_mean: list[Any] = sorted(scores, key=lambda name: -scores[name].mean)  # of equals the first
+    greedy: Candidate = next(k for k in by_mean if k == "before" or not SAMPLING[k][1])
     first, other = scores[by_mean[0]], scores[greedy]
     difference, error = first.mean - other.mean, standard_error(other.returns)
     return by_mean[0] if _is_clear(difference, first, error) else greedy
@@ -146,9 +149,10 @@ def _is_clear(difference: float, score: Evaluation, error: float) -> bool:
     return difference > CLEARLY * math.hypot(standard_error(score.returns), error)
 
 
-def _exploration(entry: Mapping[str, Any], scores: Mapping[str, Evaluation]) -> list[str]:
+def _exploration(entry: StageEntry, scores: Mapping[str, Evaluation]) -> list[str]:
     """Return a sentence if training episodes, with choices at random, were clearly the best."""
-    final, best = entry["final"], max(scores.values(), key=lambda score: score.mean)
+    final: Any = entry.final
+    best = max(scores.values(), key=lambda score: score.mean)
     if "return_error" not in final:  # too few episodes have ended
         return []
     if not _is_clear(final["return"] - best.mean, best, final["return_error"]):
@@ -184,15 +188,15 @@ def _sampling(run: RunDirectory, path: str) -> tuple[bool, bool]:
     Args:
         path: of a level, which may have learnt together with the levels above it.
     """
-    stages: dict[str, Mapping[str, Any]] = {s["name"]: s for s in run.manifest["stages"]}
+    stages: dict[str, StageEntry] = {s.name: s for s in run.manifest["stages"]}
     for above in levels_to(path):
         entry = stages.get(join(above, TOGETHER))
-        if entry is None or entry["status"] != "done":
+        if entry is None or not entry.done:
             continue
-        if "kept" not in entry:
-            if needs_comparison(entry):
+        if entry.kept is None:
+            if entry.needs_comparison:
                 continue
             return True, False  # not evaluated: skills act as they did while the selector learnt
-        if (choice := entry["kept"]["kept"]) != "before":
+        if (choice := entry.kept.kept) != "before":
             return SAMPLING[choice]
     return False, False

@@ -23,6 +23,7 @@ from skillweave.planning import Planner
 from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import SkillEntry
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.skills.goals import goals_of
@@ -141,16 +142,16 @@ def _repaired(roles: Roles, course: Course, policies: Policies) -> Policies:
     """Train, or finish training, the repairs of a run; return the policies that it ends with."""
     run, done = course.run, course.done
     for entry in run.manifest["stages"]:
-        if "repair" not in entry:
+        if (repair := entry.repair) is None:
             continue
-        if "kept" not in entry and entry["repair"]["done"] and done is None:
+        if entry.kept is None and repair.done and done is None:
             raise RunError(
                 f"{run.path}: the repair is judged by done= of "
-                f"{', '.join(entry['repair']['done'])}, which is code: "
-                f"continue it by {repair_words(entry['repair'], run)}"
+                f"{', '.join(repair.done)}, which is code: "
+                f"continue it by {repair_words(repair, run)}"
             )
-        after = course.train([repair_stage(roles, entry, done)], policies)
-        if judge_repair(roles, course, entry, assembled(roles, after)):
+        after = course.train([repair_stage(roles, entry, repair, done)], policies)
+        if judge_repair(roles, course, entry, repair, assembled(roles, after)):
             policies = after
     return policies
 
@@ -180,8 +181,8 @@ def _learnt(run: RunDirectory) -> dict[str, Policy]:
     """Return the trained policies of a finished run, by path."""
     policies: dict[str, Policy] = {}
     for entry in run.manifest["stages"]:
-        if entry.get("kept", {}).get("kept") != "before":
-            policies |= run.load_policies(entry["name"])
+        if not entry.undone:
+            policies |= run.load_policies(entry.name)
     return policies
 
 
@@ -214,28 +215,30 @@ def _entry_of(run: RunDirectory, path: str) -> dict[str, Any]:
     """Return a run's entry of the level at ``path``."""
     if not path:
         return run.manifest
-    entries: list[dict[str, Any]] = run.manifest["skills"]
-    return next((s["hierarchy"] for s in entries if s["name"] == path), {})
+    entries: list[SkillEntry] = run.manifest["skills"]
+    return next((dict(s.hierarchy or {}) for s in entries if s.name == path), {})
 
 
-def _skill_entry(roles: Roles, path: str) -> dict[str, Any]:
+def _skill_entry(roles: Roles, path: str) -> SkillEntry:
     """Return a run's entry of a skill."""
     skill, inner = roles.skills[path], roles.levels.get(path)
     policy = ready_policy(skill) if inner is None else None
-    entry: dict[str, Any] = {"name": path, "max_steps": skill.max_steps}
-    entry["ready"] = policy is not None
-    if skill.call_steps is not None:
-        entry["call_steps"] = skill.call_steps
-    if skill.goal_space is not None:
-        goals_of(skill)  # a space that is not supported is named with its skill
-        entry["goal_space"] = space_to_json(skill.goal_space)
-    entry |= part_to_json(skill, roles[path].rest, f"skill {path!r}")
-    if isinstance(skill.policy, Residual) and (part := roles[path].part) is not None:
-        assert part.base is not None
-        entry["policy"] = source_of(part.base)
-    if inner is not None:
-        entry["hierarchy"] = _level_entry(roles, inner)
-    return entry if policy is None else entry | {"policy": source_of(policy)}
+    goals_of(skill)  # a space that is not supported is named with its skill
+    recorded, part = policy, roles[path].part
+    if policy is None and isinstance(skill.policy, Residual) and part is not None:
+        recorded = part.base
+    source: Any = None if recorded is None else source_of(recorded)
+    level: Any = None if inner is None else _level_entry(roles, inner)
+    return SkillEntry(
+        path,
+        skill.max_steps,
+        ready=policy is not None,
+        call_steps=skill.call_steps,
+        goal_space=None if skill.goal_space is None else space_to_json(skill.goal_space),
+        policy=source,
+        hierarchy=level,
+        **part_to_json(skill, roles[path].rest, f"skill {path!r}"),
+    )
 
 
 def _level_entry(roles: Roles, level: Level) -> dict[str, Any]:

@@ -201,7 +201,7 @@ def _weights(run: RunDirectory) -> str:
     """Return a checksum of the weights of all skills of a run."""
     latest: dict[str, str] = {}
     for stage in run.manifest["stages"]:
-        one = {name: stage.get("sha256", "") for name in stage["learns"]}
-        latest |= stage.get("policies") or one
+        one = dict.fromkeys(stage.learns, stage.sha256 or "")
+        latest |= stage.policies or one
     skills = sorted((name, sha) for name, sha in latest.items() if name not in (SELECTOR, CRITIC))
     return hashlib.sha256(repr(skills).encode()).hexdigest()

@@ -101,8 +101,8 @@ def _use(run: RunDirectory, name: str) -> str:
         "comes with them.",
     ]
     skills = run.manifest.get("skills", ())
-    if stays := [s for s in skills if s.get("policy", {}).get("kind") == "onnx"]:
-        names = ", ".join(text(s["name"]) for s in stays)
+    if stays := [s for s in skills if s.policy and s.policy["kind"] == "onnx"]:
+        names = ", ".join(text(s.name) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)
 

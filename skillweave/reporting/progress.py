@@ -8,12 +8,13 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, Self
 
 import numpy as np
 
 from skillweave.reporting.displays import Display, Row, open_display
+from skillweave.runs.manifest import StageEntry
 from skillweave.terminal import printable, say
 from skillweave.training.episodes import INFO
 
@@ -64,13 +65,13 @@ class Progress:
             self._display.close()
             self._display = None
 
-    def plan(self, stages: Iterable[Mapping[str, Any]]) -> None:
+    def plan(self, stages: Iterable[StageEntry]) -> None:
         """Set all stages of the run, as its manifest lists them."""
         for stage in stages:
-            self._plan[stage["name"]] = int(stage["budget"])
-            if stage["status"] == "done":
-                self._spent[stage["name"]] = int(stage["steps"]), float(stage["seconds"])
-                self._over.add(stage["name"])
+            self._plan[stage.name] = stage.budget
+            if stage.done:
+                self._spent[stage.name] = stage.steps or 0, stage.seconds or 0.0
+                self._over.add(stage.name)
         self._several = len(self._plan) > 1
 
     def stage(self, name: str, budget: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol
 
 from skillweave.messages import shown_path
 from skillweave.runs.checkpoints import Checkpoints
+from skillweave.runs.manifest import RepairEntry
 
 Caller = Literal["command line", "hierarchy", "agent", "train_agent"]
 """The user's entry point: a command, or a Python function."""
@@ -62,17 +63,17 @@ def resume_words(run: RunLike, *more: str) -> str:
     if from_command_line():
         return command_words("resume", run)
     for entry in run.manifest.get("stages", ()):
-        if "repair" in entry and "kept" not in entry:
-            return repair_words(entry["repair"], run)
+        if entry.repair is not None and entry.kept is None:
+            return repair_words(entry.repair, run)
     seed = [f"seed={run.manifest['seed']}"] if run.manifest.get("seed") else []
     return _call(run, ", ".join([python_string(shown_path(run.path)), *seed, "resume=True", *more]))
 
 
-def repair_words(repair: Mapping[str, Any], run: RunLike) -> str:
+def repair_words(repair: RepairEntry, run: RunLike) -> str:
     """Return the line of Python that continues a repair."""
-    given = [python_string(repair["skill"]), f"after={python_string(repair['after'])}"]
+    given = [python_string(repair.skill), f"after={python_string(repair.after)}"]
     given.append(f"run_dir={python_string(shown_path(run.path))}")
-    given += ["done=…"] if repair["done"] else []
+    given += ["done=…"] if repair.done else []
     return f"run.repair({', '.join(given)}, resume=True)"
 
 
@@ -111,7 +112,7 @@ def saved_words(run: RunLike) -> str:
         return f"saved at {header.steps:,} steps of {header.stage}"
     stages = run.manifest["stages"]
     for stage in stages:
-        if stage["status"] != "done" and (continued := stage.get("continued")):
-            return f"saved at {continued[-1]:,} steps of {stage['name']}"
-    done = [stage["name"] for stage in stages if stage["status"] == "done"]
+        if not stage.done and stage.continued:
+            return f"saved at {stage.continued[-1]:,} steps of {stage.name}"
+    done = [stage.name for stage in stages if stage.done]
     return f"saved after {done[-1]}" if done else "saved at the start"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal, NotRequired, TypedDict
+from dataclasses import dataclass
+from typing import Literal
 
 from skillweave.schema import AtLeastOne
 
@@ -28,45 +28,33 @@ _WORDS = {
 }
 
 
-class Comparison(TypedDict):
+@dataclass(frozen=True)
+class Comparison:
     """The hierarchy that a stage ended with, and the mean returns of the compared ones."""
 
-    before: NotRequired[float]
-    greedy: NotRequired[float]
-    skills_sample: NotRequired[float]
-    selector_samples: NotRequired[float]
-    both_sample: NotRequired[float]
-    episodes: NotRequired[AtLeastOne]
-    """Episodes of each candidate; absent: training was too short for a comparison."""
-    sentence: NotRequired[str]
-    """The result of a repair, which is compared by calls."""
     kept: Candidate
+    before: float | None = None
+    greedy: float | None = None
+    skills_sample: float | None = None
+    selector_samples: float | None = None
+    both_sample: float | None = None
+    episodes: AtLeastOne | None = None
+    """Episodes of each candidate; None: training was too short for a comparison."""
+    sentence: str | None = None
+    """The result of a repair, which is compared by calls."""
 
-
-def comparison_words(kept: Mapping[str, Any]) -> str:
-    """Return a sentence on the compared hierarchies and the kept one."""
-    if "sentence" in kept:
-        return str(kept["sentence"])
-    if "episodes" not in kept:
-        return (
-            "too few steps to compare greedy and sampling in episodes: unless Selection sets it, "
-            "skills sample, and the selector is greedy"
+    def __str__(self) -> str:
+        """Return a sentence on the compared hierarchies and the kept one."""
+        if self.sentence is not None:
+            return self.sentence
+        if self.episodes is None:
+            return (
+                "too few steps to compare greedy and sampling in episodes: unless Selection sets "
+                "it, skills sample, and the selector is greedy"
+            )
+        returns = ", ".join(
+            f"{words} {mean:.4g}"
+            for name, words in _WORDS.items()
+            if (mean := getattr(self, name)) is not None
         )
-    returns = ", ".join(f"{words} {kept[k]:.4g}" for k, words in _WORDS.items() if k in kept)
-    return f"mean return {returns} ({kept['episodes']} episodes each); kept: {_WORDS[kept['kept']]}"
-
-
-def best_words(best: Mapping[str, Any]) -> str:
-    """Return a sentence on the evaluation whose weights a stage ended with (``keep="best"``)."""
-    what = "mean return" if best["of"] == "return" else "share of successes"
-    return (
-        f"kept the weights of step {best['steps']:,}, whose evaluation was best: "
-        f"{what} {best['value']:.4g}"
-    )
-
-
-def needs_comparison(entry: Mapping[str, Any]) -> bool:
-    """Return whether a stage of a run must end with the best of several hierarchies."""
-    if "repair" in entry:
-        return True
-    return entry["kind"] == "together" and bool(entry["compared"] or entry["greedy_judged"])
+        return f"mean return {returns} ({self.episodes} episodes each); kept: {_WORDS[self.kept]}"

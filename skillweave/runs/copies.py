@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from skillweave.policies.files import read_file
 from skillweave.runs.directory import RunDirectory, file_name
@@ -28,14 +27,14 @@ def policy_at_start(run: RunDirectory, skill: str, policy: Policy) -> Policy:
     Raises:
         RunError: the policy has changed, and the run holds no copy.
     """
-    entry: dict[str, Any] = next((s for s in run.manifest["skills"] if s["name"] == skill), {})
+    recorded = next((s.policy for s in run.manifest["skills"] if s.name == skill), None)
 
     def read() -> bytes | None:
         assert isinstance(policy, Foreign)
         path = _copy_path(run, skill, policy)
         return read_file(path) if path.exists() else None
 
-    return as_recorded(policy, entry.get("policy"), read, f"{run.path}: skill {skill!r}")
+    return as_recorded(policy, recorded, read, f"{run.path}: skill {skill!r}")
 
 
 def _copy_path(run: RunDirectory, skill: str, policy: Foreign) -> Path:

@@ -39,7 +39,6 @@ from skillweave.messages import absolute, shown_path
 from skillweave.policies.files import shown
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import load_words, resume_words, saved_words
-from skillweave.runs.comparison import needs_comparison
 from skillweave.runs.files import (
     TEMPORARY,
     check_unchanged,
@@ -59,6 +58,8 @@ from skillweave.runs.manifest import (
     Checkpoint,
     LineageLine,
     MetricsLine,
+    StageEntry,
+    as_json,
     identity,
     read_manifest,
     versions,
@@ -136,7 +137,7 @@ class RunDirectory:
     def num_envs(self) -> int | None:
         """Return the largest number of training environments of all stages; None: no stages."""
         stages = self.manifest["stages"]
-        return max((int(s["algorithm"]["num_envs"]) for s in stages), default=None)
+        return max((s.num_envs for s in stages), default=None)
 
     @classmethod
     def create(
@@ -248,47 +249,45 @@ class RunDirectory:
         for directory in (self.path, *(self.path / name for name in folders)):
             for path in directory.glob(TEMPORARY):
                 remove(path)
-        self._checkpoints.clear(
-            [s["name"] for s in self.manifest["stages"] if s["status"] == "done"]
-        )
+        self._checkpoints.clear([s.name for s in self.manifest["stages"] if s.done])
 
     def save(self) -> None:
         """Write ``run.json``."""
         self.check()
-        write_json(self.path / "run.json", self.manifest, make_directories=False)
+        write_json(self.path / "run.json", as_json(self.manifest), make_directories=False)
 
     def check(self) -> None:
         """Raise a RunError where the directory was deleted during the training."""
         if self._lock is not None:
             self._lock.check()
 
-    def stage(self, name: str) -> dict[str, Any]:
+    def stage(self, name: str) -> StageEntry:
         """Return the manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
-        entries: list[dict[str, Any]] = self.manifest["stages"]
+        entries: list[StageEntry] = self.manifest["stages"]
         for entry in entries:
-            if entry["name"] == name:
+            if entry.name == name:
                 return entry
-        names = ", ".join(entry["name"] for entry in entries)
+        names = ", ".join(entry.name for entry in entries)
         raise RunError(f"{self.path} has no stage {shown(name)}; it has: {names}")
 
     @property
     def finished(self) -> bool:
         """Return whether every stage is done, and compared at its end where it must be."""
-        done = all(p["status"] == "done" for p in self.manifest["stages"])
+        done = all(s.done for s in self.manifest["stages"])
         return done and not self.lacks_comparison
 
     @property
     def has_learnt(self) -> bool:
         """Return whether a new run in its place would lose results of training."""
         stages = self.manifest["stages"]
-        done = any(s["status"] == "done" or s.get("continued") for s in stages)
+        done = any(s.done or s.continued for s in stages)
         return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
 
     @property
     def lacks_comparison(self) -> bool:
         """Return whether the comparison that chooses the best hierarchy is still missing."""
         stages = self.manifest["stages"]
-        return any("kept" not in s and needs_comparison(s) for s in stages)
+        return any(s.kept is None and s.needs_comparison for s in stages)
 
     def save_checkpoint(
         self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
@@ -365,7 +364,7 @@ class RunDirectory:
         checkpoint = self._checkpoints.load(stage, self.must_be_ours)
         if checkpoint is None and (final := self._final(stage)) is not None:
             entry = self.stage(stage)
-            if entry.get("continued") or final[1].steps >= entry["budget"]:
+            if entry.continued or final[1].steps >= entry.budget:
                 checkpoint = final
         if checkpoint is None:
             return None
@@ -393,10 +392,11 @@ class RunDirectory:
             raise RunError(f"{path} holds the state of stage {shown(header.stage)}")
         self.must_be_ours(header.run, path)
         entry = self.stage(stage)
-        if header.steps == (entry.get("continued") or [None])[-1]:
+        if entry.continued[-1:] == [header.steps]:
             # Since then, other stages have added lines and evaluations.
             header.metrics_bytes = header.lineage_bytes = None
-            header.evaluation_steps = entry.get("evaluation_steps", header.evaluation_steps)
+            if entry.evaluation_steps is not None:
+                header.evaluation_steps = entry.evaluation_steps
         return tensors, header, path
 
     def final_tensors(self, stage: str) -> list[str]:
@@ -420,9 +420,9 @@ class RunDirectory:
             header |= self.place(stage)
             sums[name] = write_tensors(path, tensors, header, make_directories=False)
         if list(sums) == [stage]:
-            entry["sha256"] = sums[stage]
+            entry.sha256 = sums[stage]
         else:
-            entry["policies"] = sums
+            entry.policies = sums
 
     def place(self, stage: str) -> dict[str, str]:
         """Return the part of a file's header that names its stage and run."""
@@ -436,7 +436,7 @@ class RunDirectory:
     def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
         """Return a finished stage's policies by name; raise the errors of ``load_policy``."""
         entry = self.stage(stage)
-        names = [stage] if entry.get("policies") is None else entry["policies"]
+        names = entry.policies or [stage]
         return {name: self.load_policy(stage, name) for name in names}
 
     def load_policy(self, stage: str, name: str | None = None) -> AgentPolicy:
@@ -446,7 +446,7 @@ class RunDirectory:
             RunError: the stage is not finished, or its file is damaged.
         """
         entry = self.stage(stage)
-        if entry["status"] != "done":
+        if not entry.done:
             raise RunError(
                 f"{self.path} is not finished: its stage {stage!r} is not done "
                 f"({saved_words(self)}). Continue it: {resume_words(self)}"
@@ -458,7 +458,7 @@ class RunDirectory:
         if (of := header.get("stage")) != stage:
             raise RunError(f"{path} holds the policy of stage {shown(of)}")
         self.must_be_ours(header.get("run"), path)
-        known = entry.get("policies", {}).get(name, entry.get("sha256"))
+        known = entry.policies.get(name or "", entry.sha256)
         check_unchanged(path, sha256, known)
         return AgentPolicy.from_file(tensors, header, str(path))
 
@@ -475,6 +475,10 @@ class RunDirectory:
         """Return the sizes of ``metrics.jsonl`` and ``lineage.jsonl``, for ``rewind``."""
         return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
 
+    def record_lines(self, entry: StageEntry) -> None:
+        """Record the sizes of ``line_bytes`` in a stage's entry."""
+        entry.metrics_bytes, entry.lineage_bytes = self._metrics.size, self.lineage.size
+
     def rewind(self, at: Mapping[str, int]) -> list[str]:
         """Drop the lines after the sizes of ``line_bytes``: training writes them again.
 
@@ -486,13 +490,13 @@ class RunDirectory:
         """
         lacking = []
         for key, lines in zip(LINES, (self._metrics, self.lineage), strict=True):
-            entries = [entry for entry in self.manifest["stages"] if key in entry]
-            least = max([at.get(key, 0), *(entry[key] for entry in entries)])
+            entries = [s for s in self.manifest["stages"] if getattr(s, key) is not None]
+            least = max([at.get(key, 0), *(getattr(entry, key) for entry in entries)])
             lines.rewind(at.get(key))
             if lines.size < least:
                 lacking.append(lines.path.name)
                 for entry in entries:
-                    entry[key] = min(entry[key], lines.size)
+                    setattr(entry, key, min(getattr(entry, key), lines.size))
         return lacking
 
     def _next_step(self) -> str:
@@ -517,8 +521,8 @@ class RunDirectory:
 def _check_file_names(manifest: Mapping[str, Any]) -> None:
     """Raise a DeclarationError where the name of a policy's file would be too long."""
     for entry in manifest["stages"]:
-        for name in (entry["name"], *entry["learns"]):
-            file = _policy_file(entry["name"], name)
+        for name in (entry.name, *entry.learns):
+            file = _policy_file(entry.name, name)
             if len(file) + MORE > LONGEST_NAME:
                 raise DeclarationError(
                     f"the weights of {shown(name, 100)} would be in a file whose name has "
@@ -572,7 +576,7 @@ def _check_replaceable(path: Path, run: RunDirectory | None) -> None:
 
 def _copies(run: RunDirectory) -> tuple[str, ...]:
     """Return patterns of the files of ready policies in a run."""
-    return tuple(f"{s['name'].replace('/', '.')}.*" for s in run.manifest.get("skills", ()))
+    return tuple(f"{file_name(s.name)}.*" for s in run.manifest.get("skills", ()))
 
 
 def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:

@@ -151,13 +151,12 @@ def _whole_text(text: str) -> str:
         return text.encode("utf-8", "backslashreplace").decode()
 
 
-def read_json(
-    path: Path, check: Callable[[dict[str, Any]], object] | None = None
-) -> dict[str, Any]:
-    """Return a JSON file written by ``write_json``, without its checksum.
+def read_json(path: Path, convert: Callable[[dict[str, Any]], Any] | None = None) -> Any:
+    """Return the content of a JSON file written by ``write_json``.
 
     Args:
-        check: checks the content before the checksum, for a more specific error.
+        convert: makes what is returned from the content. It comes before the checksum is
+            compared, for a more specific error; None: a dict is returned, without checksum.
 
     Raises:
         RunError: missing, damaged, altered, no plain file, or of a newer schema.
@@ -166,13 +165,12 @@ def read_json(
     if not isinstance(data, dict):
         raise RunError(f"{path} is damaged: not a JSON object")
     check_schema(data, path)
-    if check is not None:
-        check(data)
+    found = data if convert is None else convert(data)
     if data.pop("sha256", None) != _json_digest(data):
         raise RunError(
             f"{path} is damaged: its contents do not match its checksum (edited by hand?)"
         )
-    return data
+    return found
 
 
 def _json_digest(data: Mapping[str, Any]) -> str:

@@ -25,6 +25,7 @@ from skillweave.runs.files import (
     remove,
     write_tensors,
 )
+from skillweave.runs.manifest import StageEntry, Start
 
 
 @dataclass(frozen=True)
@@ -61,18 +62,18 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
     """
     run = RunDirectory.open(path)
     learnt = dict[str, Learnt]()
-    if run.lacks_comparison and all(entry["status"] == "done" for entry in run.manifest["stages"]):
+    if run.lacks_comparison and all(entry.done for entry in run.manifest["stages"]):
         raise RunError(
             f"start_from: {path} was stopped during the comparison at its end; finish it first: "
             f"{resume_words(run)}"
         )
     for entry in run.manifest["stages"]:
-        if entry["status"] != "done" or entry.get("kept", {}).get("kept") == "before":
+        if not entry.done or entry.undone:
             continue
-        sums = entry.get("policies") or {entry["name"]: entry.get("sha256")}
-        for name, policy in run.load_policies(entry["name"]).items():
+        sums = entry.policies or {entry.name: str(entry.sha256)}
+        for name, policy in run.load_policies(entry.name).items():
             sha256 = sums[name]
-            steps = entry["steps"] + (learnt[name].steps if name in learnt else 0)
+            steps = (entry.steps or 0) + (learnt[name].steps if name in learnt else 0)
             chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
             of_run = run.manifest.get("id"), chooses, part, run.manifest.get("code", {})
             learnt[name] = Learnt(policy, sha256, steps, str(path), *of_run)
@@ -82,8 +83,8 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
 def recorded_part(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """Return what a skill sees, what it acts on and its correction; None: of no skill."""
     for skill in manifest.get("skills", ()):
-        if skill["name"] == name:
-            return {key: skill.get(key) for key in ("sees", "acts", "residual")}
+        if skill.name == name:
+            return {key: getattr(skill, key) for key in ("sees", "acts", "residual")}
     return None
 
 
@@ -92,17 +93,17 @@ def options_of(manifest: Mapping[str, Any], name: str) -> Chooses:
     if not decides(name):
         return (), ()
     level = level_of(name)
-    paths = [skill["name"] for skill in manifest["skills"]]
+    paths = [skill.name for skill in manifest["skills"]]
     skills = tuple(name_of(path) for path in paths if level_of(path) == level)
     hierarchy: Mapping[str, Any] = manifest
     if level:
-        hierarchy = manifest["skills"][paths.index(level)]["hierarchy"]
+        hierarchy = manifest["skills"][paths.index(level)].hierarchy
     lengths = hierarchy.get("call_lengths", ()) if name_of(name) == SELECTOR else ()
     return skills, tuple(lengths)
 
 
 def record_initial_policies(
-    stages: list[dict[str, Any]], learnt: Mapping[str, Learnt], where: str
+    stages: list[StageEntry], learnt: Mapping[str, Learnt], where: str
 ) -> set[str]:
     """Record the initial policies in a new run's stages; return the names of their learners.
 
@@ -115,21 +116,20 @@ def record_initial_policies(
     """
     started: set[str] = set()
     for entry in stages:
-        names = [name for name in entry["learns"] if name in learnt and name not in started]
+        names = [name for name in entry.learns if name in learnt and name not in started]
         started |= set(names)
-        if names and entry.get("evolution") is not None:
+        if names and entry.evolution is not None:
             raise DeclarationError(
-                f"start_from: stage {entry['name']!r} evolves, and each member of a population "
+                f"start_from: stage {entry.name!r} evolves, and each member of a population "
                 f"begins with its own settings and networks, not with policies of {where}. Omit "
                 "start_from, or evolve only learners that are not in that run: evolve={...}"
             )
         if names:
-            entry["starts"] = {
-                name: {k: getattr(learnt[name], k) for k in ("sha256", "steps", "run")}
-                for name in names
+            entry.starts = {
+                name: Start((of := learnt[name]).sha256, of.steps, of.run) for name in names
             }
     if not started:
-        learners = sorted({name for entry in stages for name in entry["learns"]})
+        learners = sorted({name for entry in stages for name in entry.learns})
         raise RunError(
             f"start_from: no learner of this run has learnt in {where}: this run trains "
             f"{', '.join(learners)}, and that one has {', '.join(learnt) or 'no finished learner'}"
@@ -149,12 +149,12 @@ def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> No
     """
     try:
         for entry in run.manifest["stages"]:
-            for name, start in entry.get("starts", {}).items():
+            for name, start in entry.starts.items():
                 tensors, header = learnt[name].policy.to_file()
                 path = _path(run, name)
                 make_directory(path.parent)
-                header |= {"starts": name} | run.place(entry["name"])
-                start["copy"] = write_tensors(path, tensors, header, make_directories=False)
+                header |= {"starts": name} | run.place(entry.name)
+                start.copy = write_tensors(path, tensors, header, make_directories=False)
     except BaseException:
         shutil.rmtree(run.path / "starts", ignore_errors=True)
         raise
@@ -170,7 +170,7 @@ def initial_policy(
     Raises:
         RunError: the run's copy is missing, damaged, or belongs to another run.
     """
-    start = run.stage(stage).get("starts", {}).get(name)
+    start = run.stage(stage).starts.get(name)
     if start is None:
         return None
     path = _path(run, name)
@@ -182,16 +182,16 @@ def initial_policy(
     run.must_be_ours(header.get("run"), path)
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
-    check_unchanged(path, sha256, start["copy"])
+    check_unchanged(path, sha256, start.copy)
     policy = AgentPolicy.from_file(tensors, header, str(path))
     if not same_shapes(policy.algorithm, algorithm):
         raise RunError(f"{path} holds other networks than {name!r} has in this run")
-    return policy, start["steps"]
+    return policy, start.steps
 
 
 def remove_initial_policies(run: RunDirectory, stage: str) -> None:
     """Remove the initial policies of the learners of a finished stage."""
-    for name in run.stage(stage).get("starts", {}):
+    for name in run.stage(stage).starts:
         remove(_path(run, name))
     with suppress(OSError):  # it still holds others, or never existed
         (run.path / "starts").rmdir()

@@ -1,6 +1,6 @@
 """The schemas of a run's files: ``run.json``, lines of metrics and of lineages, checkpoints.
 
-To add a field, add a line; ``NotRequired`` if not every run has it.
+To add a field, add a line; with a default, or ``NotRequired``, if not every run has it.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from skillweave.algorithms.config import config_from_json
-from skillweave.errors import RunError
+from skillweave.errors import EnvError, RunError
 from skillweave.paths import names_in
 from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
@@ -62,28 +62,30 @@ class NestedEntry(TypedDict):
     call_cost: NonNegative
 
 
-class SkillEntry(TypedDict):
-    """The entry of a skill of the run, or of a hierarchy in it."""
+@dataclass(frozen=True)
+class SkillEntry:
+    """The entry of a skill of the run, or of a hierarchy in it; what is None is absent there."""
 
     name: NodePath
     max_steps: AtLeastOne | None
-    call_steps: NotRequired[AtLeastOne]
-    ready: NotRequired[bool]
-    policy: NotRequired[Source]
-    goal_space: NotRequired[dict[str, Any]]
+    ready: bool = False
+    call_steps: AtLeastOne | None = None
+    goal_space: dict[str, Any] | None = None
     """The space of its goals, if it has some."""
-    sees: NotRequired[Any]
+    sees: Any = None
     """The part of observations that it sees, and, below, of actions that it writes."""
-    acts: NotRequired[Any]
-    rest: NotRequired[Any]
+    acts: Any = None
+    rest: Any = None
     """The other numbers of the action."""
-    residual: NotRequired[Any]
+    residual: Any = None
     """The scale of a correction of ``policy``, which is ready, where the skill learns one."""
-    hierarchy: NotRequired[NestedEntry]
+    policy: Source | None = None
+    hierarchy: NestedEntry | None = None
     """Its parts, if the skill is a hierarchy."""
 
 
-class Winner(TypedDict):
+@dataclass(frozen=True)
+class Winner:
     """The member that won a population's stage."""
 
     member: Count
@@ -92,32 +94,65 @@ class Winner(TypedDict):
     generations: Count
 
 
-class TargetEntry(TypedDict):
-    """The target at which a stage may end before its budget is spent."""
+@dataclass(frozen=True)
+class Target:
+    """A value of the periodic evaluation at which a stage ends before its budget is spent."""
 
     of: Literal["return", "success"]
+    """The criterion: the mean return, or the share of episodes that succeed."""
     at_least: float
+    """The smallest value that reaches the target."""
+
+    def reached(self, evaluation: Mapping[str, float], stage: str) -> float | None:
+        """Return the value of an evaluation that reaches the target, else None.
+
+        Args:
+            evaluation: its metrics; empty: no evaluation.
+            stage: the stage's name, for messages.
+
+        Raises:
+            EnvError: the environment does not report which episodes succeed.
+        """
+        if not evaluation:
+            return None
+        if (value := evaluation.get(f"eval_{self.of}")) is None:
+            raise EnvError(
+                f"stage {stage!r} has target_success, but its environment does not report which "
+                "episodes succeed: set info['success'] in an episode's last step"
+            )
+        return value if value >= self.at_least else None
 
 
-class Reached(TypedDict):
+@dataclass(frozen=True)
+class Reached:
     """The steps and the value with which a stage reached its target."""
 
     steps: Count
     value: float
 
 
-class Stopped(TypedDict):
+@dataclass(frozen=True)
+class Stopped:
     """The steps at which a callback ended a stage."""
 
     steps: Count
 
 
-class Best(TypedDict):
+@dataclass(frozen=True)
+class Best:
     """The evaluation whose weights a stage ended with."""
 
     steps: Count
     of: Literal["return", "success"]
     value: float
+
+    def __str__(self) -> str:
+        """Return a sentence on it (``keep="best"``)."""
+        what = "mean return" if self.of == "return" else "share of successes"
+        return (
+            f"kept the weights of step {self.steps:,}, whose evaluation was best: "
+            f"{what} {self.value:.4g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -128,7 +163,8 @@ class BestSoFar:
     metrics: dict[str, float]
 
 
-class Start(TypedDict):
+@dataclass
+class Start:
     """The policy of another run with which a learner begins a stage."""
 
     sha256: str
@@ -137,11 +173,12 @@ class Start(TypedDict):
     """Environment steps of its training there."""
     run: str | None
     """The other run's ``id``."""
-    copy: str
-    """Checksum of this run's copy."""
+    copy: str | None = None
+    """Checksum of this run's copy; None: it is not written yet."""
 
 
-class Matrix(TypedDict):
+@dataclass(frozen=True)
+class Matrix:
     """Counts of calls, and of those that were done, by the skill before (``HandOver``)."""
 
     skills: list[str]
@@ -152,7 +189,8 @@ class Matrix(TypedDict):
     """Skills whose calls were done if they ended by themselves."""
 
 
-class RepairEntry(TypedDict):
+@dataclass
+class RepairEntry:
     """The repair of a skill after another one, at the end of a run that repairs."""
 
     skill: NodePath
@@ -163,16 +201,21 @@ class RepairEntry(TypedDict):
     """Skills whose calls were judged by an event that the caller gave."""
     blame: str
     """A sentence on the reason of the failure."""
-    bonus: NotRequired[NonNegative]
-    """Additional reward of each step in which the event that a call is for holds."""
-    rehearsal: NotRequired[str]
-    """Checksum of the file of its rehearsal's observations."""
     before: Matrix
-    later: NotRequired[Matrix]
+    bonus: NonNegative = 0.0
+    """Additional reward of each step in which the event that a call is for holds."""
+    rehearsal: str | None = None
+    """Checksum of the file of its rehearsal's observations; None: without rehearsal."""
+    later: Matrix | None = None
+    """The same after the repair; None: not measured yet."""
 
 
-class StageEntry(TypedDict):
-    """A stage: its learners, the policy that decides, its budget and its progress."""
+@dataclass
+class StageEntry:
+    """A stage: its learners, the policy that decides, its budget and its progress.
+
+    What is None or empty by default is absent in ``run.json`` then.
+    """
 
     name: NodePath
     kind: Literal["agent", "skill", "selector", "together"]
@@ -182,47 +225,89 @@ class StageEntry(TypedDict):
     """The policy that chooses among the skills; None: one policy acts all the time."""
     budget: AtLeastOne
     algorithm: dict[str, Any]
+    target: Target | None
+    """A target at which it ends early; None: without target."""
     status: Literal["waiting", "training", "done"]
-    workers: NotRequired[AtLeastOne]
-    evolution: NotRequired[dict[str, Any] | None]
-    target: NotRequired[TargetEntry | None]
-    reached: NotRequired[Reached]
-    stopped: NotRequired[Stopped]
-    best: NotRequired[Best]
-    metrics_bytes: NotRequired[Count]
-    lineage_bytes: NotRequired[Count]
-    steps: NotRequired[Count]
-    evaluation_steps: NotRequired[Count]
-    seconds: NotRequired[NonNegative]
-    steps_per_second: NotRequired[float]
-    final: NotRequired[dict[str, float | None]]
-    winner: NotRequired[Winner]
-    succeeded: NotRequired[bool]
-    """True if any call of the skill succeeded in training or evaluation; absent: unknown."""
-    sha256: NotRequired[str]
-    """Checksum of its policy's file."""
-    policies: NotRequired[dict[NodePath, str]]
-    """With several learners: checksums of their policies' files by name."""
-    together: NotRequired[dict[str, Any]]
-    """Settings of skills and selector learning together."""
-    algorithms: NotRequired[dict[NodePath, dict[str, Any]]]
+    together: dict[str, Any] | None = None
+    """Settings of skills and selector learning together; None: one learner, or a population."""
+    algorithms: dict[NodePath, dict[str, Any]] = field(default_factory=dict)
     """Settings of the skills that learn together with the selector."""
-    task_weights: NotRequired[dict[NodePath, NonNegative]]
+    task_weights: dict[NodePath, NonNegative] = field(default_factory=dict)
     """The weights of skills whose ``task_weight`` differs from the one of ``together``."""
-    guide_kl: NotRequired[Positive]
+    guide_kl: Positive | None = None
     """The largest KL of the selector to its guide."""
-    compared: NotRequired[bool]
+    compared: bool | None = None
     """Keep the jointly learnt weights only if they are better than the earlier ones."""
-    greedy_judged: NotRequired[bool]
+    greedy_judged: bool | None = None
     """At its end, evaluate whether skills and selector should act greedily or sample."""
-    kept: NotRequired[Comparison]
-    """The result of the comparison at its end."""
-    continued: NotRequired[list[Count]]
-    """Steps after which the stage had ended, before its budget was raised."""
-    starts: NotRequired[dict[NodePath, Start]]
+    evolution: dict[str, Any] | None = None
+    """Settings of its population."""
+    workers: AtLeastOne = 1
+    """Processes for its environments; parts of its population."""
+    starts: dict[NodePath, Start] = field(default_factory=dict)
     """Initial policies from other runs, by learner."""
-    repair: NotRequired[RepairEntry]
+    repair: RepairEntry | None = None
     """The stage repairs a skill that has learnt before."""
+    continued: list[Count] = field(default_factory=list)
+    """Steps after which the stage had ended, before its budget was raised."""
+    metrics_bytes: Count | None = None
+    lineage_bytes: Count | None = None
+    reached: Reached | None = None
+    stopped: Stopped | None = None
+    best: Best | None = None
+    steps: Count | None = None
+    """Environment steps of the training; None until it is done, as are the next three."""
+    evaluation_steps: Count | None = None
+    seconds: NonNegative | None = None
+    steps_per_second: float | None = None
+    final: dict[str, float | None] = field(default_factory=dict)
+    """The last metrics."""
+    winner: Winner | None = None
+    succeeded: bool | None = None
+    """True if any call of the skill succeeded in training or evaluation; None: unknown."""
+    sha256: str | None = None
+    """Checksum of its policy's file."""
+    policies: dict[NodePath, str] = field(default_factory=dict)
+    """With several learners: checksums of their policies' files by name."""
+    kept: Comparison | None = None
+    """The result of the comparison at its end."""
+
+    @property
+    def done(self) -> bool:
+        """True after its training."""
+        return self.status == "done"
+
+    @property
+    def members(self) -> int:
+        """The number of members of its population; 1 without one."""
+        return 1 if self.evolution is None else int(self.evolution["population"])
+
+    @property
+    def num_envs(self) -> int:
+        """The number of its training environments."""
+        return int(self.algorithm["num_envs"])
+
+    def forget_end(self) -> None:
+        """Wait again, without the results that training writes when it has continued."""
+        self.status = "waiting"
+        self.stopped = self.best = self.steps = self.seconds = self.steps_per_second = None
+        self.succeeded = self.sha256 = self.kept = None
+        self.final, self.policies = {}, {}
+
+    def forget_files(self) -> None:
+        """Forget what belongs to files of the run that it was trained in."""
+        self.metrics_bytes = self.lineage_bytes = self.sha256 = None
+        self.policies, self.starts, self.continued = {}, {}, []
+
+    @property
+    def needs_comparison(self) -> bool:
+        """True if it must end with the best of several hierarchies."""
+        return self.repair is not None or bool(self.compared or self.greedy_judged)
+
+    @property
+    def undone(self) -> bool:
+        """True if the weights before it were better, and were kept."""
+        return self.kept is not None and self.kept.kept == "before"
 
 
 class Manifest(TypedDict):
@@ -361,13 +446,14 @@ class Checkpoint:
 # Reading and writing ``run.json``
 
 
-def check_manifest(data: Mapping[str, Any], file: str) -> None:
-    """Raise a RunError that names the file and the field where a manifest is wrong."""
-    manifest = fit(Manifest, data, file)
+def _manifest_in(data: Mapping[str, Any], file: str) -> dict[str, Any]:
+    """Return a manifest; a RunError names the file and the field where it is wrong."""
+    manifest: dict[str, Any] = fit(Manifest, data, file)
     if manifest["kind"] == "hierarchy":
         manifest = fit(HierarchyManifest, data, file)
-    for kind in ("skills", "stages"):
-        names = [entry["name"] for entry in manifest.get(kind, [])]
+    named = ("skills", "stages") if manifest["kind"] == "hierarchy" else ("stages",)
+    for kind in named:
+        names = [entry.name for entry in manifest[kind]]
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise RunError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
@@ -377,17 +463,33 @@ def check_manifest(data: Mapping[str, Any], file: str) -> None:
         )
     for i, stage in enumerate(manifest["stages"]):
         where = f"stages[{i}]"
-        config_from_json(stage["algorithm"], file, f"{where}.algorithm")
-        if stage["status"] == "done" and not {"steps", "seconds"} <= set(stage):
+        config_from_json(stage.algorithm, file, f"{where}.algorithm")
+        if stage.done and None in (stage.steps, stage.seconds):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
-    if "sha256" not in data:
+    if manifest.pop("sha256", None) is None:
         raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
+    return manifest
 
 
 def read_manifest(run: Path) -> dict[str, Any]:
     """Return the checked content of a run's ``run.json``."""
     file = run / "run.json"
-    return read_json(file, lambda data: check_manifest(data, str(file)))
+    found: dict[str, Any] = read_json(file, lambda data: _manifest_in(data, str(file)))
+    return found
+
+
+def as_json(value: Any) -> Any:
+    """Return an entry as plain JSON, without fields that are None or empty by default."""
+    if is_dataclass(value):
+        return {
+            f.name: as_json(content)
+            for f in fields(value)
+            if (content := getattr(value, f.name)) not in (None, [], {})
+            or f.default is f.default_factory is MISSING
+        }
+    if isinstance(value, Mapping):
+        return {k: as_json(x) for k, x in value.items()}
+    return [as_json(x) for x in value] if isinstance(value, list | tuple) else value
 
 
 OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info", "code")
@@ -399,7 +501,7 @@ def identity(manifest: Mapping[str, Any]) -> str:
 
     Runs that must end with the same weights have the same.
     """
-    settings = {k: v for k, v in manifest.items() if k not in OF_NO_WEIGHT}
+    settings = {k: as_json(v) for k, v in manifest.items() if k not in OF_NO_WEIGHT}
     return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[
         :16
     ]

@@ -17,8 +17,8 @@ S = TypeVar("S")
 def learns_again(run: RunDirectory, stage: str, name: str) -> bool:
     """Return whether ``name`` also learns in a later stage."""
     stages = run.manifest["stages"]
-    at = [entry["name"] for entry in stages].index(stage)
-    return any(name in entry["learns"] for entry in stages[at + 1 :])
+    at = [entry.name for entry in stages].index(stage)
+    return any(name in entry.learns for entry in stages[at + 1 :])
 
 
 def save_state(run: RunDirectory, stage: str, name: str, state: Any) -> None:
@@ -45,14 +45,14 @@ def load_state(run: RunDirectory, name: str, like: S) -> S | None:
     if header.get("learns") != name:
         raise RunError(f"{path} does not hold the state of {name!r}")
     run.must_be_ours(header.get("run"), path)
-    if run.stage(header.get("stage", "")).get("kept", {}).get("kept") == "before":
+    if run.stage(header.get("stage", "")).undone:
         return None
     return state_from(tensors, like, str(path))
 
 
 def drop_states(run: RunDirectory, stage: str) -> None:
     """Remove the states of learners of this stage that do not learn in a later one."""
-    for name in run.stage(stage)["learns"]:
+    for name in run.stage(stage).learns:
         if not learns_again(run, stage, name):
             remove(state_path(run, name))
     with suppress(OSError):  # it still holds others, or never existed

@@ -17,6 +17,7 @@ from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import error_text, suggest
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import as_json
 from skillweave.terminal import say
 
 MLFLOW_EXPERIMENT = "skillweave"
@@ -129,7 +130,7 @@ class WandB:
             id=identifier(run),
             resume="allow",
             dir=str(run.path),
-            config=run.manifest,
+            config=as_json(run.manifest),
             mode=wandb_mode(),
             settings=wandb.Settings(silent=True),
         )
@@ -185,7 +186,7 @@ class MLflow:
                 "MLFLOW_TRACKING_URI, or train without this tracker"
             ) from error
         self._id: str = mlflow_run.info.run_id
-        stages = [stage["name"] for stage in run.manifest["stages"]]
+        stages = [stage.name for stage in run.manifest["stages"]]
         self._sent_steps = {s: mlflow_run.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
 
     def _existing(self, tag: str) -> Any:
@@ -212,7 +213,7 @@ class MLflow:
         )
         settings = {k: v for k, v in manifest.items() if not isinstance(v, dict | list)}
         for stage in manifest["stages"]:
-            settings |= flat(stage.get("algorithm", {}), f"{stage['name']}.")
+            settings |= flat(stage.algorithm, f"{stage.name}.")
         param = importlib.import_module("mlflow.entities").Param
         params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
         for i in range(0, len(params), MLFLOW_MOST_SETTINGS):
@@ -325,7 +326,7 @@ def track_film(run: RunDirectory, path: Path) -> None:
 
 def steps_of(run: RunDirectory) -> int:
     """Return the environment steps of all stages."""
-    return sum(stage.get("steps", 0) for stage in run.manifest["stages"])
+    return sum(stage.steps or 0 for stage in run.manifest["stages"])
 
 
 def wandb_mode() -> Any:

@@ -111,16 +111,16 @@ class TrainCallback:
         metrics: Mapping[str, float | None],
     ) -> TrainEvent:
         stages = self._run.manifest["stages"]
-        done = [s for s in stages if s["status"] == "done"]
-        budget = int(self._run.stage(name)["budget"])
-        passed = sum(int(s["budget"]) for s in done) + min(steps, budget)
+        done = [s for s in stages if s.done]
+        budget = self._run.stage(name).budget
+        passed = sum(s.budget for s in done) + min(steps, budget)
         return TrainEvent(
             kind=kind,
             stage=name,
             steps=steps,
             budget=budget,
-            total_steps=sum(int(s["steps"]) for s in done) + steps,
-            progress=passed / sum(int(s["budget"]) for s in stages),
+            total_steps=sum(s.steps for s in done) + steps,
+            progress=passed / sum(s.budget for s in stages),
             metrics={k: float(v) for k, v in metrics.items() if v is not None},
             run_dir=self._run.path,
         )

@@ -105,9 +105,8 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     path = run.path / _name(deterministic)
     if not path.exists():
         return None
-    data = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
-    content: EvaluationFile = fit(EvaluationFile, data, str(path))
-    names = {entry["name"] for entry in run.manifest.get("skills", [])}
+    content: EvaluationFile = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
+    names = {entry.name for entry in run.manifest.get("skills", [])}
     ours = content.get("run") == run.manifest.get("id")
     top_level = {names_in(name)[0] for name in content["evaluation"].skills}
     if not ours or not top_level <= names:  # a ready hierarchy's own skills are not the run's

@@ -27,6 +27,7 @@ from skillweave.ops.device import INT, resolve_device
 from skillweave.ops.threads import torch_threads
 from skillweave.paths import CRITIC, SELECTOR, decides, level_of, relative
 from skillweave.runs.initial_policies import initial_policy
+from skillweave.runs.manifest import StageEntry
 from skillweave.runs.states import load_state, state_path
 from skillweave.seeding import Seeds, global_generators
 from skillweave.training.joint_learner import JointLearner
@@ -42,7 +43,7 @@ from skillweave.types import Array, prefixed, unprefixed
 
 def agents_of(stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> OneAgent:
     """Return the learner of a stage without a population."""
-    kind = JointAgents if "together" in stage.entry else OneAgent
+    kind = JointAgents if stage.entry.together else OneAgent
     return kind(stage, make_collectors)
 
 
@@ -55,13 +56,11 @@ class JointAgents(OneAgent):
         """Make the learning algorithms; checkpoints hold their states under ``extra``."""
         entry = self.stage.entry
         learning_task = self.learning_task
-        self.together = Together(**entry["together"])
-        self.first: str = entry["decides"]
+        self.together = Together(**entry.together)
+        self.first: str = entry.decides
         self.level = level_of(self.first)
-        configs = {self.first: self.stage.config} if self.first in entry["learns"] else {}
-        configs |= {
-            name: config_from_json(settings) for name, settings in entry["algorithms"].items()
-        }
+        configs = {self.first: self.stage.config} if self.first in entry.learns else {}
+        configs |= {name: config_from_json(settings) for name, settings in entry.algorithms.items()}
         self.algorithms: dict[str, Algorithm] = {}
         for name, config in configs.items():
             grown, role = self._as_grown(name, config), learning_task.roles[name]
@@ -117,7 +116,7 @@ class JointAgents(OneAgent):
     def _guide_kl(self, name: str) -> float | None:
         """Return the KL within which a learner stays of its guide; None: without limit."""
         if name == self.first:
-            kl: float | None = self.stage.entry.get("guide_kl")
+            kl: float | None = self.stage.entry.guide_kl
             return kl
         return self.learning_task.roles[name].guide_kl
 
@@ -139,13 +138,13 @@ class JointAgents(OneAgent):
             if saved:
                 state = state_from(unprefixed(name, saved), state, f"{log.run.path}: {name}")
             stack = Stack(algorithm, state_to(state, device))
-            learnt_before = earlier is not None or name in self.stage.entry.get("starts", {})
+            learnt_before = earlier is not None or name in self.stage.entry.starts
             learner = self._learner(name, stack, log, learnt_before=learnt_before)
             if reference is not None:
                 learner.reference = reference  # type: ignore[attr-defined]
             keep_to_guide(learner, self._guide_kl(name))
             learners[name] = learner
-        weights = self.stage.entry["task_weights"]
+        weights = self.stage.entry.task_weights
         joint = JointLearner(learners, self.level, self.together.task_weight, weights)
         if extra:
             for name in learners:
@@ -175,8 +174,8 @@ class JointAgents(OneAgent):
         """Report a deleted file of a state."""
         latest = self._latest_stage(name)
         path = state_path(self.stage.run, name)
-        choice = latest.get("kept", {}).get("kept")
-        if latest and latest.get("evolution") is None and choice != "before" and not path.exists():
+        trained = latest is not None and latest.evolution is None and not latest.undone
+        if trained and not path.exists():
             log.message(
                 f"{path} is not there any more, so {name!r} continues with its weights alone, and "
                 "learns otherwise than without the interruption"
@@ -233,9 +232,9 @@ class JointAgents(OneAgent):
             learner.act_from_the_start()
         return learner
 
-    def _latest_stage(self, name: str) -> dict[str, Any]:
-        """Return the latest entry of a finished stage in which ``name`` has learnt, or {}."""
-        return next(reversed(self.stage.stages_before(name)), {})
+    def _latest_stage(self, name: str) -> StageEntry | None:
+        """Return the latest entry of a finished stage in which ``name`` has learnt, or None."""
+        return next(reversed(self.stage.stages_before(name)), None)
 
     def train(self, log: StageLog) -> dict[str, AgentPolicy]:
         """Learn until the stage is over, and report skills that learnt nothing."""
@@ -245,7 +244,7 @@ class JointAgents(OneAgent):
             if decides(name):
                 continue
             if rows and not updates:
-                learns = self.first in self.stage.entry["learns"]
+                learns = self.first in self.stage.entry.learns
                 more = "raise together.epsilon, " if learns else ""
                 log.message(
                     f"skill {name!r} acted in {rows:,} of {log.at.steps:,} steps only, too few "

@@ -163,4 +163,4 @@ class PlainAgent(Declared):
 
 def load_agent_of(run: RunDirectory) -> AgentPolicy:
     """Return the policy of a finished run of a plain agent."""
-    return run.load_policy(run.manifest["stages"][0]["name"])
+    return run.load_policy(run.manifest["stages"][0].name)

@@ -7,7 +7,6 @@ they failed, it is none. The observations were recorded before, so they cost no 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from skillweave.runs.files import (
     remove,
     write_tensors,
 )
+from skillweave.runs.manifest import StageEntry
 from skillweave.seeding import Seeds
 from skillweave.spaces import to_tensor
 from skillweave.training.learner import Learner, RolloutLearner
@@ -61,20 +61,22 @@ def save_rehearsal(run: RunDirectory, stage: str, obs: Array) -> None:
     tensors = {"obs": to_tensor(np.ascontiguousarray(obs))}
     header = {"kind": KIND} | run.place(stage)
     sha256 = write_tensors(path, tensors, header, make_directories=False)
-    run.stage(stage)["repair"]["rehearsal"] = sha256
+    repair = run.stage(stage).repair
+    assert repair is not None
+    repair.rehearsal = sha256
 
 
-def rehearse(learner: Learner, run: RunDirectory, entry: Mapping[str, Any], policy: Any) -> None:
+def rehearse(learner: Learner, run: RunDirectory, entry: StageEntry, policy: Any) -> None:
     """Let a learner keep what ``policy`` does in the observations of its stage's rehearsal, if any.
 
     Raises:
         RunError: the file is missing, damaged, or belongs to another run.
     """
-    recorded = entry.get("repair", {}).get("rehearsal")
+    recorded = None if entry.repair is None else entry.repair.rehearsal
     if recorded is None or not isinstance(learner, RolloutLearner):
         return
     assert isinstance(policy, AgentPolicy)
-    path = _path(run, entry["name"])
+    path = _path(run, entry.name)
     if not path.exists():
         raise RunError(
             f"{path} is missing: the repair keeps to it what the skill could do. Restore the file, "
@@ -103,10 +105,10 @@ def rehearsal_of(policy: AgentPolicy, obs: torch.Tensor, device: torch.device) -
     )
 
 
-def remove_rehearsal(run: RunDirectory, entry: Mapping[str, Any]) -> None:
+def remove_rehearsal(run: RunDirectory, entry: StageEntry) -> None:
     """Remove the observations of a finished stage's rehearsal, if it has one."""
-    if "rehearsal" in entry.get("repair", {}):
-        remove(_path(run, entry["name"]))
+    if entry.repair is not None and entry.repair.rehearsal is not None:
+        remove(_path(run, entry.name))
         with suppress(OSError):  # it still holds others
             (run.path / "starts").rmdir()
 

@@ -16,10 +16,11 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.algorithms.schedules import own_schedules
 from skillweave.collecting.start_methods import cannot_be_sent, runs_again, why_no_processes
 from skillweave.envs.make import EnvSpec, cores, workers_for
-from skillweave.errors import DeclarationError, EnvError, SkillweaveError, reworded
+from skillweave.errors import DeclarationError, SkillweaveError, reworded
 from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
 from skillweave.paths import SELECTOR, join
+from skillweave.runs.manifest import StageEntry, Target
 from skillweave.schema import AtLeastOne, Fraction, NonNegative, Positive, settings
 from skillweave.training.learning_task import LearningTask
 from skillweave.training.replay_learner import store_of
@@ -32,35 +33,6 @@ TOGETHER = "together"
 
 Policies = Mapping[str, Policy]
 """Policies by path: ready skills, and those that earlier stages trained."""
-
-
-@dataclass(frozen=True)
-class Target:
-    """A value of the periodic evaluation at which a stage ends before its budget is spent."""
-
-    of: Literal["return", "success"]
-    """The criterion: the mean return, or the share of episodes that succeed."""
-    at_least: float
-    """The smallest value that reaches the target."""
-
-    def reached(self, evaluation: Mapping[str, float], stage: str) -> float | None:
-        """Return the value of an evaluation that reaches the target, else None.
-
-        Args:
-            evaluation: its metrics; empty: no evaluation.
-            stage: the stage's name, for messages.
-
-        Raises:
-            EnvError: the environment does not report which episodes succeed.
-        """
-        if not evaluation:
-            return None
-        if (value := evaluation.get(f"eval_{self.of}")) is None:
-            raise EnvError(
-                f"stage {stage!r} has target_success, but its environment does not report which "
-                "episodes succeed: set info['success'] in an episode's last step"
-            )
-        return value if value >= self.at_least else None
 
 
 def target_of(
@@ -161,73 +133,67 @@ class Stage:
         configs = (self.config, *self.beside.values())
         return self.acts_by_code or any(own_schedules(config) for config in configs)
 
-    def entry(self) -> dict[str, Any]:
+    def entry(self) -> StageEntry:
         """Return the manifest's entry before training."""
         first = join(self.level, SELECTOR) if self.together else self.learner or self.name
-        entry: dict[str, Any] = {
-            "name": self.name,
-            "kind": self.kind,
-            "learns": [*([] if self.ready else [first]), *self.beside],
-            "decides": first if self.kind in ("selector", "together") else None,
-            "budget": self.budget,
-            "algorithm": config_to_json(self.config),
-            "target": None if self.target is None else asdict(self.target),
-            "status": "waiting",
-        }
-        if self.together is not None:
-            entry["together"] = asdict(self.together)
-            entry["algorithms"] = {k: config_to_json(v) for k, v in self.beside.items()}
-            entry["task_weights"] = dict(self.task_weights)
-        if self.guide_kl is not None:
-            entry["guide_kl"] = self.guide_kl
-        if self.kind == "together":
-            entry["compared"] = self.compared
-            entry["greedy_judged"] = self.greedy_judged
-        return entry
+        judged = self.kind == "together"
+        return StageEntry(
+            name=self.name,
+            kind=self.kind,
+            learns=[*([] if self.ready else [first]), *self.beside],
+            decides=first if self.kind in ("selector", "together") else None,
+            budget=self.budget,
+            algorithm=config_to_json(self.config),
+            target=self.target,
+            status="waiting",
+            together=None if self.together is None else asdict(self.together),
+            algorithms={k: config_to_json(v) for k, v in self.beside.items()},
+            task_weights=dict(self.task_weights),
+            guide_kl=self.guide_kl,
+            compared=self.compared if judged else None,
+            greedy_judged=self.greedy_judged if judged else None,
+        )
 
 
-def check_stages(
-    entries: Sequence[dict[str, Any]], eval_every: int | None, keep: str = "last"
-) -> None:
+def check_stages(entries: Sequence[StageEntry], eval_every: int | None, keep: str = "last") -> None:
     """Raise a DeclarationError where the settings of a manifest's stages do not fit together."""
-    alone = any(entry.get("evolution") is None for entry in entries)
+    alone = any(entry.evolution is None for entry in entries)
     if keep == "best" and eval_every is None and alone:
         raise DeclarationError(
             "keep is 'best', but nothing is evaluated while it trains: set eval_every to the "
             "environment steps between evaluations"
         )
     for entry in entries:
-        where = f"stage {entry['name']!r}"
-        population = entry.get("evolution")
+        where = f"stage {entry.name!r}"
+        evolves = entry.evolution is not None
         try:
-            resolve_device(entry["algorithm"].get("device", "cpu"))
+            resolve_device(entry.algorithm.get("device", "cpu"))
         except SkillweaveError as error:
             raise reworded(error, f"{where}: {error}") from error
-        members = 1 if population is None else population["population"]
-        starts = entry["algorithm"].get("learning_starts", 0)
-        budget = entry["budget"] // members
+        starts = entry.algorithm.get("learning_starts", 0)
+        budget = entry.budget // entry.members
         if budget <= starts:
-            each = " for each member" if members > 1 else ""
+            each = " for each member" if entry.members > 1 else ""
             raise DeclarationError(
                 f"{where}: its budget is {budget:,} steps{each}, but it begins to learn only after "
                 f"{starts:,} (learning_starts). Give it more steps, or start earlier"
             )
-        for name, algorithm in entry.get("algorithms", {}).items():
+        for name, algorithm in entry.algorithms.items():
             if budget <= (starts := algorithm.get("learning_starts", 0)):
                 raise DeclarationError(
                     f"{where}: its budget is {budget:,} steps, but {name!r} begins to learn only "
                     f"after {starts:,} (learning_starts). Give the stage more steps, or start "
                     "earlier"
                 )
-        target = entry.get("target")
-        if target is not None and population is not None and target["of"] != "return":
+        target = entry.target
+        if target is not None and evolves and target.of != "return":
             raise DeclarationError(
                 f"{where}: it evolves, and members are compared by their mean return, so its "
                 "target must be target_return"
             )
-        if target is not None and population is None and eval_every is None:
+        if target is not None and not evolves and eval_every is None:
             raise DeclarationError(
-                f"{where}: it has a target_{target['of']}, but is not evaluated while it trains: "
+                f"{where}: it has a target_{target.of}, but is not evaluated while it trains: "
                 "set eval_every to the environment steps between evaluations"
             )
 
@@ -236,7 +202,7 @@ ONE = "one collector (EnvSpec(workers=1), --collectors 1, Ray(collectors=1))"
 """Advice of messages where a stage cannot have several collectors."""
 
 
-def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any = None) -> None:
+def assign_workers(entries: Sequence[StageEntry], spec: EnvSpec, sent: Any = None) -> None:
     """Write the number of processes for its environments into each stage's entry.
 
     For a population it is the number of parts into which its members are split; without a declared
@@ -250,7 +216,7 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
         DeclarationError: a declared number does not divide ``num_envs``, or a population whose
             members learn on a GPU is to be split.
     """
-    alone = any(entry.get("evolution") is None for entry in entries)
+    alone = any(entry.evolution is None for entry in entries)
     workers = workers_for(spec) if alone else 1
     if workers > 1 and spec.workers is None:
         reason = why_no_processes() or runs_again() or cannot_be_sent((spec, sent))
@@ -262,54 +228,53 @@ def assign_workers(entries: Sequence[dict[str, Any]], spec: EnvSpec, sent: Any =
                 f"message, EnvSpec(workers={cores()}) uses processes"
             )
     for entry in entries:
-        num_envs = entry["algorithm"]["num_envs"]
-        if entry.get("evolution") is not None:
-            entry["workers"] = workers_of(entry, spec.workers or 1)
-            if entry["workers"] > 1 and entry["algorithm"].get("device") == "cuda":
+        num_envs = entry.num_envs
+        if entry.evolution is not None:
+            entry.workers = workers_of(entry, spec.workers or 1)
+            if entry.workers > 1 and entry.algorithm.get("device") == "cuda":
                 raise DeclarationError(
-                    f"stage {entry['name']!r}: device is 'cuda', but the parts of a population "
+                    f"stage {entry.name!r}: device is 'cuda', but the parts of a population "
                     f"learn on processors alone: set device='cpu', or have {ONE}"
                 )
         elif spec.workers is None:
             fitting = (k for k in range(workers, 0, -1) if num_envs % k == 0)
-            entry["workers"] = next(fitting)
+            entry.workers = next(fitting)
         elif num_envs % workers:
             raise DeclarationError(
-                f"stage {entry['name']!r}: num_envs is {num_envs}; it must be a multiple of "
+                f"stage {entry.name!r}: num_envs is {num_envs}; it must be a multiple of "
                 f"workers, {workers}, so that each has as many environments; or have {ONE}"
             )
         else:
-            entry["workers"] = workers
+            entry.workers = workers
 
 
-def workers_of(entry: Mapping[str, Any], requested: int) -> int:
+def workers_of(entry: StageEntry, requested: int) -> int:
     """Return a stage's number of workers for a requested one: at most one for each member."""
-    population = entry.get("evolution")
-    if population is None or requested <= 1:
+    if entry.evolution is None or requested <= 1:
         return requested
-    return min(requested, int(population["population"]))
+    return min(requested, entry.members)
 
 
-def check_replay(entry: dict[str, Any], role: Role) -> None:
+def check_replay(entry: StageEntry, role: Role) -> None:
     """Raise a DeclarationError where the replay buffer of a stage's learner cannot be made.
 
     A buffer that is larger than the free memory is a TrainingError.
 
     Args:
-        entry: the manifest's; "evolution" holds the number of members.
+        entry: the manifest's.
     """
-    config = config_from_json(entry["algorithm"])
+    config = config_from_json(entry.algorithm)
     algorithm = make_algorithm(config, role.observation_space, role.action_space)
     if algorithm.store != "replay":
         return
-    members = int((entry.get("evolution") or {"population": 1})["population"])
-    if members > 1 and entry.get("workers", 1) > 1:
+    members = entry.members
+    if members > 1 and entry.workers > 1:
         raise DeclarationError(
-            f"stage {entry['name']!r}: it evolves, and all members of {type(config).__name__} "
-            f"learn from one replay buffer, so they cannot be split into {entry['workers']} parts. "
+            f"stage {entry.name!r}: it evolves, and all members of {type(config).__name__} "
+            f"learn from one replay buffer, so they cannot be split into {entry.workers} parts. "
             f"Have {ONE}, take PPO, or name other stages: evolve={{...}}"
         )
     try:  # unwritten slots take no memory
         store_of(algorithm, config.num_envs * members, members, shared=members > 1)
     except SkillweaveError as error:
-        raise reworded(error, f"stage {entry['name']!r}: {error}") from error
+        raise reworded(error, f"stage {entry.name!r}: {error}") from error

@@ -14,10 +14,9 @@ from skillweave.messages import suggest
 from skillweave.notices import notice
 from skillweave.policies.files import shown
 from skillweave.runs.command_words import resume_words
-from skillweave.runs.comparison import best_words
 from skillweave.runs.directory import LINES, RunDirectory
 from skillweave.runs.initial_policies import remove_initial_policies
-from skillweave.runs.manifest import Checkpoint
+from skillweave.runs.manifest import Best, Checkpoint, Reached, StageEntry, Stopped
 from skillweave.runs.states import drop_states, learns_again, save_state
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
@@ -53,22 +52,14 @@ class Listener(Protocol):
         ...
 
 
-def never_succeeded(entry: Mapping[str, Any]) -> bool:
-    """Return True if a skill's stage has ended without a successful call.
-
-    False for skills without ``success``, and for populations.
-    """
-    return entry.get("succeeded") is False
-
-
-def success_rate(entry: Mapping[str, Any]) -> float:
+def success_rate(entry: StageEntry | None) -> float:
     """Return the share of a skill's calls that succeeded at the end of its stage.
 
-    1 for skills without ``success``, and for populations.
+    1 for skills without ``success``, for populations, and without a stage.
     """
-    if "succeeded" not in entry:
+    if entry is None or entry.succeeded is None:
         return 1.0
-    return max(entry["final"].get(k) or 0.0 for k in ("success", "eval_success"))
+    return max(entry.final.get(k) or 0.0 for k in ("success", "eval_success"))
 
 
 class StageLog:
@@ -88,21 +79,22 @@ class StageLog:
         self._callbacks = [x for x in listeners if isinstance(x, TrainCallback)]
         self._has_final = False
         # Before a stage trains, its entry has the size that the files had when it was last done.
-        is_new = self.entry["status"] != "training"
-        known = {} if is_new else self.entry
-        now = {k: v for k in LINES if (v := getattr(at, k)) is not None}
-        incomplete = run.rewind(known | now)
-        sizes = {} if is_new or incomplete else self.entry
-        self.entry.update(run.line_bytes() | sizes, status="training")
+        is_new = self.entry.status != "training"
+        known = (at,) if is_new else (self.entry, at)
+        sizes = {k: v for of in known for k in LINES if (v := getattr(of, k)) is not None}
+        incomplete = run.rewind(sizes)
+        if is_new or incomplete:
+            run.record_lines(self.entry)
+        self.entry.status = "training"
         run.save()
         for listener in listeners:
-            listener.stage(name, int(self.entry["budget"]))
+            listener.stage(name, self.entry.budget)
         for file in incomplete:
             self.message(f"{run.path / file} was removed or shortened: curves lack its lines")
 
     def tick(self, update: int, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write the report of an update, and pass it to listeners."""
-        name = self.entry["name"]
+        name = self.entry.name
         self.stands(update, steps, seconds)
         self.at.metrics = metrics
         header = {"stage": name, "update": update, "steps": steps}
@@ -122,7 +114,7 @@ class StageLog:
     def message(self, text: str) -> None:
         """Send a message about the stage to listeners."""
         for listener in self.listeners:
-            listener.message(f"{self.entry['name']}: {text}")
+            listener.message(f"{self.entry.name}: {text}")
 
     def report_reset(self, count: int, of: int) -> None:
         """Report that ``count`` of ``of`` environments could not repeat their open episodes."""
@@ -152,7 +144,7 @@ class StageLog:
 
     def _notify_callbacks(self) -> None:
         for callback in self._callbacks:
-            callback.checkpoint(self.entry["name"], self.at.steps, self.at.metrics)
+            callback.checkpoint(self.entry.name, self.at.steps, self.at.metrics)
 
     def report_absent(self, tally: EpisodeTally, *, over: bool) -> None:
         """Report once in a run the logged keys of ``info`` that never occurred.
@@ -200,16 +192,16 @@ class StageLog:
 
     def stopped(self) -> None:
         """Record that a callback has ended the stage."""
-        self.entry["stopped"] = {"steps": self.at.steps}
+        self.entry.stopped = Stopped(self.at.steps)
         self.message(
             f"the callback returned False after {self.at.steps:,} steps: the stage ends here"
         )
 
     def kept_best(self, best: KeepBest) -> None:
         """Record that the stage ends with the weights of its best evaluation."""
-        self.entry["best"] = {"steps": best.steps, "of": best.of, "value": best.value}
+        self.entry.best = Best(best.steps, best.of, best.value)
         self.at.metrics = self.at.metrics | best.metrics
-        self.message(best_words(self.entry["best"]))
+        self.message(str(self.entry.best))
 
     def save_final(
         self,
@@ -251,11 +243,12 @@ class StageLog:
 
     def reached(self, value: float) -> None:
         """Record that the stage has reached its target."""
-        self.entry["reached"] = {"steps": self.at.steps, "value": value}
-        target = self.entry["target"]
+        self.entry.reached = Reached(self.at.steps, value)
+        target = self.entry.target
+        assert target is not None
         self.message(
-            f"target reached after {self.at.steps:,} steps: {target['of']} {value:g}, "
-            f"the target is {target['at_least']:g}"
+            f"target reached after {self.at.steps:,} steps: {target.of} {value:g}, "
+            f"the target is {target.at_least:g}"
         )
 
     def done(self, policies: Mapping[str, AgentPolicy], states: Mapping[str, Any]) -> None:
@@ -267,37 +260,36 @@ class StageLog:
         entry = self.entry
         at = self.at
         for name, state in states.items():
-            if learns_again(self.run, entry["name"], name):
-                save_state(self.run, entry["name"], name, state)
+            if learns_again(self.run, entry.name, name):
+                save_state(self.run, entry.name, name, state)
         self._save_policies(policies)
         for name, policy in policies.items():
             policy.name_outliers(repr(name))
         if self._has_final:
-            self.run.keep_final(entry["name"])
-        entry.update(status="done", steps=at.steps, seconds=round(at.seconds, 3))
-        entry.update(self.run.line_bytes())  # so that a later stage notices removed lines
-        entry["evaluation_steps"] = at.evaluation_steps
-        entry.update(steps_per_second=round(at.steps / max(at.seconds, 1e-9), 1))
-        entry["final"] = at.metrics
-        if (succeeded := self._succeeded()) is not None:
-            entry["succeeded"] = succeeded
+            self.run.keep_final(entry.name)
+        entry.status, entry.steps, entry.seconds = "done", at.steps, round(at.seconds, 3)
+        self.run.record_lines(entry)  # so that a later stage notices removed lines
+        entry.evaluation_steps = at.evaluation_steps
+        entry.steps_per_second = round(at.steps / max(at.seconds, 1e-9), 1)
+        entry.final = dict(at.metrics)
+        entry.succeeded = self._succeeded()
         self.run.save()
-        if never_succeeded(entry):
+        if entry.succeeded is False:
             self.message(
                 "no call ended with success() true, so stages after this one build on a skill that "
                 "does not work. It may need more steps, a reward that leads there "
                 "step by step, or states nearer to it: start_calls, episode_calls, initiation()"
             )
         self.run.drop_checkpoints()
-        drop_states(self.run, entry["name"])
-        remove_initial_policies(self.run, entry["name"])
+        drop_states(self.run, entry.name)
+        remove_initial_policies(self.run, entry.name)
         remove_rehearsal(self.run, entry)
         for listener in self.listeners:
-            listener.done(entry["name"], at.steps, at.seconds, at.metrics)
+            listener.done(entry.name, at.steps, at.seconds, at.metrics)
 
     def _save_policies(self, policies: Mapping[str, AgentPolicy]) -> None:
         """Write the policies; on a full disk delete final states of earlier stages first."""
-        name = self.entry["name"]
+        name = self.entry.name
         try:
             self.run.save_policies(name, policies)
         except RunError:
@@ -311,13 +303,13 @@ class StageLog:
 
     def _succeeded(self) -> bool | None:
         """Return True if a call of the skill succeeded; None: unknown."""
-        if self.entry["kind"] != "skill" or self.entry.get("evolution"):
+        if self.entry.kind != "skill" or self.entry.evolution:
             return None
-        lines = [line for line in self.run.metrics() if line.get("stage") == self.entry["name"]]
+        lines = [line for line in self.run.metrics() if line.get("stage") == self.entry.name]
         shares = [line[k] for line in lines for k in ("success", "eval_success") if k in line]
         if wrong := [value for value in shares if type(value) not in (int, float)]:
             raise RunError(
-                f"{self.run.path / 'metrics.jsonl'}: {self.entry['name']!r} has a share of calls "
+                f"{self.run.path / 'metrics.jsonl'}: {self.entry.name!r} has a share of calls "
                 f"that succeeded of {shown(wrong[0])}, which is no number; remove that line, then "
                 f"{resume_words(self.run)}"
             )
@@ -338,5 +330,5 @@ def resumed(log: StageLog, restore: Callable[[], T]) -> T:
     except (KeyError, IndexError, ValueError, TypeError, RuntimeError, OverflowError) as error:
         raise RunError(
             f"{log.run.path}: training cannot continue from the checkpoint of stage "
-            f"{log.entry['name']!r}: {error!r}"
+            f"{log.entry.name!r}: {error!r}"
         ) from error

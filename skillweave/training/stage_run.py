@@ -13,10 +13,11 @@ from skillweave.algorithms.config import AlgorithmConfig, config_from_json
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.planning.recorder import Recorder
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import StageEntry, Target
 from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.stage import Policies, Target
+from skillweave.training.stage import Policies
 from skillweave.training.stage_log import StageLog
 
 
@@ -24,7 +25,7 @@ from skillweave.training.stage_log import StageLog
 class StageRun:
     """A stage in a run. The run's settings count: a resumed run keeps its first settings."""
 
-    entry: dict[str, Any]
+    entry: StageEntry
     """The stage's entry in the manifest."""
     run: RunDirectory
     seeds: Seeds
@@ -38,42 +39,41 @@ class StageRun:
     @property
     def name(self) -> str:
         """Name of the stage."""
-        return str(self.entry["name"])
+        return self.entry.name
 
     @property
     def learner(self) -> str:
         """Path of the learner, where there is one."""
-        return str(self.entry["learns"][0])
+        return self.entry.learns[0]
 
-    def stages_before(self, name: str) -> list[dict[str, Any]]:
+    def stages_before(self, name: str) -> list[StageEntry]:
         """Return the entries of finished stages in which a learner has learnt."""
         stages = self.run.manifest["stages"]
-        return [s for s in stages if name in s["learns"] and s["status"] == "done"]
+        return [s for s in stages if name in s.learns and s.done]
 
     def steps_before(self, name: str) -> int:
         """Return the environment steps of earlier stages in which a learner has learnt."""
-        return sum(s["steps"] for s in self.stages_before(name))
+        return sum(s.steps or 0 for s in self.stages_before(name))
 
     @property
     def config(self) -> AlgorithmConfig:
         """The algorithm's settings."""
-        return config_from_json(self.entry["algorithm"])
+        return config_from_json(self.entry.algorithm)
 
     @property
     def budget(self) -> int:
         """Budget in environment steps."""
-        return int(self.entry["budget"])
+        return self.entry.budget
 
     @property
     def continues(self) -> bool:
         """True for a finished stage that was given more steps."""
-        return bool(self.entry.get("continued"))
+        return bool(self.entry.continued)
 
     @property
     def target(self) -> Target | None:
         """The target at which the stage ends early; None: without target."""
-        target = self.entry.get("target")
-        return None if target is None else Target(**target)
+        return self.entry.target
 
     @property
     def best(self) -> KeepBest:

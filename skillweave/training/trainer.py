@@ -22,7 +22,7 @@ from skillweave.errors import DeclarationError
 from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
-from skillweave.runs.manifest import Checkpoint
+from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
@@ -50,7 +50,7 @@ class OneAgent:
     """
 
     def __init__(self, stage: StageRun, make_collectors: MakeCollectors = make_collectors) -> None:
-        if stage.entry.get("evolution") is not None:
+        if stage.entry.evolution is not None:
             raise DeclarationError(f"stage {stage.name!r} evolves: it needs a population to train")
         self.stage = stage
         self._resources = ExitStack()
@@ -63,7 +63,7 @@ class OneAgent:
         every = manifest.get("eval_every")
         episodes = manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
-        workers = int(stage.entry.get("workers", 1))
+        workers = stage.entry.workers
         make = partial(_seeded, self.maker(), stage.seeds / "global")
         self.collectors = self._make_collectors(
             make, config.num_envs, workers, 1, learning_task.name
@@ -114,9 +114,9 @@ class OneAgent:
             row_steps=stage.learning_task.row_steps,
             goes_on_at=log.at.steps,
         )
-        keep_to_guide(learner, stage.entry.get("guide_kl"))
+        keep_to_guide(learner, stage.entry.guide_kl)
         rehearse(learner, stage.run, stage.entry, stage.policies.get(stage.learner))
-        starts = stage.entry.get("starts", {})
+        starts = stage.entry.starts
         learnt_before = stage.learner in stage.policies or stage.name in starts
         if learnt_before and isinstance(learner, ReplayLearner):
             learner.act_from_the_start()
@@ -230,7 +230,7 @@ class OneAgent:
                 log.reached(float(log.at.metrics[f"eval_{target.of}"]))
         else:
             self._save_final(log, spent=True)
-            if self.stage.entry["kind"] == "skill" and self._is_unchanged():
+            if self.stage.entry.kind == "skill" and self._is_unchanged():
                 log.report_learnt_nothing()
         log.report_absent(self.episodes.tally, over=True)
         log.report_endless(self.episodes.tally)
@@ -286,10 +286,10 @@ class Course:
     done: Mapping[str, Any] | None = None
     """The events by which a repair is judged, as for ``planning.hand_over``."""
 
-    def tell(self, entry: Mapping[str, Any], text: str) -> None:
+    def tell(self, entry: StageEntry, text: str) -> None:
         """Send a message about a stage to the listeners."""
         for listener in self.listeners:
-            listener.message(f"{entry['name']}: {text}")
+            listener.message(f"{entry.name}: {text}")
 
     def train(self, stages: Sequence[Stage], policies: Policies) -> dict[str, Policy]:
         """Train stages one after another; return all policies after them, by path.
@@ -315,7 +315,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     """
     run = course.run
     entry = run.stage(stage.name)
-    if entry["status"] == "done":
+    if entry.done:
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
         remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
@@ -325,7 +325,7 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
         learning_task = replace(learning_task, log_info=tuple(keys))
     learning_task, recorder = begin_calls(run, entry, learning_task)
     learner = course.make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
-    evolves = entry.get("evolution") is not None
+    evolves = entry.evolution is not None
     with (
         global_generators(seeds / "global"),
         deferred("at the end of this generation" if evolves else "after this round"),

@@ -28,7 +28,7 @@ from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.cli.overrides import apply_overrides
 from skillweave.errors import DeclarationError
-from skillweave.runs.manifest import read_manifest
+from skillweave.runs.manifest import as_json, read_manifest
 from skillweave.seeding import Seeds
 
 KINDS = (PPO, SelfImitationPPO, SkillCritic, DQN, SAC, TD3)
@@ -171,7 +171,7 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
     from skillweave import named
 
     monkeypatch.setattr(named, "_KNOWN", {})
-    agent = sw.Agent.from_manifest(manifest)
+    agent = sw.Agent.from_manifest(as_json(manifest))
     assert agent.load(run.path).policy is not None
     with pytest.raises(
         DeclarationError, match="a function of your own, and its code is not loaded"

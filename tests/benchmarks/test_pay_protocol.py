@@ -445,7 +445,8 @@ def test_where_a_run_is_needed_its_result_does_not_count_before_it_is_over(tmp_p
     bench.run("flat", ["right"])
     first = suite().tasks[0]
     assert bench._found(first, FLAT, 512, keep=True) is not None
-    half = SimpleNamespace(manifest={"stages": [{"status": "done"}, {"status": "training"}]})
+    stages = [SimpleNamespace(done=True), SimpleNamespace(done=False)]
+    half = SimpleNamespace(manifest={"stages": stages})
     with monkeypatch.context() as changed:
         changed.setattr(agents.RunDirectory, "open", lambda path: half)
         assert bench._found(first, FLAT, 512, keep=True) is None

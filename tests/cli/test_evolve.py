@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_runs import stage_entry
 
 from skillweave import Evolution, Hierarchy, Range, Skill, Tournament, Truncation
 from skillweave.cli.main import main
@@ -99,15 +100,15 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recipe_evolves_and_says_how_it_went(run: Path):
-    stages = {p["name"]: p for p in RunDirectory.open(run).manifest["stages"]}
-    assert {n: p["budget"] for n, p in stages.items()} == {
+    stages = {p.name: p for p in RunDirectory.open(run).manifest["stages"]}
+    assert {n: p.budget for n, p in stages.items()} == {
         "left": 3 * 128, "right": 2 * 128, "selector": 3 * 128,
     }  # fmt: skip
     for name, stage in stages.items():
         lineage = read_lineage(RunDirectory.open(run), name)
         assert lineage is not None
-        assert lineage.winner.member == stage["winner"]["member"]
-        assert lineage.winner.generation == stage["winner"]["generation"]
+        assert lineage.winner.member == stage.winner.member
+        assert lineage.winner.generation == stage.winner.generation
 
 
 def test_the_winners_family_tree_reaches_back_to_the_start(run: Path):
@@ -147,7 +148,7 @@ def test_a_run_without_populations_shows_how_its_agents_learnt(tmp_path):
 
 
 def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
-    stage = {"name": "inner/hop", "kind": "skill", "learns": ["inner/hop"], "status": "done"}
+    stage = stage_entry("inner/hop")
     directory = RunDirectory.create(tmp_path / "run", {"kind": "hierarchy", "stages": [stage]})
     for steps in (100, 200):
         directory.log({"stage": "inner/hop", "steps": steps, "return": 1.0})

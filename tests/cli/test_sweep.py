@@ -73,8 +73,7 @@ def test_each_combination_is_trained_with_each_seed_and_none_twice(capsys, asked
     names = [f"selector.gamma={g}-s{s}" for g in (0.9, 0.99) for s in (0, 1)]
     assert trained == names
     gammas = [
-        RunDirectory.open(run["run"]).stage("selector")["algorithm"]["gamma"]
-        for run in first["runs"]
+        RunDirectory.open(run["run"]).stage("selector").algorithm["gamma"] for run in first["runs"]
     ]
     assert gammas == [0.9, 0.9, 0.99, 0.99]
     assert [g["settings"] for g in first["groups"]] == ["selector.gamma=0.9", "selector.gamma=0.99"]
@@ -98,7 +97,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(capsys, asked, trained, 
     assert trained == ["s3"]
     assert found["runs"][0]["return"] == whole["runs"][0]["return"]
     ends = [RunDirectory.open(r["runs"][0]["run"]).stage("selector") for r in (whole, found)]
-    assert ends[0]["sha256"] == ends[1]["sha256"]
+    assert ends[0].sha256 == ends[1].sha256
 
 
 def test_runs_of_other_settings_are_not_taken_for_these(capsys, asked, trained):

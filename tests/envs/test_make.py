@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from small_runs import stage_entry
 
 from skillweave.envs import make
 from skillweave.envs.make import EnvSpec, workers_for
@@ -58,24 +59,22 @@ def test_a_step_is_timed_by_a_few_steps_if_it_is_slow(
     assert Slow.steps == most
 
 
-def entry(name: str, num_envs: int, **more):
-    return {"name": name, "algorithm": {"num_envs": num_envs}} | more
-
-
 def test_where_every_stage_evolves_nothing_is_measured():
     def never():
         raise AssertionError("an environment was made")
 
-    entries = [entry("one", 4, evolution={}), entry("other", 6, evolution={})]
+    entries = [stage_entry(name, evolution={}) for name in ("one", "other")]
     assign_workers(entries, EnvSpec(never, engine="sync"))
-    assert [e["workers"] for e in entries] == [1, 1]
+    assert [e.workers for e in entries] == [1, 1]
 
 
 def test_a_measured_number_is_lowered_to_one_that_divides_the_environments(monkeypatch):
     monkeypatch.setattr("skillweave.training.stage.workers_for", lambda spec: 4)
-    entries = [entry("one", 4, evolution={}), entry("two", 6), entry("three", 8, evolution=None)]
+    entries = [stage_entry("one", evolution={}), stage_entry("two"), stage_entry("three")]
+    for entry, num_envs in zip(entries, (4, 6, 8), strict=True):
+        entry.algorithm["num_envs"] = num_envs
     assign_workers(entries, EnvSpec("CartPole-v1"))
-    assert [e["workers"] for e in entries] == [1, 3, 4]
+    assert [e.workers for e in entries] == [1, 3, 4]
 
 
 class Unseen(gym.Env):

@@ -144,7 +144,7 @@ def test_a_skill_keeps_to_its_own_reward_where_it_says_so():
 
     (stage,) = declare(One(), Own()).stages()
     assert stage.task_weights == {"own": 0.0}
-    assert stage.entry()["task_weights"] == {"own": 0.0}
+    assert stage.entry().task_weights == {"own": 0.0}
     alone = declare(Own()).stages()[0]
     assert "skill_critic" not in alone.beside, "no skill needs what the critic says"
 

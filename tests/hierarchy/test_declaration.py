@@ -9,6 +9,7 @@ import pytest
 import torch
 from declaring import plainly, skills_with
 from gymnasium.spaces import Box, Dict, Discrete, Text
+from small_runs import stage_entry
 
 from skillweave import (
     DQN,
@@ -548,12 +549,13 @@ def test_a_budget_that_ends_before_learning_begins_is_refused(tmp_path, flat):
 
 
 def test_each_members_budget_counts_not_the_populations(tmp_path):
-    stage = {"name": "x", "budget": 4_000, "algorithm": {"learning_starts": 1_000}}
+    stage = stage_entry("x")
+    stage.algorithm["learning_starts"] = 1_000
     check_stages([stage], None)
     says = "'x'.*1,000 steps for each member, but it begins to learn only after 1,000"
     with pytest.raises(SkillweaveError, match=says):
-        check_stages([stage | {"evolution": {"population": 4}}], None)
-    check_stages([{"name": "x", "budget": 1, "algorithm": {}}], None)
+        check_stages([dataclasses.replace(stage, evolution={"population": 4})], None)
+    check_stages([dataclasses.replace(stage, budget=1, algorithm={})], None)
 
 
 class Plain(Skill):

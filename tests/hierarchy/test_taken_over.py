@@ -1,5 +1,6 @@
 """What a hierarchy takes over from a run, what it refuses, and what it tells."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -183,7 +184,8 @@ def test_a_run_without_its_code_tells_of_no_settings(tmp_path, monkeypatch, caps
         with pytest.raises(KeyboardInterrupt):
             agent.train(tmp_path / "run", checkpoint_every=100, eval_every=100)
     capsys.readouterr()
-    Agent.from_manifest(RunDirectory.open(tmp_path / "run").manifest).resume(tmp_path / "run")
+    path = tmp_path / "run"
+    Agent.from_manifest(json.loads((path / "run.json").read_text())).resume(path)
     assert "own settings" not in "".join(capsys.readouterr())
 
 

@@ -14,6 +14,7 @@ from small_runs import assert_same, reports_every, stopped_run
 import skillweave as sw
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import as_json
 
 often = reports_every(40)
 OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}
@@ -137,7 +138,7 @@ def test_a_run_without_its_code_has_the_parts(tmp_path):
     try:
         hierarchy = crane([Arm(), Hook()], env="Crane-v0", rest="hold")
         run = hierarchy.train(tmp_path / "run", quiet=True)
-        loaded = sw.Hierarchy.from_manifest(RunDirectory.open(tmp_path / "run").manifest)
+        loaded = sw.Hierarchy.from_manifest(as_json(RunDirectory.open(tmp_path / "run").manifest))
         assert loaded.rest == "hold"
         again = loaded.load(tmp_path / "run")
         assert again.evaluate(3).returns == run.evaluate(3).returns

@@ -10,21 +10,21 @@ import pytest
 
 from skillweave.reporting.card import text, write_card
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import SkillEntry, StageEntry
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 from skillweave.training.skill_report import SkillReport
 
-STAGE = {
-    "name": "land", "kind": "skill", "learns": ["land"], "decides": None, "budget": 1000,
-    "algorithm": {"algorithm": "PPO"}, "status": "done", "steps": 1024, "seconds": 2.0,
-    "steps_per_second": 512.0, "final": {"return": 12.5},
-}  # fmt: skip
+STAGE = StageEntry(
+    "land", "skill", ["land"], None, 1000, {"algorithm": "PPO"}, None, "done",
+    steps=1024, seconds=2.0, steps_per_second=512.0, final={"return": 12.5},
+)  # fmt: skip
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunDirectory:
-    skill = {"name": "land", "max_steps": 10}
-    hop = {"name": "hop", "max_steps": 5, "policy": {"kind": "onnx", "file": "hop.onnx"}}
+    skill = SkillEntry("land", 10)
+    hop = SkillEntry("hop", 5, policy={"kind": "onnx", "file": "hop.onnx"})
     manifest = {
         "kind": "hierarchy", "env": "CartPole-v1", "env_kwargs": {}, "seed": 3,
         "checkpoint_every": 100, "eval_every": None, "eval_episodes": 20,

@@ -30,11 +30,11 @@ def write_run(base: Path, to: Path, seed: int, returns: Sequence[float], agent: 
     run.manifest["seed"] = seed
     lines = []
     for stage in run.manifest["stages"]:
-        own = returns if stage["name"] == agent else [0.0] * 4
+        own = returns if stage.name == agent else [0.0] * 4
         for update, (steps, value) in enumerate(zip(STEPS, own, strict=True), 1):
             # Skills have half as many steps.
-            far = steps // (1 if stage["name"] == agent else 2)
-            told = {"stage": stage["name"], "update": update, "steps": far, "seconds": 1.0}
+            far = steps // (1 if stage.name == agent else 2)
+            told = {"stage": stage.name, "update": update, "steps": far, "seconds": 1.0}
             lines.append({**told, "return": value, "entropy": 0.5})
     run.save()
     (to / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from reporting.walkway import declare
+from small_runs import stage_entry
 
 from skillweave.reporting import progress as module
 from skillweave.reporting.progress import EpisodeProgress, Progress
@@ -224,9 +225,9 @@ def test_rich_is_imported_only_to_draw() -> None:
 
 
 STAGES = [
-    {"name": "left", "budget": 20_000, "status": "done", "steps": 10_000, "seconds": 5.0},
-    {"name": "right", "budget": 20_000, "status": "new"},
-    {"name": "selector", "budget": 40_000, "status": "new"},
+    stage_entry("left", budget=20_000, steps=10_000, seconds=5.0),
+    stage_entry("right", "waiting", budget=20_000),
+    stage_entry("selector", "waiting", budget=40_000),
 ]
 
 

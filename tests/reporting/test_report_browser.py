@@ -62,7 +62,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     assert main(["report", *map(str, words)]) == 0
     write_comparison([RunDirectory.open(folder / n) for n in "abc"], found["comparison"])
     stopped = RunDirectory.open(folder / "c")
-    stopped.stage("selector")["status"] = "training"
+    stopped.stage("selector").status = "training"
     stopped.save()
     write_report(stopped, found["unfinished"])
     return found

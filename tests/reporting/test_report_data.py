@@ -201,8 +201,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, words in (("a", ()), ("b", ("--seed", "1")), ("c", ("--set", "call_steps=3"))):
         assert main([*train, "-o", str(found / name), *words]) == 0
     run = RunDirectory.open(found / "c")
-    run.stage("balance")["status"] = "training"
-    run.stage("selector")["status"] = "waiting"
+    run.stage("balance").status = "training"
+    run.stage("selector").status = "waiting"
     run.save()
     return found
 

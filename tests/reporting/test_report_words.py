@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare
+from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
@@ -125,7 +126,7 @@ def test_a_hierarchy_in_a_hierarchy_is_judged_by_its_skills() -> None:
 
 
 def test_without_episodes_the_verdict_says_how_far_training_is() -> None:
-    stages = [{"status": "done"}, {"status": "training"}]
+    stages = [stage_entry("one"), stage_entry("two", "training")]
     assert no_verdict(stages) == "Training is not finished: 1 of 2 stages are done."
     assert "No episodes were played" in no_verdict(stages[:1])
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from small_runs import stage_entry
 
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import command_words, saved_words
@@ -37,7 +38,7 @@ def test_paths_with_spaces_are_quoted():
 
 
 def test_what_is_saved_is_what_a_resumed_run_goes_on_from(tmp_path):
-    stages = [{"name": "left", "status": "done"}, {"name": "right", "status": "training"}]
+    stages = [stage_entry("left"), stage_entry("right", "training")]
     run, kept = SimpleNamespace(path=tmp_path, manifest={"stages": stages}), Checkpoints(tmp_path)
     assert saved_words(run) == "saved after left"
     for steps in (100, 200):

@@ -30,17 +30,13 @@ from skillweave.runs.manifest import (
     Generation,
     MemberEntry,
     Origin,
+    SkillEntry,
+    StageEntry,
     versions,
 )
 from skillweave.seeding import Seeds
 
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
-STAGES: list[dict[str, Any]] = [
-    {"name": "landing", "status": "training", "budget": 10, "algorithm": ALGORITHM}
-    | {"kind": "skill", "learns": ["landing"], "decides": None},
-    {"name": "selector", "status": "waiting", "budget": 10, "algorithm": ALGORITHM}
-    | {"kind": "selector", "learns": ["selector"], "decides": "selector"},
-]
 
 
 def manifest() -> dict[str, Any]:
@@ -50,7 +46,7 @@ def manifest() -> dict[str, Any]:
         "env_kwargs": {},
         "seed": 7,
         "checkpoint_every": 100,
-        "skills": [{"name": "landing", "max_steps": None, "ready": False}],
+        "skills": [SkillEntry("landing", None)],
         "call_steps": 10,
         "learn": "apart",
         "interrupt": None,
@@ -65,7 +61,12 @@ def manifest() -> dict[str, Any]:
         "eval_episodes": 20,
         "needs_recipe": False,
         "resume_needs_recipe": False,
-        "stages": [dict(p) for p in STAGES],
+        "stages": [
+            StageEntry("landing", "skill", ["landing"], None, 10, ALGORITHM, None, "training"),
+            StageEntry(
+                "selector", "selector", ["selector"], "selector", 10, ALGORITHM, None, "waiting"
+            ),
+        ],
     }
 
 
@@ -93,6 +94,11 @@ def damage(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
+
+
+def end(run: RunDirectory, stage: str) -> None:
+    entry = run.stage(stage)
+    entry.status, entry.steps, entry.seconds = "done", 1, 1.0
 
 
 def save(run: RunDirectory, seed: int, stage: str = "landing") -> Learnt:
@@ -170,9 +176,9 @@ def test_an_unknown_stage_is_answered_with_those_there_are(run: RunDirectory) ->
 
 
 def test_a_run_is_finished_when_every_stage_is_done(run: RunDirectory) -> None:
-    run.stage("landing").update(status="done", steps=1, seconds=1.0)
+    end(run, "landing")
     assert not run.finished
-    run.stage("selector").update(status="done", steps=1, seconds=1.0)
+    end(run, "selector")
     assert run.finished
     run.save()
     assert RunDirectory.open(run.path).finished
@@ -297,7 +303,7 @@ def policy() -> AgentPolicy:
 
 def test_a_finished_policy_comes_back_exactly(run: RunDirectory, policy: AgentPolicy) -> None:
     run.save_policies("landing", {"landing": policy})
-    run.stage("landing")["status"] = "done"
+    run.stage("landing").status = "done"
     found = run.load_policy("landing")
     assert found.weights.keys() == policy.weights.keys()
     assert all(torch.equal(found.weights[k], v) for k, v in policy.weights.items())
@@ -312,7 +318,7 @@ def test_a_policy_of_an_unfinished_stage_says_how_to_finish_it(run: RunDirectory
 
 def test_a_damaged_policy_is_named(run: RunDirectory, policy: AgentPolicy) -> None:
     run.save_policies("landing", {"landing": policy})
-    run.stage("landing")["status"] = "done"
+    run.stage("landing").status = "done"
     damage(run.policy_path("landing"))
     with pytest.raises(RunError, match="damaged") as caught:
         run.load_policy("landing")
@@ -323,7 +329,7 @@ def test_a_checkpoint_in_the_place_of_a_policy_is_refused_by_name(run: RunDirect
     save(run, 1)
     run.policy_path("landing").parent.mkdir()
     (run.path / "checkpoint.safetensors").rename(run.policy_path("landing"))
-    run.stage("landing")["status"] = "done"
+    run.stage("landing").status = "done"
     with pytest.raises(RunError) as caught:
         run.load_policy("landing")
     assert str(run.policy_path("landing")) in str(caught.value)
@@ -484,8 +490,8 @@ def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
 def finished(run: RunDirectory, *policies: AgentPolicy) -> None:
     """Every stage of the run, done."""
     for entry, policy in zip(run.manifest["stages"], policies, strict=True):
-        run.save_policies(entry["name"], {entry["name"]: policy})
-        entry.update(status="done", steps=1, seconds=1.0)
+        run.save_policies(entry.name, {entry.name: policy})
+        end(run, entry.name)
     run.save()
 
 
@@ -618,11 +624,11 @@ def test_a_process_that_is_killed_holds_the_run_no_longer(run: RunDirectory, wor
 def test_what_another_process_did_in_between_is_seen(run: RunDirectory) -> None:
     second = RunDirectory.open(run.path)
     run.begin()
-    run.stage("landing").update(status="done", steps=5, seconds=1.0)
+    end(run, "landing")
     run.save()
     run.close()
     second.begin()
-    assert second.stage("landing")["status"] == "done"
+    assert second.stage("landing").status == "done"
     second.close()
 
 
@@ -664,7 +670,7 @@ def test_checkpoints_go_when_their_stage_is_done_and_not_before(run: RunDirector
     save(run, 1, "landing")
     save(run, 2, "landing")
     save(run, 3, "selector")  # the one before is landing's
-    run.stage("landing").update(status="done", steps=5, seconds=1.0)
+    end(run, "landing")
     run.save()
     run.begin()
     assert not (run.path / "checkpoint.previous.safetensors").exists()

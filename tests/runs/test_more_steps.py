@@ -44,6 +44,7 @@ from skillweave.errors import DeclarationError
 from skillweave.runs import files
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
+from skillweave.runs.manifest import StageEntry
 from skillweave.training import stage_log
 from skillweave.training.periodic import PeriodicEvaluation
 
@@ -84,9 +85,9 @@ def by_kind(name: str) -> Any:
     return pytest.param(name, id=name, marks=[] if name in QUICK else [pytest.mark.slow])
 
 
-def stages(run: Run | Path) -> dict[str, dict[str, Any]]:
+def stages(run: Run | Path) -> dict[str, StageEntry]:
     path = run.path if isinstance(run, Run) else run
-    return {s["name"]: s for s in RunDirectory.open(path).manifest["stages"]}
+    return {s.name: s for s in RunDirectory.open(path).manifest["stages"]}
 
 
 def assert_metrics_rise(path: Path) -> None:
@@ -117,22 +118,22 @@ def test_a_finished_run_learns_on_for_more_steps(kind: str, path: Path) -> None:
     run = declared(1_024).train(path, seed=3, resume=True, quiet=True)
     assert run.path == first.path
     after = stages(run)
-    grown = [name for name, entry in after.items() if entry.get("continued")]
+    grown = [name for name, entry in after.items() if entry.continued]
     assert grown
     if kind == "first apart":
         assert grown == ["together"], "what the others learn now it would not know of"
     for name, entry in after.items():
-        assert entry["status"] == "done"
+        assert entry.status == "done"
         file = f"{name.replace('/', '.')}.safetensors"
         if name in grown:
-            assert entry["continued"] == [before[name]["steps"]]
-            assert entry["steps"] >= entry["budget"] > before[name]["budget"]
-            assert entry["seconds"] > before[name]["seconds"]
+            assert entry.continued == [before[name].steps]
+            assert entry.steps >= entry.budget > before[name].budget
+            assert entry.seconds > before[name].seconds
         else:
             assert entry == before[name]
             assert policies(path)[file] == weights[file]
     assert any(policies(path)[name][1] != old[1] for name, old in weights.items())
-    assert sum(e["budget"] for e in after.values()) == 1_024
+    assert sum(e.budget for e in after.values()) == 1_024
     assert lines(path)[: len(told)] == told
     assert len(lines(path)) > len(told)
     assert_metrics_rise(path)
@@ -158,15 +159,16 @@ def test_more_steps_continue_from_all_that_was_learnt(path: Path) -> None:
 def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
     agent(512).train(path, quiet=True, callback=lambda event: event.steps < 200)
     ended = stages(path)["agent"]
-    assert 200 <= ended["steps"] < 512
-    assert ended["stopped"] == {"steps": ended["steps"]}
+    assert 200 <= ended.steps < 512
+    assert ended.stopped is not None
+    assert ended.stopped.steps == ended.steps
     agent(512).train(path, resume=True, quiet=True)
     assert stages(path)["agent"] == ended, "it is finished"
     agent(1_024).train(path, resume=True, quiet=True)
     after = stages(path)["agent"]
-    assert after["steps"] >= 1_024
-    assert after["continued"] == [ended["steps"]]
-    assert "stopped" not in after
+    assert after.steps >= 1_024
+    assert after.continued == [ended.steps]
+    assert after.stopped is None
     assert_metrics_rise(path)
 
 
@@ -188,8 +190,8 @@ def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: 
 
     with pytest.raises(SkillweaveError, match="mine"):
         agent(256).train(path, quiet=True, callback=fail)
-    assert stages(path)["agent"]["status"] == "training"
-    assert stages(agent(256).resume(path, quiet=True))["agent"]["status"] == "done"
+    assert stages(path)["agent"].status == "training"
+    assert stages(agent(256).resume(path, quiet=True))["agent"].status == "done"
 
 
 @pytest.mark.parametrize("every", [60, 100_000])
@@ -211,7 +213,7 @@ def test_a_run_killed_right_after_its_callback_ended_it_comes_there_again(
             train(path)
     train(path)
     assert_same(path, tmp_path / "whole")
-    assert stages(path)["agent"]["steps"] == stages(tmp_path / "whole")["agent"]["steps"]
+    assert stages(path)["agent"].steps == stages(tmp_path / "whole")["agent"].steps
 
 
 def test_the_best_weights_of_before_are_kept_if_none_are_better(
@@ -222,11 +224,11 @@ def test_the_best_weights_of_before_are_kept_if_none_are_better(
 
     monkeypatch.setattr(PeriodicEvaluation, "due", worse_and_worse)
     agent(512).train(path, quiet=True, keep="best", eval_every=128)
-    best, kept = stages(path)["agent"]["best"], policies(path)
-    assert best["steps"] < 256
+    best, kept = stages(path)["agent"].best, policies(path)
+    assert best.steps < 256
     last = read_tensors(path / "final/agent.safetensors")[0]["params"]
     agent(1_024).train(path, resume=True, quiet=True)
-    assert stages(path)["agent"]["best"] == best
+    assert stages(path)["agent"].best == best
     assert policies(path) == kept
     assert not torch.equal(read_tensors(path / "final/agent.safetensors")[0]["params"], last)
 
@@ -273,7 +275,7 @@ def test_a_continuation_that_is_killed_at_once_continues(
     with pytest.raises(RunError, match=r"unfinished run, saved at 256 steps of agent"):
         agent(512).train(path, quiet=True)
     run = agent(512).resume(path, quiet=True)
-    assert stages(run)["agent"]["steps"] == 512
+    assert stages(run)["agent"].steps == 512
     assert_metrics_rise(path)
 
 
@@ -316,7 +318,7 @@ def test_a_skill_that_learns_on_alone_makes_its_selector_old_and_it_is_said(
     with_skill(128).train(path, quiet=True)
     capfd.readouterr()
     run = with_skill(256).train(path, resume=True)
-    assert [n for n, e in stages(run).items() if e.get("continued")] == ["left"]
+    assert [n for n, e in stages(run).items() if e.continued] == ["left"]
     told = capfd.readouterr().err
     assert "left continues: 128 → 256 steps" in told
     assert "selector stays as it is, so it still chooses for left as they were" in told
@@ -350,7 +352,7 @@ def test_a_small_replay_buffer_is_kept(
             agent(276, OFF).train(path, resume=True, quiet=True)
     before = policies(path)
     run = agent(384, OFF).train(path, resume=True, quiet=True)
-    assert stages(run)["agent"]["steps"] == 384
+    assert stages(run)["agent"].steps == 384
     assert policies(path) != before
 
 
@@ -408,7 +410,7 @@ def test_a_copy_without_final_states_names_start_from(path: Path, tmp_path: Path
         agent(256).train(path, resume=True, quiet=True)
     line = f'agent.train(start_from="{path}")'
     assert str(caught.value).endswith(line)
-    assert stages(path)["agent"]["budget"] == 128
+    assert stages(path)["agent"].budget == 128
     agent(128).train(tmp_path / "new", start_from=path, quiet=True)
 
 
@@ -441,13 +443,13 @@ def test_a_stage_that_is_done_waits_for_the_end_of_its_run(
         interrupt_at_checkpoint(patched, 2)
         with pytest.raises(KeyboardInterrupt):
             declare(256).train(path, checkpoint_every=100, quiet=True)
-    assert [e["status"] for e in stages(path).values()].count("done") == 1
+    assert [e.status for e in stages(path).values()].count("done") == 1
     run = declare(512).train(path, resume=True)
     assert "left can be given more steps once the run is finished" in capfd.readouterr().err
-    budgets = {name: e["budget"] for name, e in stages(run).items()}
+    budgets = {name: e.budget for name, e in stages(run).items()}
     assert budgets == {"left": 64, "balance": 128, "selector": 256}
     run = declare(512).train(path, resume=True, quiet=True)
-    assert {name: e["budget"] for name, e in stages(run).items()} == declare(512).budgets()
+    assert {name: e.budget for name, e in stages(run).items()} == declare(512).budgets()
 
 
 # Begin, or continue
@@ -616,5 +618,5 @@ def test_sac_learns_on(path: Path) -> None:
     sac = SAC(num_envs=2, batch_size=16, learning_starts=20, network=Network((8,)))
     for steps in (200, 300):
         run = sw.train_agent("Pendulum-v1", sac, steps, path, resume=True, quiet=True)
-    assert stages(run)["agent"]["continued"] == [200]
+    assert stages(run)["agent"].continued == [200]
     assert torch.isfinite(torch.tensor(run.evaluate(1, quiet=True).mean))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_runs import stage_entry
 
 from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
@@ -132,7 +133,7 @@ def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None
     land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
     hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
     run.manifest["track"] = ["tensorboard"]
-    run.manifest["stages"] = [{"name": "land", "steps": 500}, {"name": "selector", "steps": 200}]
+    run.manifest["stages"] = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
         found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
         save_evaluation(run, found, 0, True)
@@ -160,7 +161,7 @@ def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     run.manifest["track"] = ["tensorboard"]
-    run.manifest["stages"] = [{"name": "land", "steps": 500}, {"name": "selector", "steps": 200}]
+    run.manifest["stages"] = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     film = gif(run.path / "hierarchy.gif")
     track_film(run, film)
     track_film(run, run.path / "other.mp4")  # it cannot show those, and says nothing
@@ -244,8 +245,9 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     monkeypatch.chdir(tmp_path)
     run.manifest["track"] = ["mlflow"]
-    stage = {"name": "landing", "kind": "skill", "algorithm": {"gamma": 0.9}, "steps": 300}
-    run.manifest["stages"] = [stage | {"status": "training"}]
+    stage = stage_entry("landing", "training", steps=300)
+    stage.algorithm["gamma"] = 0.9
+    run.manifest["stages"] = [stage]
     (killed,) = make_trackers(("mlflow",), run)
     for steps in (100, 200, 300):
         killed.tick("landing", steps, 1.0, {"return": steps / 100})
@@ -253,7 +255,7 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     client = mlflow.MlflowClient(uri)
     experiment = client.get_experiment_by_name("skillweave").experiment_id
     assert [r.info.status for r in client.search_runs([experiment])] == ["KILLED"]
-    run.manifest["stages"][0]["status"] = "done"
+    stage.status = "done"
     (resumed,) = make_trackers(("mlflow",), run)
     for steps in (200, 300, 400):  # the latest checkpoint was of step 100
         resumed.tick("landing", steps, 1.0, {"return": steps / 100})

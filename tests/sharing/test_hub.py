@@ -207,7 +207,7 @@ def test_an_unfinished_or_damaged_run_is_refused_before_the_hub_hears_of_it(
     with pytest.raises(RunError, match=r"left\.safetensors is damaged"):
         run.push(NAME)
     directory = RunDirectory.open(run.path)
-    directory.stage("selector")["status"] = "training"
+    directory.stage("selector").status = "training"
     directory.save()
     with pytest.raises(RunError, match=r"'selector' is not done.*resume=True"):
         run.push(NAME)

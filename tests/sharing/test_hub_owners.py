@@ -49,7 +49,7 @@ def test_where_files_lie_and_who_tracks_a_run_does_not_go_up(
 
 
 def test_nor_does_where_a_ready_policy_lies(run: sw.Run, hub: Hub) -> None:
-    left, right = RunDirectory.open(run.path).manifest["skills"]
+    left, right = run.info()["skills"]
     source = {"kind": "onnx", "file": "/home/ada/secret/hop.onnx", "sha256": "0" * 64}
     change(run.path, skills=[left | {"policy": source}, right])
     run.push(NAME)

@@ -39,6 +39,7 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
+from skillweave.runs.manifest import Best
 from skillweave.seeding import Seeds
 from skillweave.training.keep_best import KeepBest
 
@@ -128,10 +129,10 @@ def test_every_stage_keeps_its_best_and_says_so(
     training.train(hierarchy(learn), run, (heard,))
     run.close()
     for entry in run.manifest["stages"]:
-        found = evaluations(run.path, entry["name"])
+        found = evaluations(run.path, entry.name)
         best = max(found, key=lambda steps: (found[steps], steps))
-        assert entry["best"] == {"steps": best, "of": "return", "value": found[best]}
-        said = f"{entry['name']}: kept the weights of step {best:,}, whose evaluation was best"
+        assert entry.best == Best(best, "return", found[best])
+        said = f"{entry.name}: kept the weights of step {best:,}, whose evaluation was best"
         assert sum(text.startswith(said) for text in heard.said) == 1
     for judged_run, after in judged:  # those that are kept, and no others
         for name, policy in judged_run.load_policies("together").items():
@@ -172,7 +173,7 @@ def test_a_resumed_run_keeps_the_same(
     assert stops >= 2
     assert_same(tmp_path / "run", tmp_path / "whole")
     runs = [RunDirectory.open(tmp_path / name) for name in ("run", "whole")]
-    kept = [[entry["best"] for entry in run.manifest["stages"]] for run in runs]
+    kept = [[entry.best for entry in run.manifest["stages"]] for run in runs]
     assert kept[0] == kept[1]
 
 

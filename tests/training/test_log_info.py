@@ -352,7 +352,7 @@ def test_the_command_line_logs_and_keeps(tmp_path: Path) -> None:
     assert main([*words, "-o", str(first), "--log-info", "place", *best]) == 0
     assert "info/place" in lines(first)[-1]
     (stage,) = manifest_of(first)["stages"]
-    assert stage["best"]["steps"] <= stage["steps"]
+    assert stage.best.steps <= stage.steps
     more = ["--set", "train.keep=best", "--set", "train.log_info=place, other"]
     assert main([*words, "-o", str(second), *best[2:], *more]) == 0
     assert manifest_of(second)["log_info"] == ["place", "other"]

@@ -278,15 +278,14 @@ def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> Non
 def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
     h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     entries = training.manifest(h, seed=0, flat=False)["stages"]
-    keys = ("name", "kind", "learns", "decides")
-    assert [tuple(e[k] for k in keys) for e in entries] == [
+    assert [(e.name, e.kind, e.learns, e.decides) for e in entries] == [
         ("start", "skill", ["start"], None),
         ("selector", "selector", ["selector"], "selector"),
     ]
     told = training.manifest(h, seed=0, flat=True)
     assert told["kind"] == "agent"
     assert "skills" not in told
-    assert [tuple(e[k] for k in keys) for e in told["stages"]] == [
+    assert [(e.name, e.kind, e.learns, e.decides) for e in told["stages"]] == [
         ("agent", "agent", ["agent"], None)
     ]
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from skillweave.policies.core import flat
 from skillweave.runs.command_words import command_words
-from skillweave.runs.comparison import best_words, comparison_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import as_json
 from skillweave.skills import Skill
 from skillweave.training.skill_report import SkillReport, all_steps
 
@@ -99,7 +99,7 @@ def facts(run: RunDirectory) -> list[tuple[str, str]]:
     rows.append(("Recipe", manifest.get("recipe") or "declared in Python"))
     rows += [("Seed", str(manifest["seed"])), ("Made", manifest["created"].replace("T", " "))]
     if manifest["kind"] == "hierarchy":
-        rows.append(("Skills", ", ".join(s["name"] for s in manifest["skills"])))
+        rows.append(("Skills", ", ".join(s.name for s in manifest["skills"])))
         rows.append(("A call lasts", _call_length(manifest)))
         selector = manifest.get("selector")
         rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
@@ -124,34 +124,29 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
     """Return a row for each stage; ``steps``: by stage, the steps of its last metrics."""
     rows = []
     for entry in run.manifest["stages"]:
-        final = (entry.get("final") or {}).get("return")
         notes = []
-        if continued := entry.get("continued"):
-            notes.append(f"continued after {', '.join(f'{k:,}' for k in continued)} steps")
-        if reached := entry.get("reached"):
-            notes.append(f"target reached after {reached['steps']:,} steps")
-        if stopped := entry.get("stopped"):
-            notes.append(f"a callback ended it after {stopped['steps']:,} steps")
-        if best := entry.get("best"):
-            notes.append(best_words(best))
-        if kept := entry.get("kept"):
-            notes.append(comparison_words(kept))
-        if winner := entry.get("winner"):
-            notes.append(f"winner: member {winner['member']}, fitness {winner['fitness']:.1f}")
-        done = entry["status"] == "done"
-        far = f"{steps.get(entry['name'], 0):,} of {entry['budget']:,}"
+        if entry.continued:
+            notes.append(f"continued after {', '.join(f'{k:,}' for k in entry.continued)} steps")
+        if entry.reached is not None:
+            notes.append(f"target reached after {entry.reached.steps:,} steps")
+        if entry.stopped is not None:
+            notes.append(f"a callback ended it after {entry.stopped.steps:,} steps")
+        notes += [str(found) for found in (entry.best, entry.kept) if found is not None]
+        if (winner := entry.winner) is not None:
+            notes.append(f"winner: member {winner.member}, fitness {winner.fitness:.1f}")
+        far = f"{steps.get(entry.name, 0):,} of {entry.budget:,}"
         rows.append(
             {
-                "name": entry["name"],
-                "kind": entry["kind"],
-                "algorithm": entry["algorithm"].get("algorithm", "?"),
-                "status": entry["status"],
-                "steps": f"{entry['steps']:,}" if done else far,
-                "seconds": f"{entry['seconds']:,.1f}" if done else "–",
-                "speed": f"{entry['steps_per_second']:,.0f}"
-                if "steps_per_second" in entry
-                else "–",
-                "return": number(final),
+                "name": entry.name,
+                "kind": entry.kind,
+                "algorithm": entry.algorithm.get("algorithm", "?"),
+                "status": entry.status,
+                "steps": f"{entry.steps:,}" if entry.done else far,
+                "seconds": f"{entry.seconds:,.1f}" if entry.done else "–",
+                "speed": "–"
+                if entry.steps_per_second is None
+                else f"{entry.steps_per_second:,.0f}",
+                "return": number(entry.final.get("return")),
                 "notes": "; ".join(notes),
             }
         )
@@ -162,11 +157,10 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     """Return a sentence for each unfinished stage; ``steps``: by stage, at its last metrics."""
     sentences = []
     for entry in run.manifest["stages"]:
-        name = entry["name"]
-        budget = entry["budget"]
-        if entry["status"] == "waiting":
+        name, budget = entry.name, entry.budget
+        if entry.status == "waiting":
             sentences.append(f"The stage {name!r} has not begun.")
-        elif entry["status"] == "training":
+        elif entry.status == "training":
             far = f"after {steps[name]:,}" if name in steps else "before the first line of metrics"
             sentences.append(
                 f"The stage {name!r} is not finished: it stands {far} of {budget:,} steps."
@@ -202,13 +196,14 @@ def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
     )
     values |= {k: manifest[k] for k in names if k in manifest}
     for skill in manifest.get("skills", ()):
-        fields = {k: v for k, v in skill.items() if k != "name"}
-        values |= flat(fields, f"skills.{skill['name']}.")
+        fields = {k: v for k, v in as_json(skill).items() if k != "name"}
+        values |= flat(fields, f"skills.{skill.name}.")
     for entry in manifest["stages"]:
-        fields = {k: v for k, v in entry.items() if k not in LEFT_OUT | MADE | {"name", "starts"}}
+        left_out = LEFT_OUT | MADE | {"name", "starts"}
+        fields = {k: v for k, v in as_json(entry).items() if k not in left_out}
         # From which run differs from seed to seed.
-        fields |= {f"starts.{name}": "another run" for name in entry.get("starts", {})}
-        values |= flat(fields, f"{entry['name']}.")
+        fields |= {f"starts.{name}": "another run" for name in entry.starts}
+        values |= flat(fields, f"{entry.name}.")
     return values
 
 

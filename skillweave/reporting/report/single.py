@@ -258,11 +258,11 @@ def _sentence(error: SkillweaveError) -> str:
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
-    names = [skill["name"] for skill in run.manifest.get("skills", ())]
+    names = [skill.name for skill in run.manifest.get("skills", ())]
     colors = {name: color_of(i) for i, name in enumerate(names)}
     colors |= {} if played is None else played.colors
     for entry in run.manifest["stages"]:
-        for name in (entry["name"], *entry["learns"], *entry.get("algorithms", ())):
+        for name in (entry.name, *entry.learns, *entry.algorithms):
             colors.setdefault(name, color_of(len(colors)))
     return {name: hex_of(color) for name, color in colors.items()}
 
@@ -292,8 +292,11 @@ def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) ->
         "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
         "versions": list(manifest["versions"].items()),
-        "steps": sum(e.get("steps", reached.get(e["name"], 0)) for e in manifest["stages"]),
-        "training_seconds": sum(entry.get("seconds", 0.0) for entry in manifest["stages"]),
+        "steps": sum(
+            reached.get(entry.name, 0) if entry.steps is None else entry.steps
+            for entry in manifest["stages"]
+        ),
+        "training_seconds": sum(entry.seconds or 0.0 for entry in manifest["stages"]),
         "missing": missing,
         "finished": run.finished,
     }
@@ -367,10 +370,10 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
     sections = []
     data["trees"] = []
     for entry in run.manifest["stages"]:
-        lineage = read_lineage(run, entry["name"])
+        lineage = read_lineage(run, entry.name)
         if lineage is None:
             continue
-        color = colors[entry["name"]]
+        color = colors[entry.name]
         paths = charts.setting_paths(lineage, color)
         data["trees"].append(
             {"tree": charts.family_tree(lineage, color), "paths": [spec for _, spec in paths]}
@@ -381,5 +384,5 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
             for b in lineage.path(lineage.winner)
         ]
         names = [(setting_title(k), short_value(lineage.winner.settings[k])) for k, _ in paths]
-        sections.append({"stage": entry["name"], "line": line, "settings": names})
+        sections.append({"stage": entry.name, "line": line, "settings": names})
     return {"lineages": sections}

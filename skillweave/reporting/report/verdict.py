@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from skillweave.paths import level_of
 from skillweave.planning.hand_over import wilson
 from skillweave.reporting.report.facts import number, percent, scale_of
+from skillweave.runs.manifest import StageEntry
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
 
@@ -56,9 +56,9 @@ def verdict(score: Evaluation, deterministic: bool) -> str:
     return text if deterministic else f"With sampled actions: {text[0].lower()}{text[1:]}"
 
 
-def no_verdict(stages: Sequence[Mapping[str, Any]]) -> str:
+def no_verdict(stages: Sequence[StageEntry]) -> str:
     """Return the sentence in place of a verdict where no episode was played."""
-    done = sum(entry["status"] == "done" for entry in stages)
+    done = sum(entry.done for entry in stages)
     if done < len(stages):
         return f"Training is not finished: {done} of {len(stages)} stages are done."
     return "No episodes were played, so there is no verdict."
