@@ -250,9 +250,9 @@ def test_seeds_that_start_from_runs_of_their_own_are_one_group(tmp_path):
     for seed in range(2):
         first = agent.train(tmp_path / f"first-{seed}", seed=seed, quiet=True)
         run = agent.train(tmp_path / f"then-{seed}", seed=seed, quiet=True, start_from=first)
-        found.append(settings(run.info()))
+        found.append(settings(RunDirectory.open(run.path).manifest))
     assert found[0] == found[1]
-    assert found[0] != settings(first.info())
+    assert found[0] != settings(RunDirectory.open(first.path).manifest)
 
 
 @pytest.mark.slow
