@@ -72,14 +72,12 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
     declared.validate()
     flat: bool | AlgorithmConfig = False
     note = ""
-    if (
-        isinstance(options, TrainOptions)
-        and (flat := options.flat)
-        and options.log_calls is not None
-    ):
-        raise DeclarationError(
-            "flat trains one plain agent, which has no skills to call: leave out log_calls"
-        )
+    if isinstance(options, TrainOptions):
+        flat = options.flat
+        if flat is not False and options.log_calls is not None:
+            raise DeclarationError(
+                "flat trains one plain agent, which has no skills to call: leave out log_calls"
+            )
     how = declared.train_defaults.given(options)
     if isinstance(declared, Declaration) and flat is False:
         declared, note = evolving(declared, options.evolve)
