@@ -28,7 +28,7 @@ from skillweave import Array, Run
 from skillweave.errors import SkillweaveError
 from skillweave.ops.threads import torch_threads
 from skillweave.planning import CallLog, record_calls
-from skillweave.planning.hand_over import calls_done
+from skillweave.planning.handover import calls_done
 from skillweave.recipes import lander_missions
 from skillweave.types import Memory
 

@@ -14,7 +14,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import leaves
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
 from skillweave.planning.machine import RewardMachine, predicate_of
 from skillweave.planning.planner import Planner

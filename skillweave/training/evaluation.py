@@ -194,7 +194,7 @@ class Evaluation:
 
     def _hints(self) -> list[str]:
         """Return hints of mistakes, and skills that seldom succeed after one other skill."""
-        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_hand_over", ()))]
+        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_handover", ()))]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -462,7 +462,7 @@ def _scored(
         reflexes.steps(),
         alone,
     )
-    vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
+    vars(evaluation)["_handover"] = tuple(tally.handover())
     if isinstance(tally, CallTally):
         vars(evaluation).update(_goals=tally.goals, _reached=tally.reached)
     return evaluation

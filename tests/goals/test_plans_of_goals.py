@@ -230,9 +230,9 @@ def test_exploring_draws_goals_for_new_calls() -> None:
     assert 10 < len(np.unique(log.goals["go_to"][mine], axis=0)) < mine.sum()
 
 
-def test_hand_over_and_chains_go_by_skill() -> None:
+def test_handover_and_chains_go_by_skill() -> None:
     log = ready().log_calls(1_000, num_envs=4)
-    rate, count = log.hand_over().of("go_to", after="go_to")
+    rate, count = log.handover().of("go_to", after="go_to")
     assert 0 < rate <= 1
     assert count > 5
     assert 0 < log.chain("go_to", "go_to").estimate <= 1
@@ -294,7 +294,7 @@ def test_a_task_knows_no_goal(task: Any) -> None:
         run.plan(task, log)
     if callable(task):
         with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the pred"):
-            log.hand_over(done={"go_to": task})
+            log.handover(done={"go_to": task})
 
 
 @pytest.mark.parametrize(

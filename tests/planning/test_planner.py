@@ -524,7 +524,7 @@ def test_a_key_of_info_that_was_not_recorded_is_named(log: CallLog) -> None:
     with pytest.raises(RunError, match=r"reads info\['door'\].*record it: .*info=\['door'\]"):
         Planner(log, Predicate(opened))
     with pytest.raises(RunError, match="which the log does not have"):
-        log.hand_over({"wait": opened})
+        log.handover({"wait": opened})
     known = record_calls(SPEC, skill_set(), 500, info=["door"])
     assert Planner(known, Predicate(opened)).values(known.start[:1]).max() > 0
 
