@@ -30,7 +30,7 @@ from skillweave import (
     gae,
     mask_logits,
     masked_mean,
-    normalise,
+    normalize,
     register_algorithm,
     train_agent,
 )
@@ -128,7 +128,7 @@ class A2CAlgorithm(Algorithm):
         mask = None if rollout.mask is None else rollout.mask.flatten(1, 2)
         head = self.actor(leaves, inputs)
         log_prob, entropy = self.head.stats(head, None, mask, rollout.action.flatten(1, 2))
-        gain = log_prob.unflatten(1, lead) * normalise(advantage, valid)
+        gain = log_prob.unflatten(1, lead) * normalize(advantage, valid)
         policy_loss = -masked_mean(gain, valid)
         value_loss = 0.5 * masked_mean((value - returns).square(), valid)
         bonus = masked_mean(entropy, flat_valid)

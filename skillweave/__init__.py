@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from skillweave.networks.net import Net
     from skillweave.networks.stacked import Layout
     from skillweave.ops.distributions import mask_logits
-    from skillweave.ops.moments import masked_mean, normalise
+    from skillweave.ops.moments import masked_mean, normalize
     from skillweave.ops.optim import adam_, clip_grad_norm_
     from skillweave.ops.returns import gae
     from skillweave.reporting.curves_figure import plot_curves
@@ -152,7 +152,7 @@ _HOME = {
     "make_options_env": "api.options",
     "mask_logits": "ops.distributions",
     "masked_mean": "ops.moments",
-    "normalise": "ops.moments",
+    "normalize": "ops.moments",
     "one_of": "envs.pool",
     "plot_curves": "reporting.curves_figure",
     "register_algorithm": "algorithms.registry",
@@ -246,7 +246,7 @@ __all__ = [
     "make_options_env",
     "mask_logits",
     "masked_mean",
-    "normalise",
+    "normalize",
     "one_of",
     "plot_curves",
     "register_algorithm",

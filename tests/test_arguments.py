@@ -166,7 +166,7 @@ INSIDE = {
     "Export", "LastCall", "Layout", "Net", "OptionsEnv", "ParameterGroup",
     "ParentSelection", "Policy", "Report",
     "Rollout", "Run", "Sample", "Seeds", "Skill", "Step", "adam_",
-    "clip_grad_norm_", "gae", "mask_logits", "masked_mean", "normalise", "tree",
+    "clip_grad_norm_", "gae", "mask_logits", "masked_mean", "normalize", "tree",
     "Interrupted", *KINDS,
 }  # fmt: skip
 

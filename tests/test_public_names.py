@@ -23,7 +23,7 @@ PoolWrapper RNN Range Ray Reflex Report Residual Rollout Run RunError SAC Sample
 SelfImitationPPO Skill SkillError SkillweaveError Step TD3 Together Tournament TrainDefaults
 TrainEvent TrainingError Truncation adam_ clip_grad_norm_ envpool evaluate from_function from_hub
 from_onnx from_sb3 from_torch gae load load_policy make_options_env mask_logits masked_mean
-normalise one_of plot_curves register_algorithm register_encoder save_policy train_agent tree
+normalize one_of plot_curves register_algorithm register_encoder save_policy train_agent tree
 """
 
 

@@ -12,7 +12,7 @@ from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.handover import START, before_each, calls_done, shown_rate, wilson
-from skillweave.planning.neighbours import Standard, nearest
+from skillweave.planning.neighbors import Standard, nearest
 from skillweave.types import Array
 
 LEAST = 20

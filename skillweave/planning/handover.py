@@ -16,7 +16,7 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import nearest
+from skillweave.planning.neighbors import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
@@ -26,7 +26,7 @@ START = "start"
 """The row of calls that begin an episode."""
 Z = 1.96
 """Standard deviations of a 95 % interval."""
-NEIGHBOURS = 5
+NEIGHBORS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +262,7 @@ def chain(
     for i in reversed(range(len(skills) - 1)):
         here = maps[numbers[i + 1]]
         starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
-        near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
+        near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
         follows = (weights_of(distance) * chance[near]).sum(1)
         may = log.may_follow[rows[i]].reshape(len(rows[i]), len(log.skills), -1)
         goes_on = won[rows[i]] & ~log.terminated[rows[i]]

@@ -64,7 +64,7 @@ def bound(planner: Planner, space: Any) -> Planner:
 def test_values_are_those_of_a_skill_for_each_goal(goals: Any) -> None:
     """With few goals and with many: the best goal from each start is known on a line."""
     log = jumps(goals, np.repeat(np.arange(11), 3))  # every call three times
-    planner = Planner(log, Mission(at(9), at(1)), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, Mission(at(9), at(1)), neighbors=1, gamma=GAMMA, caution=0.0)
     obs = np.float32([[p] for p in range(11)])
     reached = GAMMA ** (np.abs(9 - np.arange(11)) - 1.0)
     there_and_back = (reached + reached * GAMMA**8) / 2
@@ -85,21 +85,21 @@ def test_calls_count_for_one_another_by_start_and_goal() -> None:
     ends = np.where(goals > 0.5, 5, -5)
     log = log_of(["go"], [(0, [(0, [end], True, "end")]) for end in ends.tolist()])
     log.goals["go"] = goals[:, None]
-    planner = Planner(log, at(5), neighbours=3, caution=0.0)
+    planner = Planner(log, at(5), neighbors=3, caution=0.0)
     assert planner.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0, abs=1e-3)
     option = planner.graph.near(np.zeros((1, 1), np.float32))
     aims = goals[option.goal[0]]
     worth = (planner.plan[option.pieces[0], 0] * option.weights[0]).sum(1)
     assert (worth[aims > 0.6] > 0.99).all()
     assert (worth[aims < 0.4] < 0.01).all()
-    assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbour differs
+    assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbor differs
 
 
 def test_fewer_calls_than_options() -> None:
     """Options without a call are worth nothing, and are never chosen."""
     log = log_of(["go"], [(p, [(0, [p + 1], True, "end")]) for p in range(5)])
     log.goals["go"] = np.arange(1.0, 6.0)[:, None]
-    planner = bound(Planner(log, at(1), neighbours=2, caution=0.0), LINE)
+    planner = bound(Planner(log, at(1), neighbors=2, caution=0.0), LINE)
     obs = np.float32([[4], [0]])
     near, corners = planner.graph.near(obs), planner.states.corners(planner.machine.start(2))
     assert np.isfinite(planner.in_place.valued(near, obs, corners)).sum() == 10
@@ -116,7 +116,7 @@ def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch: Any) 
     aims = []
     for task in (at(9), at(1)):
         with pytest.warns(UserWarning, match="the plan uses 50 of them"):
-            planner = bound(Planner(log, task, neighbours=1, gamma=GAMMA), LINE)
+            planner = bound(Planner(log, task, neighbors=1, gamma=GAMMA), LINE)
         choice, _ = planner.act(planner.start(2), obs)
         aims.append(choice["goal"]["go"][:, 0].tolist())
     assert aims == [[10, 10], [0, 0]]
@@ -126,14 +126,14 @@ def test_a_logged_goal_has_no_distance_to_itself() -> None:
     """Not even by rounding, where its numbers are large beside their differences."""
     log = log_of(["go"], [(0, [(0, [i], True, "end")]) for i in range(40)])
     log.goals["go"] = np.random.default_rng(0).normal(size=(40, 2))
-    near = CallGraph(log, neighbours=1).near(np.zeros((1, 1), np.float32))
+    near = CallGraph(log, neighbors=1).near(np.zeros((1, 1), np.float32))
     assert (near.distance == 0).all()
 
 
 def test_a_goal_that_failed_is_not_repeated_forever() -> None:
     """The log says that goals above lead to 3; now there is a wall."""
     log = jumps((0, 10), np.repeat(np.arange(11), 3))
-    planner = bound(Planner(log, at(9), neighbours=1, gamma=GAMMA), LINE)
+    planner = bound(Planner(log, at(9), neighbors=1, gamma=GAMMA), LINE)
     memory, obs, aims = planner.start(1), np.float32([[2]]), []
     for _ in range(6):
         choice, memory = planner.act(memory, obs)
