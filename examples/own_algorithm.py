@@ -13,7 +13,8 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave import (
+from skillweave import train_agent
+from skillweave.algorithms import (
     ActingParams,
     ActionHead,
     AgentState,
@@ -24,7 +25,6 @@ from skillweave import (
     ParameterGroup,
     Report,
     Rollout,
-    Seeds,
     adam_,
     clip_grad_norm_,
     gae,
@@ -32,8 +32,8 @@ from skillweave import (
     masked_mean,
     normalize,
     register_algorithm,
-    train_agent,
 )
+from skillweave.types import Seeds
 
 
 @dataclass(frozen=True)

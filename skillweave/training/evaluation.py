@@ -6,8 +6,7 @@ A pool of environments is faster; all its episodes start from one seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from dataclasses import replace as replaced
+from dataclasses import dataclass, field, replace as replaced
 from typing import Any
 
 import gymnasium as gym

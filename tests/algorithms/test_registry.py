@@ -11,27 +11,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from toys import Countdown, Echo, Masked, learn
-from toys import own_algorithm as example
+from toys import Countdown, Echo, Masked, learn, own_algorithm as example
 
-from skillweave import (
-    PPO,
-    SAC,
-    Algorithm,
-    Apart,
-    Evolution,
-    Hierarchy,
-    Mutations,
-    Network,
-    Skill,
-    register_algorithm,
-    train_agent,
-)
-from skillweave.algorithms import config as table
+from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
+from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution import Evolution, Mutations
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 

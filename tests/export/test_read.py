@@ -39,7 +39,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.selectors import ready_selector
 from skillweave.skills.foreign_policy import made_up
-from skillweave.types import Array, Policy
+from skillweave.types import Array, LastCall, Policy
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("stable_baselines3")
@@ -156,7 +156,7 @@ GUIDED = ActiveGuide(
 )
 
 
-def choose(obs: Array, last: sw.LastCall) -> Array:
+def choose(obs: Array, last: LastCall) -> Array:
     return np.where(last.succeeded, 1, (obs[:, T].astype(int) + last.skill) % 2)
 
 

@@ -13,7 +13,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 
 import skillweave as sw
-from skillweave.errors import SkillError
+from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.policies.spaces import space_of
@@ -177,10 +177,10 @@ def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
 def test_another_log_s_goals_are_refused(tmp_path: Any) -> None:
     log = ready().log_calls(300, num_envs=4)
     run = ready("number")
-    with pytest.raises(sw.RunError, match="changed since the log"):
+    with pytest.raises(RunError, match="changed since the log"):
         run.plan(near(1.4, 0.3), log)
     other = declared(run.hierarchy.skills, selector=Planner(log, near(1.4, 0.3)))
-    with pytest.raises(sw.RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
+    with pytest.raises(RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
         other.train(tmp_path / "run", quiet=True)
 
 
@@ -189,7 +189,7 @@ def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
     run = declared(skills).train(quiet=True)
     log = run.log_calls(300, num_envs=4)
     guide = sw.Guide(Planner(log, near(1.4, 0.3)), restrict=False, target_kl=0.1)
-    with pytest.raises(sw.DeclarationError, match="says nothing about goals"):
+    with pytest.raises(DeclarationError, match="says nothing about goals"):
         declared(skills, selector=sw.PPO(), guide=guide).train(quiet=True)
 
 

@@ -12,7 +12,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
 
-from skillweave import EnvSpec, Hierarchy, HierarchyPolicy, Lengths, evaluate
+from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import (
@@ -34,7 +34,7 @@ from skillweave.policies.plan import nearest_corner
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import Array
+from skillweave.types import Array, HierarchyPolicy
 
 GAMMA = 0.9
 LINE = 10

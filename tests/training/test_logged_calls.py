@@ -16,18 +16,10 @@ from small_runs import (
     interrupt_at_checkpoint,
 )
 
-from skillweave import (
-    EnvSpec,
-    Evolution,
-    Hierarchy,
-    Lengths,
-    Ray,
-    Run,
-    Skill,
-    TrainDefaults,
-)
+from skillweave import EnvSpec, Hierarchy, Lengths, Ray, Run, Skill, TrainDefaults
 from skillweave.collecting import placement
 from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
+from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import CallLog
 from skillweave.planning.calls import LEARNING, columns_of
