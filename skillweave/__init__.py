@@ -1,7 +1,5 @@
 """Skillweave: teach agents skills on any Gymnasium environment, weave them into one policy."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from skillweave.public import lazy

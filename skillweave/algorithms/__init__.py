@@ -1,7 +1,5 @@
 """Algorithms: one algorithm, one file; settings in ``config``."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from skillweave.public import lazy

@@ -1,7 +1,5 @@
 """Environments: engines with one meaning of resets, and checks of environments."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from skillweave.public import lazy

@@ -1,7 +1,5 @@
 """Evolution: a population that learns in stacks, is compared, selected and mutated."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from skillweave.public import lazy

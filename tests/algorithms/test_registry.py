@@ -175,7 +175,9 @@ def test_the_latest_of_a_name_counts_and_the_librarys_own_stay():
 def test_a_method_that_is_missing_is_named(method):
     kind = example().A2CAlgorithm
     lacking = type("Half", (kind,), {method: getattr(Algorithm, method)})
-    with pytest.raises(DeclarationError, match=rf"Half lacks {method}; see skillweave\.Algorithm"):
+    with pytest.raises(
+        DeclarationError, match=rf"Half lacks {method}; see skillweave\.algorithms\.Algorithm"
+    ):
         register_algorithm(example().A2C, lacking)
     algorithm = lacking(own(), BOX, LINE)
     given = {"fresh_state": 1, "parameter_groups": 0, "act": 4, "value": 2, "update": 3}[method]
@@ -191,7 +193,7 @@ def changed(**attributes: Any) -> Any:
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "no algorithm": (
         lambda: register_algorithm(example().A2C, int),  # type: ignore[arg-type]
-        r"int is no subclass of skillweave\.Algorithm",
+        r"int is no subclass of skillweave\.algorithms\.Algorithm",
     ),
     "settings of another store": (
         lambda: register_algorithm(example().A2C, changed(store="replay")),

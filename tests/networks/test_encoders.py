@@ -204,7 +204,8 @@ def test_a_registered_encoder_learns_saves_and_loads(name):
 def test_an_encoder_that_nobody_registered_names_those_that_are():
     with pytest.raises(DeclarationError) as error:
         Net("net", obs_codec(image_space()), Network(encoder="wholes"), 2)
-    said = "'wholes', which is not registered: call register_encoder('wholes', ...)"
+    call = "call skillweave.algorithms.register_encoder('wholes', ...)"
+    said = f"'wholes', which is not registered: {call}"
     assert said in str(error.value)
     assert "registered: halves" in str(error.value)
 
