@@ -16,11 +16,13 @@ import numpy as np
 
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.messages import short
-from skillweave.policies.files import check_file as check_file
-from skillweave.policies.files import load_json as load_json
-from skillweave.policies.files import parse_json as parse_json
-from skillweave.policies.files import read_file as read_file
-from skillweave.policies.files import shown as shown
+from skillweave.policies.files import (
+    check_file as check_file,
+    load_json as load_json,
+    parse_json as parse_json,
+    read_file as read_file,
+    shown as shown,
+)
 from skillweave.settings import Fitting, Unfit, annotations_of
 
 # JSON

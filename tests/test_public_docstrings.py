@@ -9,24 +9,28 @@ import re
 import textwrap
 from collections.abc import Iterator
 from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pages import BLOCK, train_briefly
 
-import skillweave as sw
-from skillweave import Array, Policy, SkillweaveError
+from skillweave import SkillweaveError
 from skillweave.errors import KINDS
+from skillweave.public import HOMES
+from skillweave.types import Array, Policy
 
 ALIASES = ("Array",)
 """Names of what is another library's: the reference explains them."""
+THINGS = {n: getattr(import_module(m), n) for m, homes in HOMES.items() for n in homes}
+"""Every public name's object."""
 ARRAY = re.compile(r"\b(Array|Tensor|Views|Float|Int|Bool)\b")
 
 
 def public_functions(name: str) -> Iterator[tuple[str, Any]]:
     """The function of this name; or the constructor and public methods of the class."""
-    thing = getattr(sw, name)
+    thing = THINGS[name]
     if inspect.ismodule(thing):
         for part in vars(thing).values():
             if inspect.isclass(part) and part.__module__ == thing.__name__:
@@ -76,7 +80,7 @@ def section(text: str, title: str) -> str:
 
 def example_of(name: str) -> str:
     """The Python in a public name's docstring."""
-    return "\n".join(BLOCK.findall(inspect.getdoc(getattr(sw, name)) or ""))
+    return "\n".join(BLOCK.findall(inspect.getdoc(THINGS[name]) or ""))
 
 
 def raises(thing: Any) -> bool:
@@ -114,7 +118,7 @@ def missing(thing: Any) -> list[str]:
     return lacks
 
 
-NAMES = [name for name in sw.__all__ if name not in ALIASES]
+NAMES = [name for name in THINGS if name not in ALIASES]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -123,10 +127,10 @@ def test_a_public_name_says_all_that_a_user_needs(name: str) -> None:
     assert found == {}
 
 
-@pytest.mark.parametrize("public", [n for n in NAMES if dataclasses.is_dataclass(getattr(sw, n))])
+@pytest.mark.parametrize("public", [n for n in NAMES if dataclasses.is_dataclass(THINGS[n])])
 def test_every_field_of_a_public_dataclass_is_explained(public: str) -> None:
     """By the text under it, by the comment beside it, or by the class."""
-    kind, said = getattr(sw, public), set[str]()
+    kind, said = THINGS[public], set[str]()
     for base in kind.__mro__:
         if not base.__module__.startswith("skillweave"):
             continue

@@ -73,7 +73,7 @@ from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
 from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.record import with_returns
-from skillweave.planning.run_log import hand_over_json, hand_over_of
+from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -322,7 +322,7 @@ class Hierarchy(Declaration):
                 alone or together with skills, are the run's log of calls afterwards, as if
                 ``Run.log_calls`` had recorded them; so ``Run.plan`` needs no further steps. Calls
                 that are open at the end are left out. Skills that learnt in these steps have
-                changed since: ``hand_over`` may count their calls, but ``plan`` refuses them. A run
+                changed since: ``handover`` may count their calls, but ``plan`` refuses them. A run
                 that was interrupted logs the calls after it was continued. Nothing else changes.
                 None: that of ``train_defaults``, by default no log.
             log_calls_info: keys of ``info`` to record with the calls.
@@ -811,8 +811,8 @@ class Run:
     def info(self) -> dict[str, Any]:
         """Return its manifest, with the latest saved evaluation under ``evaluation``.
 
-        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
-        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
+        One that sampled actions on request is under ``evaluation_sampled``. ``handover`` has the
+        counts of the log of calls, if there is one: see ``CallLog.handover``.
         """
         self._check_written()
         run = RunDirectory.open(self.path)
@@ -821,7 +821,7 @@ class Run:
             "evaluation_sampled": load_evaluation(run, deterministic=False),
         }
         known = {k: v.to_json() for k, v in scores.items() if v is not None}
-        return run.manifest | known | hand_over_json(hand_over_of(run))
+        return run.manifest | known | handover_json(handover_of(run))
 
     @checked_names
     def log_calls(
@@ -950,7 +950,7 @@ class Run:
         more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
         earlier policy has a cost in the observations of its calls that were done after other skills
         (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
-        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
+        recorded, and the handovers counted: the new weights are kept if this one is clearly better
         and no other one clearly worse. All other weights stay as they are. What was done is in
         ``Run.repairs``.
 
@@ -960,7 +960,7 @@ class Run:
             steps: environment steps of training; measuring takes more. None: 200,000.
             run_dir: a new directory; None: the next number of ``runs/<name>-repair-<n>``.
             done: by skill, the event that a call is for, in place of the skill's ``success``; as
-                for ``planning.hand_over``.
+                for ``planning.handover``.
             calls: calls of the pair to measure at least, before and after; fewer where 500,000
                 steps do not hold them.
             seed: the root of every random stream.

@@ -25,7 +25,7 @@ from skillweave.hierarchy.settings import Apart, Guide, Selection
 from skillweave.messages import short
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
-from skillweave.planning.neighbours import check_features
+from skillweave.planning.neighbors import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.runs.command_words import Caller
 from skillweave.selectors.ready import ReadyValue

@@ -112,7 +112,7 @@ def train(
     """Train, or finish training, the stages of a run; return the policy.
 
     Args:
-        done: the events by which a repair is judged, as for ``planning.hand_over``.
+        done: the events by which a repair is judged, as for ``planning.handover``.
     """
     if run.manifest["kind"] == "agent":
         agent = declaration if isinstance(declaration, PlainAgent) else declaration.plain_agent()

@@ -1,4 +1,4 @@
-"""Attribution of a failed hand-over: to the ends of the first skill, or to the second skill."""
+"""Attribution of a failed handover: to the ends of the first skill, or to the second skill."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from skillweave.errors import RunError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
-from skillweave.planning.hand_over import START, before_each, calls_done, shown_rate, wilson
-from skillweave.planning.neighbours import Standard, nearest
+from skillweave.planning.handover import START, before_each, calls_done, shown_rate, wilson
+from skillweave.planning.neighbors import Standard, nearest
 from skillweave.types import Array
 
 LEAST = 20

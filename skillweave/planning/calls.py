@@ -24,7 +24,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.planning.blame import Blame, blame
 from skillweave.planning.call_file import GOAL, INFO, read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP, CallColumns
-from skillweave.planning.hand_over import CallEnds, Chain, HandOver, call_ends, chain, hand_over
+from skillweave.planning.handover import CallEnds, Chain, Handover, call_ends, chain, handover
 from skillweave.policies.files import checksum
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
@@ -71,9 +71,9 @@ class CallLog(CallColumns):
     """
 
     @checked_names
-    def hand_over(
+    def handover(
         self, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
-    ) -> HandOver:
+    ) -> Handover:
         """Count how often each skill is done after each other one.
 
         A row counts the calls that follow a call of its skill. Calls that the episode's time limit
@@ -89,7 +89,7 @@ class CallLog(CallColumns):
         Raises:
             DeclarationError: ``done`` names an unknown skill, or holds no event.
         """
-        return hand_over(self, done, only_after_done=only_after_done)
+        return handover(self, done, only_after_done=only_after_done)
 
     @checked_names
     def chain(
@@ -103,7 +103,7 @@ class CallLog(CallColumns):
 
         Args:
             *skills: names, in their order.
-            done: as for ``hand_over``.
+            done: as for ``handover``.
             features: as for ``Planner``.
 
         Raises:
@@ -131,7 +131,7 @@ class CallLog(CallColumns):
         Args:
             skill: the second skill.
             after: the first skill, or "start".
-            done: as for ``hand_over``.
+            done: as for ``handover``.
             features: as for ``Planner``; images need them.
 
         Raises:

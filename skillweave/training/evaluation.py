@@ -6,8 +6,7 @@ A pool of environments is faster; all its episodes start from one seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from dataclasses import replace as replaced
+from dataclasses import dataclass, field, replace as replaced
 from typing import Any
 
 import gymnasium as gym
@@ -194,7 +193,7 @@ class Evaluation:
 
     def _hints(self) -> list[str]:
         """Return hints of mistakes, and skills that seldom succeed after one other skill."""
-        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_hand_over", ()))]
+        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_handover", ()))]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -462,7 +461,7 @@ def _scored(
         reflexes.steps(),
         alone,
     )
-    vars(evaluation)["_hand_over"] = tuple(tally.hand_over())
+    vars(evaluation)["_handover"] = tuple(tally.handover())
     if isinstance(tally, CallTally):
         vars(evaluation).update(_goals=tally.goals, _reached=tally.reached)
     return evaluation

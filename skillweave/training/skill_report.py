@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.collecting.judge import Outcome, judge, seen_by
 from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.paths import level_of
-from skillweave.planning.hand_over import HandOver
+from skillweave.planning.handover import Handover
 from skillweave.policies.core import CallEnd, end_with_episode, part_of
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.settings import Count
@@ -202,7 +202,7 @@ class SkillTally:
             reward = outcome.reward
             ended = np.flatnonzero(outcome.why != CallEnd.RUNNING)
             np.add.at(self._ended, (acting[ended], outcome.why[ended]), 1)
-            self._hand_over(played, outcome, ended)
+            self._handover(played, outcome, ended)
             done = outcome.why == CallEnd.OWN
             self._own_with_episode += np.bincount(acting[done & played.over], minlength=count)
             again = self._done[played.episode] == acting
@@ -225,7 +225,7 @@ class SkillTally:
             if len(rows):
                 tally.add(played_below(played, i, rows))
 
-    def _hand_over(self, played: Played, outcome: StepOutcome, ended: Array) -> None:
+    def _handover(self, played: Played, outcome: StepOutcome, ended: Array) -> None:
         """Count the calls that have ``ended`` (m,), by what was done before."""
         assert played.acting is not None
         acting, episode = played.acting[ended], played.episode[ended]
@@ -239,7 +239,7 @@ class SkillTally:
         np.add.at(self._handed[1], place, won[counts])
         self._won[episode] = won
 
-    def hand_over(self) -> list[str]:
+    def handover(self) -> list[str]:
         """Return sentences on skills that succeed much less often after one skill than elsewhere.
 
         Skills without ``success`` are left out.
@@ -247,9 +247,9 @@ class SkillTally:
         names = tuple(self._path + name for name in self.labels)
         nothing = np.zeros(len(names), np.int64)
         sentences = (
-            HandOver(names, self._handed[0], self._handed[1], nothing).weakest() if names else []
+            Handover(names, self._handed[0], self._handed[1], nothing).weakest() if names else []
         )
-        return [*sentences, *(s for below in self._below.values() for s in below.hand_over())]
+        return [*sentences, *(s for below in self._below.values() for s in below.handover())]
 
     def cut(self, episodes: Array) -> None:
         """End calls that might have gone on in ``episodes`` (k,), as another skill acts there."""
@@ -394,9 +394,9 @@ class CallTally:
         below = {} if self._below is None else self._below.reports()
         return {self._path: report} | below
 
-    def hand_over(self) -> list[str]:
+    def handover(self) -> list[str]:
         """Return the sentences of a hierarchy's own skills."""
-        return [] if self._below is None else self._below.hand_over()
+        return [] if self._below is None else self._below.handover()
 
 
 def tally_of(policy: Policy, episodes: int) -> tuple[str | None, SkillTally | CallTally]:

@@ -14,7 +14,7 @@ from skillweave.errors import SkillweaveError
 from skillweave.messages import whole_number
 from skillweave.paths import AGENT, join
 from skillweave.planning import CallLog
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
@@ -36,7 +36,7 @@ from skillweave.reporting.report.curves import (
 )
 from skillweave.reporting.report.film import Film, make_film
 from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.hand_over import Section, hand_over_section
+from skillweave.reporting.report.handover import Section, handover_section
 from skillweave.reporting.report.numbers import number, percent, scale_of
 from skillweave.reporting.report.page import library, write_page
 from skillweave.reporting.report.skills_table import (
@@ -207,13 +207,13 @@ def write_report(
     with_goals = {} if played is None else played.with_goals
     section: Section | None = None
     if log is not None:
-        section = hand_over_section(log, spec, colors, with_goals, filmed=filmed > 0)
+        section = handover_section(log, spec, colors, with_goals, filmed=filmed > 0)
         missing += section.missing
     data = {"curves": curve_data(all_curves, colors), "metrics": metrics_of(all_curves)}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": data["metrics"]}
-    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False, "hand_over": None}
+    context |= {"episodes": 0, "filmed": 0, "legend": [], "has_skills": False, "handover": None}
     context["goals"] = []
     hand_film = None
     if section is not None:
@@ -238,7 +238,7 @@ def _log(run: RunDirectory, missing: list[str]) -> CallLog | None:
     try:
         log = load_calls(run)
     except SkillweaveError as error:
-        missing.append(f"There is no hand-over: {_sentence(error)}")
+        missing.append(f"There is no handover: {_sentence(error)}")
         return None
     return log if log is not None and len(log) else None
 

@@ -1,4 +1,4 @@
-"""Hand-over: how often each skill succeeds after each other one, and chains of skills."""
+"""Handover: how often each skill succeeds after each other one, and chains of skills."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import nearest
+from skillweave.planning.neighbors import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
@@ -26,11 +26,11 @@ START = "start"
 """The row of calls that begin an episode."""
 Z = 1.96
 """Standard deviations of a 95 % interval."""
-NEIGHBOURS = 5
+NEIGHBORS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class HandOver:
+class Handover:
     """Counts of calls and of those that were done, by the skill before.
 
     Attributes:
@@ -82,9 +82,9 @@ class HandOver:
         return float(self.rate[place]), int(self.calls[place])
 
     def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on the skills that are never done, and on weak hand-overs.
+        """Return sentences on the skills that are never done, and on weak handovers.
 
-        A hand-over is weak where a skill is done much less often after one skill than elsewhere.
+        A handover is weak where a skill is done much less often after one skill than elsewhere.
 
         Args:
             least: the fewest calls that count.
@@ -184,7 +184,7 @@ class Chain:
     estimate: float
     """Along logged calls: from where each call ended, the nearest calls of the next skill."""
     product: float
-    """The product of the rates of the hand-over matrix; NaN where a pair has no call."""
+    """The product of the rates of the handover matrix; NaN where a pair has no call."""
     rates: tuple[float, ...]
     """The factors of the product."""
     calls: tuple[int, ...]
@@ -202,10 +202,10 @@ class Chain:
         return f"{text}{self.product:.0%} as the product {factors}"
 
 
-def hand_over(
+def handover(
     log: CallColumns, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
-) -> HandOver:
-    """See ``CallLog.hand_over``."""
+) -> Handover:
+    """See ``CallLog.handover``."""
     count = len(log.skills)
     won = calls_done(log, done)
     before = before_each(log, won, only_after_done)
@@ -219,7 +219,7 @@ def hand_over(
         for name, judged in zip(log.skills, log.own_success, strict=True)
         if not judged and name not in (done or {})
     )
-    return HandOver(log.skills, calls, did, cut, by_itself)
+    return Handover(log.skills, calls, did, cut, by_itself)
 
 
 def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> Array:
@@ -227,7 +227,7 @@ def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> A
 
     Args:
         won: (C,) bool, the calls that were done.
-        only_after_done: as for ``CallLog.hand_over``.
+        only_after_done: as for ``CallLog.handover``.
     """
     before = np.full(len(log), -1)
     following = log.followed_by
@@ -262,7 +262,7 @@ def chain(
     for i in reversed(range(len(skills) - 1)):
         here = maps[numbers[i + 1]]
         starts, ends = here(log.start[rows[i + 1]]), here(log.end[rows[i]])
-        near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
+        near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
         follows = (weights_of(distance) * chance[near]).sum(1)
         may = log.may_follow[rows[i]].reshape(len(rows[i]), len(log.skills), -1)
         goes_on = won[rows[i]] & ~log.terminated[rows[i]]
@@ -273,7 +273,7 @@ def chain(
                 "(its initiation() is False there), so this chain cannot be run"
             )
         chance = np.where(follows_on, follows, 0.0)
-    matrix = hand_over(log, done)
+    matrix = handover(log, done)
     pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
     rates = tuple(rate for rate, _ in pairs)
     return Chain(
