@@ -1,4 +1,4 @@
-"""The course of ``Run.repair``: measure a hand-over, train on, measure again, keep the better."""
+"""The course of ``Run.repair``: measure a handover, train on, measure again, keep the better."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ D = TypeVar("D", bound=Declaration)
 USUAL_STEPS = 200_000
 """Steps of a repair for which none are given."""
 GOOD = 0.95
-"""A hand-over that is done at least this often needs no repair."""
+"""A handover that is done at least this often needs no repair."""
 MADE_ELSEWHERE = ("metrics_bytes", "lineage_bytes", "sha256", "policies", "starts", "continued")
 """Fields of a stage's entry that belong to files of the run that it was trained in."""
 OF_THE_RUN = ("id", "sha256", "versions", "created", "stages", "track")
@@ -185,7 +185,7 @@ def _measured(
     num_envs: int,
     progress: Progress,
 ) -> Measured:
-    """Measure the hand-over as it is.
+    """Measure the handover as it is.
 
     Raises:
         DeclarationError: there is nothing to repair, or the skill may not start there.

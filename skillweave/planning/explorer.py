@@ -12,7 +12,7 @@ from skillweave.messages import short, whole_number
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import check_features, check_number
+from skillweave.planning.neighbors import check_features, check_number
 from skillweave.planning.states import planning_states
 from skillweave.policies.core import Memory, Policy, Turn
 from skillweave.types import Array
@@ -36,7 +36,7 @@ class Explorer(Policy):
         radius: in standard deviations of the features, over all of them; None: a quarter of one
             in each feature, 0.25 √F.
         features: as for ``Planner``; what makes two calls alike, a place for example.
-        neighbours: K.
+        neighbors: K.
         gamma: γ of one step.
         temperature: as for ``Planner``.
         every: steps after which it plans again.
@@ -50,7 +50,7 @@ class Explorer(Policy):
         radius: float | None = None,
         *,
         features: Any = None,
-        neighbours: int = 3,
+        neighbors: int = 3,
         gamma: float = 0.997,
         temperature: float = 0.03,
         every: int = 4_000,
@@ -64,7 +64,7 @@ class Explorer(Policy):
         check_number("Explorer: temperature", temperature, 1e-6, 10.0)
         self.every = whole_number(every, "Explorer: every", 1)
         self._radius, self._features, self._gamma = radius, features, gamma
-        self._neighbours = whole_number(neighbours, "Explorer: neighbours", 1)
+        self._neighbors = whole_number(neighbors, "Explorer: neighbors", 1)
         self._temperature = temperature
         self._choices = 0
         self._graph: CallGraph | None = None
@@ -78,7 +78,7 @@ class Explorer(Policy):
         """Plan on the calls so far."""
         if len(log) < 2:
             return
-        graph = CallGraph(log, self._features, self._neighbours)
+        graph = CallGraph(log, self._features, self._neighbors)
         nothing = RewardMachine({})
         readings = nothing.acts.read(graph.log.as_steps())
         judged = graph.judge(

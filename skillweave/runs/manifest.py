@@ -142,7 +142,7 @@ class Start(TypedDict):
 
 
 class Matrix(TypedDict):
-    """Counts of calls, and of those that were done, by the skill before (``HandOver``)."""
+    """Counts of calls, and of those that were done, by the skill before (``Handover``)."""
 
     skills: list[str]
     calls: list[list[Count]]

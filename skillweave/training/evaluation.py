@@ -6,8 +6,7 @@ A pool of environments is faster; all its episodes start from one seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from dataclasses import replace as replaced
+from dataclasses import dataclass, field, replace as replaced
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +37,7 @@ from skillweave.training.skill_report import (
     SkillReport,
     all_steps,
     skill_reports,
-    weak_hand_overs,
+    weak_handovers,
 )
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
@@ -200,7 +199,7 @@ class Evaluation:
 
     def _hints(self) -> list[str]:
         """Return hints of mistakes, and skills that seldom succeed after one other skill."""
-        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_hand_over", ()))]
+        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_handover", ()))]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -464,7 +463,7 @@ def _scored(
         dict(calls.reflexes),
         None if skill is None else policy.path,
     )
-    vars(evaluation)["_hand_over"] = tuple(weak_hand_overs(calls)) if has_skills else ()
+    vars(evaluation)["_handover"] = tuple(weak_handovers(calls)) if has_skills else ()
     if skill is not None:
         reached = None
         if skill.defines("success"):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from skillweave.paths import level_of
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.reporting.report.facts import number, percent, scale_of
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
