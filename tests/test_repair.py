@@ -273,7 +273,7 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     entry = {"name": "r", "budget": 100, "repair": {"skill": "press", "after": "flip"}}
     collector = repair.repair_stage(roles, entry).learning_task(policies).collector(2, None)
     assert isinstance(collector, Collector)
-    assert collector.call_limit == 5, "of 8 by itself"
+    assert collector.limit == 5, "of 8 by itself"
 
 
 def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def render_policy(
     episodes = whole_number(episodes, "episodes", 1)
     every = whole_number(every, "every", 1)
     seed = whole_number(seed, "seed", 0)
-    limit = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
+    max_steps = LONG_EPISODE if max_steps is None else whole_number(max_steps, "max_steps", 1)
     rng = rng or (Seeds(seed) / "render").numpy()
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")
@@ -92,7 +92,7 @@ def render_policy(
                 EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
             ):
                 film = _Film(env, video, every, label)
-                whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+                whole = SeededEpisodes(engine, range(seed, seed + episodes), max_steps)
                 how: Any = {"deterministic": deterministic, "rng": rng}
                 for played in play(policy, whole, before_step=film.before_step, **how):
                     film.after_step(played)

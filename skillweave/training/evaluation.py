@@ -297,7 +297,7 @@ def evaluate(
     """
     episodes = whole_number(episodes, "episodes", 1)
     seed = whole_number(seed, "seed", 0)
-    limit = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
+    max_steps = None if max_steps is None else whole_number(max_steps, "max_steps", 1)
     n = USUAL_ENVS if num_envs is None else whole_number(num_envs, "num_envs", 1)
     if log_calls:
         check_logged(policy, info)
@@ -306,7 +306,7 @@ def evaluate(
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     with global_generators(Seeds(seed) / "evaluation"):
         keys = tuple(info) if log_calls else None
-        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch, keys)
+        return _evaluate(policy, spec, episodes, seed, deterministic, n, max_steps, watch, keys)
 
 
 def _evaluate(
@@ -316,7 +316,7 @@ def _evaluate(
     seed: int,
     deterministic: bool,
     n: int,
-    limit: int | None,
+    max_steps: int | None,
     watch: Callable[[Played], None] | None,
     info: tuple[str, ...] | None,
 ) -> Evaluation:
@@ -332,7 +332,7 @@ def _evaluate(
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS
-        most = limit or longest_evaluation(own_limit)
+        most = max_steps or longest_evaluation(own_limit)
         starts = SeededEpisodes(envs, seeds, most)
         first = starts.obs[:1].copy()
         moments = play(
@@ -342,7 +342,7 @@ def _evaluate(
             rng=np.random.default_rng([seed, 1]),
             seed=seed,
         )
-        if limit is None and own_limit is None:
+        if max_steps is None and own_limit is None:
             moments = _with_notice(moments, spec.name, most)
         how: dict[str, Any] = {"steps": False} if info is None else {"info": info, "spec": spec}
         calls = PlayedCalls(policy, spaces, own_rewards=True, **how)
