@@ -26,6 +26,7 @@ from skillweave.hierarchy.fitting import ready_policies
 from skillweave.hierarchy.roles import roles_of
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import with_goal
+from skillweave.types import Array, HierarchyPolicy
 
 ENV = "CartPole-v1"
 NETWORK = sw.Network((64, 64))
@@ -34,16 +35,16 @@ NETWORK = sw.Network((64, 64))
 class Left(sw.Skill):
     """Ends by itself."""
 
-    def termination(self, step: sw.Step) -> sw.Array:
-        ended: sw.Array = step.next_obs[:, 0] < -0.1
+    def termination(self, step: sw.Step) -> Array:
+        ended: Array = step.next_obs[:, 0] < -0.1
         return ended
 
 
 class Right(sw.Skill):
     """May start only in some places."""
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
-        may: sw.Array = obs[:, 0] < 1.0
+    def initiation(self, obs: Array) -> Array:
+        may: Array = obs[:, 0] < 1.0
         return may
 
 
@@ -89,9 +90,9 @@ def policies() -> dict[str, Any]:
     skills = (Left(), Right(), Center())
     act = tuple(network(seen, taken, i) for i in range(3))
     selector = network(seen, gym.spaces.Discrete(3), 3)
-    inner = sw.HierarchyPolicy(selector, SkillSet(skills, act, call_steps=20))
+    inner = HierarchyPolicy(selector, SkillSet(skills, act, call_steps=20))
     over = SkillSet((Inner(), Center()), (inner, act[2]), call_steps=40)
-    nested = sw.HierarchyPolicy(network(seen, gym.spaces.Discrete(2), 4), over)
+    nested = HierarchyPolicy(network(seen, gym.spaces.Discrete(2), 4), over)
     return {"flat": act[0], "hierarchy": inner, "nested": nested}
 
 
@@ -107,7 +108,7 @@ def policies_with_goals(plain: Any) -> dict[str, tuple[Any, Any]]:
     act = tuple(network(seen, env.action_space, i) for i in range(3))
     choices = SkillSet(skills, act).choice_space
     selector = network(env.observation_space, choices, 3)
-    goals = sw.HierarchyPolicy(selector, SkillSet(skills, act, call_steps=20))
+    goals = HierarchyPolicy(selector, SkillSet(skills, act, call_steps=20))
     mapping = {"sees": (2, 3, 0, 1, sw.Goal()), "acts": sw.Acts(to=(1, 0))}
     modules = of_modules((Left(), Right(), Center()), plain.selector, 4, {})
     mapped = of_modules(skills, selector, 6, mapping)
@@ -116,7 +117,7 @@ def policies_with_goals(plain: Any) -> dict[str, tuple[Any, Any]]:
 
 def of_modules(
     skills: Sequence[sw.Skill], selector: Any, inputs: int, mapping: dict[str, Any]
-) -> sw.HierarchyPolicy:
+) -> HierarchyPolicy:
     """Return a hierarchy of modules that have this number of inputs."""
     for skill in skills:
         wide, narrow = torch.nn.Linear(inputs, 64), torch.nn.Linear(64, 2)
@@ -124,7 +125,7 @@ def of_modules(
         skill.policy = sw.from_torch(torch.nn.Sequential(*layers), **mapping)
     act = ready_policies(roles_of(sw.Hierarchy(ENV, skills)))
     ready = SkillSet(tuple(skills), tuple(act[s.name] for s in skills), call_steps=20)
-    return sw.HierarchyPolicy(selector, ready)
+    return HierarchyPolicy(selector, ready)
 
 
 def acts_per_second(policy: Any, steps: int) -> float:

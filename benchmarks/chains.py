@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from examples import bridge, doorkey, yard
-from skillweave import PPO, Array, Hierarchy, Run, recipes
+from skillweave import PPO, Hierarchy, Run, recipes
 from skillweave.cli.overrides import apply_overrides
 from skillweave.recipes import lunar_lander
+from skillweave.types import Array
 
 
 @dataclass(frozen=True)

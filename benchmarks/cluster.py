@@ -39,8 +39,9 @@ import numpy as np
 
 from benchmarks.collecting import EPOCHS, NETWORK, grid, ours
 from benchmarks.common import report, table
-from skillweave import PPO, EnvSpec, Evolution, Network, Ray, train_agent
+from skillweave import PPO, EnvSpec, Network, Ray, train_agent
 from skillweave.collecting.cluster import imported
+from skillweave.evolution import Evolution
 from skillweave.types import Array
 
 SLEEP = 2e-3

@@ -23,7 +23,8 @@ import numpy as np
 
 from benchmarks.common import report, table, workers
 from benchmarks.declared_worlds import Delivery, Locked, Reach, Switches, Track
-from skillweave import Array, EnvSpec, Hierarchy, Skill, Step
+from skillweave import EnvSpec, Hierarchy, Skill, Step
+from skillweave.types import Array
 
 WAYS = ("new", "apart", "flat")
 

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array
+from skillweave.types import Array
 
 
 class _World(gym.Env[Any, Any]):

@@ -19,8 +19,9 @@ from typing import Any
 from benchmarks.declarations import compare, gained, scored
 from benchmarks.declared_worlds import Locked, Switches
 from examples.bridge import AXE, BRIDGE, WOOD, River
-from skillweave import Array, EnvSpec, Hierarchy, Skill, Step
+from skillweave import EnvSpec, Hierarchy, Skill, Step
 from skillweave.toys import KeyDoor
+from skillweave.types import Array
 
 WAYS = ("open", "closed")
 

@@ -21,8 +21,8 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.common import median, report, table
-from skillweave import HierarchyPolicy, Player, Run, recipes
-from skillweave.types import Array
+from skillweave import Player, Run, recipes
+from skillweave.types import Array, HierarchyPolicy
 
 TIE = 1e-4
 """Two actions whose logits differ by less may be swapped by rounding."""

@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.grouped import regroup
-from skillweave import Array, Lengths
+from skillweave import Lengths
 from skillweave.recipes import mazes
+from skillweave.types import Array
 
 FIXED = (5, 10, 25, 50)
 CHOSEN = "chosen"

@@ -22,9 +22,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Apart, Array, Hierarchy, Network, Skill, Step, register_encoder
+from skillweave import Apart, Hierarchy, Network, Skill, Step
+from skillweave.algorithms import register_encoder
 from skillweave.recipes import _mazes, mazes
 from skillweave.recipes._mazes import PLACE, SPEED
+from skillweave.types import Array
 
 SKILL_STEPS, SELECTOR_STEPS = 40_000, 948_000
 """Together they are the recipe's, a million."""

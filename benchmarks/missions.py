@@ -20,6 +20,7 @@ import numpy as np
 
 import skillweave as sw
 from benchmarks.common import table
+from skillweave.errors import DeclarationError, RunError
 from skillweave.planning import Planner
 from skillweave.toys import KeyDoor
 from skillweave.types import Array, Step
@@ -152,9 +153,9 @@ def judged(run: sw.Run, mission: str, words: Words, episodes: int) -> Row | None
     """Return what is predicted and measured; None: it is no mission."""
     try:
         planned = run.plan(mission, predicates=words)
-    except sw.DeclarationError:
+    except DeclarationError:
         return None
-    except sw.RunError:
+    except RunError:
         return Row(mission, 0.0, 0.0, True)
     chance, planner = planned.explain().chance, planned.hierarchy.selector
     assert isinstance(planner, Planner)

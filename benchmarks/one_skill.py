@@ -17,7 +17,6 @@ from pathlib import Path
 from benchmarks.common import median, report, table
 from skillweave import (
     PPO,
-    Array,
     EnvSpec,
     Hierarchy,
     Network,
@@ -27,6 +26,7 @@ from skillweave import (
     Together,
     train_agent,
 )
+from skillweave.types import Array
 
 SPEC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 CONFIG = PPO(num_envs=16, n_steps=64, network=Network((64, 64), "tanh"))

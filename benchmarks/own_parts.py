@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from skillweave import Apart, Array, Hierarchy, Skill, Step
+from skillweave import Apart, Hierarchy, Skill, Step
 from skillweave.recipes import pick_and_place as whole
 from skillweave.recipes._arm import is_held, spec
+from skillweave.types import Array
 
 ARM, FINGERS = slice(0, 3), 3
 REST = (0.0, 0.0, 0.0, "hold")

@@ -27,7 +27,8 @@ import torch
 
 from benchmarks.common import median, report, run_command, table, warm_up
 from benchmarks.updates import rollout, seconds
-from skillweave import PPO, EnvSpec, Evolution, Network
+from skillweave import PPO, EnvSpec, Network
+from skillweave.evolution import Evolution
 from skillweave.evolution.architecture import Change, rebuilt
 from skillweave.evolution.population import Population
 from skillweave.evolution.stacks import Member, join, split

@@ -1,8 +1,8 @@
-"""Repair of a hand-over: ``hover`` of ``lander-missions``, 100 steps in its box, after ``go_left``.
+"""Repair of a handover: ``hover`` of ``lander-missions``, 100 steps in its box, after ``go_left``.
 
     python -m benchmarks.repair --seeds 0 1 2 3 4
 
-For each seed of the repair it prints the hand-over matrices before and after, and whether the
+For each seed of the repair it prints the handover matrices before and after, and whether the
 result was kept. ``--run`` repairs the skills of another run, of other seeds for example.
 """
 

@@ -19,16 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common import median, report, table, workers
-from skillweave import (
-    PPO,
-    Evolution,
-    Mutations,
-    Network,
-    Range,
-    Tournament,
-    Truncation,
-    train_agent,
-)
+from skillweave import PPO, Network, train_agent
+from skillweave.evolution import Evolution, Mutations, Range, Tournament, Truncation
 
 BUDGET, GENERATIONS = 4_000_000, 20
 PRIOR = {

@@ -16,7 +16,8 @@ from typing import cast
 
 from benchmarks.common import median, recorded, report, table, warm_up
 from benchmarks.grouped import act_by
-from skillweave import Hierarchy, HierarchyPolicy, recipes
+from skillweave import Hierarchy, recipes
+from skillweave.types import HierarchyPolicy
 
 
 def stable_baselines3(steps: int, seed: int) -> float:

@@ -35,9 +35,10 @@ from benchmarks.grouped import PLACES, act_by, regroup
 from benchmarks.pay.agents import by_lot
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.suite import Seldom, Shaped
-from skillweave import PPO, Array, Hierarchy, Lengths, Run, Skill, SkillweaveError, Step
+from skillweave import PPO, Hierarchy, Lengths, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.training import manifest
+from skillweave.types import Array
 
 EPSILONS = {"epsilon": 0.1, "epsilon_final": 0.0}
 """Of a selector over skills that are trained already: with a high or constant epsilon, it never

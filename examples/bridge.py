@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
+from skillweave.types import Array
 
 WIDTH, HEIGHT, RIVER, LONGEST = 13, 9, 8, 80
 X, Y, AXE, WOOD, BRIDGE = range(5)
@@ -81,20 +82,20 @@ class Get(sw.Skill):
     max_steps = 20
     what = AXE
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (step.next_obs[:, self.what] > step.obs[:, self.what]) - 0.02
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return step.next_obs[:, self.what] == 1
 
-    def success(self, step: sw.Step) -> sw.Array:
+    def success(self, step: sw.Step) -> Array:
         return self.termination(step)
 
 
 class GetAxe(Get):
     """Fetches the axe."""
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return obs[:, AXE] == 0
 
 
@@ -103,7 +104,7 @@ class Chop(Get):
 
     what = WOOD
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return (obs[:, AXE] == 1) & (obs[:, WOOD] == 0) & (obs[:, BRIDGE] == 0)
 
 
@@ -112,7 +113,7 @@ class Build(Get):
 
     what = BRIDGE
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return obs[:, WOOD] == 1
 
 
@@ -121,13 +122,13 @@ class Cross(sw.Skill):
 
     max_steps = 20
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (step.next_obs[:, X] == WIDTH - 1) - 0.02
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return step.next_obs[:, X] == WIDTH - 1
 
-    def success(self, step: sw.Step) -> sw.Array:
+    def success(self, step: sw.Step) -> Array:
         return self.termination(step)
 
 

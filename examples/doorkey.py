@@ -19,6 +19,8 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
+from skillweave.envs import PoolWrapper
+from skillweave.types import Array
 
 KEY, DOOR, OPEN = 5, 4, 0
 ROOM = "DoorKey-8x8"
@@ -32,14 +34,14 @@ def make(render_mode: str | None = None, room: str = ROOM) -> gym.Env[Any, Any]:
     return ImgObsWrapper(gym.make(f"MiniGrid-{room}-v0", render_mode=render_mode))
 
 
-class Image(sw.PoolWrapper):
+class Image(PoolWrapper):
     """Observations of EnvPool's rooms as those of ``make``: the image alone."""
 
     def __init__(self, pool: Any) -> None:
         super().__init__(pool, pool.observation_space["image"])
 
-    def see(self, obs: Any, ids: sw.Array) -> sw.Array:
-        image: sw.Array = obs["image"]
+    def see(self, obs: Any, ids: Array) -> Array:
+        image: Array = obs["image"]
         return image
 
 
@@ -48,12 +50,12 @@ def many(num_envs: int, threads: int, seed: int, room: str = ROOM) -> Image:
     return Image(sw.envpool(f"MiniGrid-{room}-v0", num_envs, threads, seed))
 
 
-def carrying(obs: sw.Array) -> sw.Array:
+def carrying(obs: Array) -> Array:
     """(N,) bool, the key is in the agent's hands."""
     return obs[:, 3, 6, 0] == KEY
 
 
-def door_open(obs: sw.Array) -> sw.Array:
+def door_open(obs: Array) -> Array:
     """(N,) bool, an open door is in view."""
     return ((obs[..., 0] == DOOR) & (obs[..., 2] == OPEN)).any((1, 2))
 
@@ -63,10 +65,10 @@ class GetKey(sw.Skill):
 
     max_steps = 64
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (carrying(step.next_obs) & ~carrying(step.obs)) - 0.01
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return carrying(step.next_obs)
 
 
@@ -75,13 +77,13 @@ class OpenDoor(sw.Skill):
 
     max_steps = 64
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return carrying(obs)
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (door_open(step.next_obs) & ~door_open(step.obs)) - 0.01
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return door_open(step.next_obs)
 
 
@@ -90,7 +92,7 @@ class Goal(sw.Skill):
 
     max_steps = 64
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return step.reward * 10 - 0.01
 
 
@@ -125,9 +127,9 @@ def declare(
     # take less time. Other rooms are taken to be harder: where successes are rare at first, PPO
     # forgets one before the next comes.
     here = room == ROOM
-    fast = {"batch_size": 512, "learning_rate": 1.4e-3}
+    fast: dict[str, Any] = {"batch_size": 512, "learning_rate": 1.4e-3}
     learner = algorithm(**fast) if here else algorithm(sw.SelfImitationPPO)
-    settings = {
+    settings: dict[str, Any] = {
         "call_steps": 32,
         "steps": steps,
         # At first any skill that may start is called: else one that may start anywhere takes all.
@@ -140,7 +142,7 @@ def declare(
         "algorithm": learner,
         "selector": learner,
     } | how
-    other = {} if here else {"room": room}
+    other: dict[str, Any] = {} if here else {"room": room}
     env = sw.EnvSpec(make, other, pool=partial(many, **other), engine=engine, workers=workers)
     return sw.Hierarchy(env, [GetKey(), OpenDoor(), Goal()], **settings)
 

@@ -18,15 +18,8 @@ import stable_baselines3 as sb3
 import torch
 from onnx import TensorProto, helper
 
-from skillweave import (
-    PPO,
-    Apart,
-    Array,
-    Hierarchy,
-    Skill,
-    from_onnx,
-    from_sb3,
-)
+from skillweave import PPO, Apart, Hierarchy, Skill, from_onnx, from_sb3
+from skillweave.types import Array
 
 ENV = "CartPole-v1"
 

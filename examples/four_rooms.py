@@ -15,14 +15,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import (
-    DQN,
-    Apart,
-    Array,
-    Hierarchy,
-    Network,
-    Skill,
-)
+from skillweave import DQN, Apart, Hierarchy, Network, Skill
+from skillweave.types import Array
 
 PLAN = [
     "#############",

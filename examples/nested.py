@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
+from skillweave.types import Array
 
 SIZE = 6
 WAITING, CARRIED, DELIVERED = 0.0, 0.5, 1.0
@@ -55,7 +56,7 @@ class Errands(gym.Env[Any, Any]):
         done = bool((self.state == DELIVERED).all())
         return self._seen(), paid - 0.01, done, self.left == 0 and not done, {"success": done}
 
-    def _seen(self) -> sw.Array:
+    def _seen(self) -> Array:
         rows = [np.append(self.places[2 * k : 2 * k + 2] / SIZE, self.state[k]) for k in (0, 1)]
         return np.concatenate([self.agent / SIZE, *rows]).astype(np.float32)
 
@@ -66,7 +67,7 @@ class OfErrand(sw.Skill):
     def __init__(self, errand: str) -> None:
         self.column = 6 + 5 * ERRANDS[errand]
 
-    def state(self, obs: sw.Array) -> sw.Array:
+    def state(self, obs: Array) -> Array:
         """(N,), how far the errand is."""
         return obs[:, self.column]
 
@@ -76,13 +77,13 @@ class Fetch(OfErrand):
 
     max_steps = 30
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return self.state(obs) < DELIVERED
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (self.state(step.next_obs) > self.state(step.obs)) - 0.02
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return self.state(step.next_obs) >= CARRIED
 
 
@@ -91,13 +92,13 @@ class Deliver(OfErrand):
 
     max_steps = 30
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return self.state(obs) == CARRIED
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return (self.state(step.next_obs) > self.state(step.obs)) - 0.02
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return self.state(step.next_obs) == DELIVERED
 
 
@@ -113,12 +114,12 @@ def declare(steps: int = 150_000, **how: Any) -> sw.Hierarchy:
         network=sw.Network(hidden=(64, 64)),
     )
     selection = sw.Selection(call_cost=0.01, greedy_skills=False)
-    settings = {"algorithm": learner, "selector": learner, "selection": selection}
-    errands = [
+    settings: dict[str, Any] = {"algorithm": learner, "selector": learner, "selection": selection}
+    errands: list[Any] = [
         sw.Hierarchy(env, [Fetch(name), Deliver(name)], call_steps=30, name=name, **settings)
         for name in ERRANDS
     ]
-    above = {"call_steps": 40, "steps": steps} | settings
+    above: dict[str, Any] = {"call_steps": 40, "steps": steps} | settings
     above["together"] = sw.Together(task_weight=0.0, epsilon=0.5, epsilon_final=0.05)
     return sw.Hierarchy(env, errands, **above | how)
 

@@ -13,7 +13,8 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from skillweave import (
+from skillweave import train_agent
+from skillweave.algorithms import (
     ActingParams,
     ActionHead,
     AgentState,
@@ -24,16 +25,15 @@ from skillweave import (
     ParameterGroup,
     Report,
     Rollout,
-    Seeds,
     adam_,
     clip_grad_norm_,
     gae,
     mask_logits,
     masked_mean,
-    normalise,
+    normalize,
     register_algorithm,
-    train_agent,
 )
+from skillweave.types import Seeds
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class A2CAlgorithm(Algorithm):
         mask = None if rollout.mask is None else rollout.mask.flatten(1, 2)
         head = self.actor(leaves, inputs)
         log_prob, entropy = self.head.stats(head, None, mask, rollout.action.flatten(1, 2))
-        gain = log_prob.unflatten(1, lead) * normalise(advantage, valid)
+        gain = log_prob.unflatten(1, lead) * normalize(advantage, valid)
         policy_loss = -masked_mean(gain, valid)
         value_loss = 0.5 * masked_mean((value - returns).square(), valid)
         bonus = masked_mean(entropy, flat_valid)

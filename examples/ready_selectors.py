@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
-from skillweave import Array
+from skillweave.types import Array
 
 PLACE, KEY, DOOR = range(3)
 

@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import skillweave as sw
+from skillweave.envs import PoolWrapper, one_of
 
 POINTS = 4
 SECONDS = 30  # for each point
@@ -31,7 +32,7 @@ SEEN = gym.spaces.Dict(
 )
 
 
-class Missions(sw.PoolWrapper):
+class Missions(PoolWrapper):
     """Dogs that walk to four points each. Places are complex: metres east, and i metres north.
 
     Observations: a dog's ``state``, and its next ``point``, metres forward and left of it. A dog
@@ -168,7 +169,7 @@ def main():
     parser.add_argument("--by-hand", action="store_true", help="steer by a rule, without training")
     parser.add_argument("--flat", action="store_true", help="PPO moves the joints, without a skill")
     args = parser.parse_args()
-    env = sw.EnvSpec(sw.one_of(Missions), pool=Missions)
+    env = sw.EnvSpec(one_of(Missions), pool=Missions)
     if args.flat:
         run = sw.train_agent(env, sw.PPO(gamma=0.998), args.steps, args.out, seed=args.seed)
     else:

@@ -18,18 +18,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from skillweave import (
-    Array,
-    Evaluation,
-    Hierarchy,
-    HierarchyPolicy,
-    OptionsEnv,
-    Policy,
-    Skill,
-    evaluate,
-    from_function,
-    make_options_env,
-)
+from skillweave import Hierarchy, Skill, evaluate, from_function, make_options_env
+from skillweave.envs import OptionsEnv
+from skillweave.types import Array, Evaluation, HierarchyPolicy, Policy
 
 GAMMA = 0.999  # of one environment step
 CALL_STEPS = 10

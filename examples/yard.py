@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 import skillweave as sw
+from skillweave.types import Array
 
 BUTTON = np.array([-0.8, 0.8])
 FLAG = np.array([0.8, -0.8])
@@ -70,20 +71,20 @@ class Change(sw.Skill):
     max_steps = 100
     what = OPEN
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return step.next_obs[:, self.what] - step.obs[:, self.what]
 
-    def termination(self, step: sw.Step) -> sw.Array:
+    def termination(self, step: sw.Step) -> Array:
         return step.next_obs[:, self.what] == 1
 
-    def success(self, step: sw.Step) -> sw.Array:
+    def success(self, step: sw.Step) -> Array:
         return self.termination(step)
 
 
 class Press(Change):
     """Goes to the button, which opens the gate."""
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return obs[:, OPEN] == 0
 
 
@@ -92,7 +93,7 @@ class Pass(Change):
 
     what = BEHIND
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return (obs[:, OPEN] == 1) & (obs[:, BEHIND] == 0)
 
 
@@ -101,13 +102,13 @@ class Reach(sw.Skill):
 
     max_steps = 100
 
-    def initiation(self, obs: sw.Array) -> sw.Array:
+    def initiation(self, obs: Array) -> Array:
         return obs[:, BEHIND] == 1
 
-    def reward(self, step: sw.Step) -> sw.Array:
+    def reward(self, step: sw.Step) -> Array:
         return step.reward
 
-    def success(self, step: sw.Step) -> sw.Array:
+    def success(self, step: sw.Step) -> Array:
         return step.terminated
 
 

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from skillweave.policies.errors import DeclarationError as DeclarationError
-from skillweave.policies.errors import PolicyError as PolicyError
-from skillweave.policies.errors import RunError as RunError
-from skillweave.policies.errors import SkillError as SkillError
-from skillweave.policies.errors import SkillweaveError as SkillweaveError
-from skillweave.policies.errors import printable
+from skillweave.policies.errors import (
+    DeclarationError as DeclarationError,
+    PolicyError as PolicyError,
+    RunError as RunError,
+    SkillError as SkillError,
+    SkillweaveError as SkillweaveError,
+    printable,
+)
 from skillweave.tracebacks import ShortTraceback
 
 SkillweaveError._render_traceback_ = ShortTraceback._render_traceback_  # type: ignore[attr-defined]

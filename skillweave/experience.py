@@ -68,7 +68,7 @@ SCHEMA: dict[str, Column] = {
     "skill": Column(raw=True, rollout=False),  # (T, N) int64, the skill that acts
     "goal": Column(raw=True, rollout=False),  # (T, N, *goal_shape), under the path of a skill
     "call_end": Column(raw=True, rollout=False),  # (T, N) int8, ``CallEnd`` after the step
-    "call_limit": Column(raw=True, rollout=False),  # (T, N) int64, the length that was chosen
+    "call_length": Column(raw=True, rollout=False),  # (T, N) int64, the length that was chosen
     "call_succeeded": Column(raw=True, rollout=False),  # (T, N) bool, where calls ended
     "chances": Column(raw=True, rollout=False),  # (T, N, A) float32, of the guide's latest choice
     "guide_allows": Column(raw=True, rollout=False),  # (T, N, A) bool, of next choices

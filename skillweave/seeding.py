@@ -27,9 +27,9 @@ class Seeds:
     """A node of the seed tree; ``Seeds(7) / "landing" / 17`` is a node two levels below.
 
     ```python
-    import skillweave as sw
+    from skillweave.types import Seeds
 
-    noise = (sw.Seeds(7) / "landing" / 17).numpy().normal(size=3)  # always the same three
+    noise = (Seeds(7) / "landing" / 17).numpy().normal(size=3)  # always the same three
     ```
     """
 

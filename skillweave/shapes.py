@@ -7,8 +7,6 @@ In a shape, each letter is an axis and means the same size in a whole signature;
 any number of axes, ``#`` before a name lets an axis be 1 instead.
 """
 
-from typing import Annotated as Bool
-from typing import Annotated as Float
-from typing import Annotated as Int
+from typing import Annotated as Bool, Annotated as Float, Annotated as Int
 
 __all__ = ["Bool", "Float", "Int"]

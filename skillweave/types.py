@@ -6,14 +6,27 @@ This module imports no torch.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from gymnasium import Space
 
-from skillweave.policies.core import Array as Array
-from skillweave.policies.core import Step as Step
-from skillweave.policies.core import read_only as read_only
+from skillweave.policies.core import (
+    Array as Array,
+    LastCall as LastCall,
+    Step as Step,
+    read_only as read_only,
+)
+from skillweave.public import lazy
+from skillweave.seeding import Seeds as Seeds
+
+if TYPE_CHECKING:
+    from skillweave.export.write import Export as Export
+    from skillweave.hierarchy.policy import HierarchyPolicy as HierarchyPolicy
+    from skillweave.training.callback import TrainEvent as TrainEvent
+    from skillweave.training.evaluation import Evaluation as Evaluation
+else:
+    __all__, __getattr__, __dir__ = lazy(__name__)
 
 T = TypeVar("T")
 Memory: TypeAlias = dict[str, Array]

@@ -19,8 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from declaring import plainly
-from hypothesis import HealthCheck, Phase, given, seed, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, given, seed, settings, strategies as st
 
 from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, EnvSpec, Hierarchy, Network, Reflex, Skill
 from skillweave.errors import SkillweaveError

@@ -18,6 +18,7 @@ from shared_runs import SMALL
 
 import skillweave as sw
 from skillweave.collecting.user_code import changes, code_sum, environment_texts, skill_texts
+from skillweave.errors import RunError
 from skillweave.planning import CallLog, Mission, Planner, join
 from skillweave.runs.directory import CALLS
 
@@ -244,7 +245,7 @@ def test_a_log_is_refused_where_calls_would_end_elsewhere(edited: Any, run: sw.R
         return policy.skills
 
     used_log(run).check_skills(skills("np.abs", "np.square"))  # another reward
-    with pytest.raises(sw.RunError, match="the termination of skill 'to_1' has changed"):
+    with pytest.raises(RunError, match="the termination of skill 'to_1' has changed"):
         used_log(run).check_skills(skills("> 9", "> 8"))
 
 
@@ -271,5 +272,5 @@ def test_logs_of_two_environments_are_not_mixed(edited: Any, run: sw.Run) -> Non
     with pytest.warns(UserWarning, match=r"They are now in calls-1\.safetensors"):
         new = now.log_calls(100)
     assert len(now.calls) == len(new)
-    with pytest.raises(sw.RunError, match="the code of the environment has changed"):
+    with pytest.raises(RunError, match="the code of the environment has changed"):
         join([CallLog.load(run.path / "calls-1.safetensors"), new])

@@ -106,7 +106,7 @@ CASES = [
     ("together", "collector.0.kept.discount", "infinite"),
     ("together", "collector.0.kept.tau", "negative"),
     ("together", "collector.0.kept.player.elapsed", "negative"),
-    ("together", "collector.0.kept.player.limit", "far too large"),
+    ("together", "collector.0.kept.player.length", "far too large"),
     ("together", "collector.0.open.obs", "missing"),
     ("together", "counts.left", "negative"),
     ("together", "loop.report", "negative"),

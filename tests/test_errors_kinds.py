@@ -23,7 +23,15 @@ from skillweave.buffers import ram
 from skillweave.cli.overrides import apply_overrides
 from skillweave.collecting import search
 from skillweave.collecting.workers import error_to_send
-from skillweave.errors import KINDS, kind_of, make_error, reworded
+from skillweave.errors import (
+    KINDS,
+    EnvError,
+    Interrupted,
+    MissingExtra,
+    kind_of,
+    make_error,
+    reworded,
+)
 from skillweave.hierarchy import options
 from skillweave.runs.lock import Lock
 
@@ -68,9 +76,9 @@ def test_no_place_raises_an_error_without_a_kind():
 
 def test_the_kinds_are_one_level_below_their_base():
     assert all(issubclass(kind, sw.SkillweaveError) for kind in KINDS.values())
-    assert issubclass(sw.MissingExtra, ImportError)
-    assert issubclass(sw.Interrupted, KeyboardInterrupt)
-    assert not issubclass(sw.Interrupted, Exception)
+    assert issubclass(MissingExtra, ImportError)
+    assert issubclass(Interrupted, KeyboardInterrupt)
+    assert not issubclass(Interrupted, Exception)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -83,12 +91,12 @@ def test_an_error_of_each_kind_can_be_made_reworded_and_pickled(name):
 
 
 def test_an_error_of_a_users_subclass_is_of_the_kind_that_it_stands_on():
-    class Mine(sw.EnvError):
+    class Mine(EnvError):
         """A kind of the user's own."""
 
     assert kind_of(Mine("x")) == "EnvError"
     assert error_to_send(Mine("x")) == ("EnvError", "x")
-    assert error_to_send(sw.MissingExtra("a film", "video"))[0] == "MissingExtra"
+    assert error_to_send(MissingExtra("a film", "video"))[0] == "MissingExtra"
     assert error_to_send(MemoryError("x"))[0] == "TrainingError"
     assert error_to_send(ValueError("x"))[0] == "EnvError"
 

@@ -127,8 +127,9 @@ def adapter():
 
 
 def test_stable_baselines3_is_told_final_observations_and_time_limits():
-    from skillweave import EnvSpec, OptionsEnv
+    from skillweave import EnvSpec
     from skillweave.collecting.skill_set import SkillSet
+    from skillweave.envs import OptionsEnv
     from skillweave.envs.make import make_engine
 
     module = adapter()

@@ -13,6 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete
 
 import skillweave as sw
 from skillweave.cli import main
+from skillweave.errors import DeclarationError
 
 BYTES, REALS = np.uint8, np.float32
 
@@ -163,7 +164,7 @@ def test_the_shape_says_where_the_planes_are(read, shape, channels_first):
 @pytest.mark.parametrize("shape", UNCLEAR, ids=str)
 def test_a_shape_that_says_nothing_is_refused_with_the_setting(tmp_path, shape):
     run = tmp_path / "run"
-    with pytest.raises(sw.DeclarationError) as error:
+    with pytest.raises(DeclarationError) as error:
         sw.train_agent(lambda: Shows(Box(0, 1, shape, BYTES)), settings(), 16, run, quiet=True)
     assert f"the observation of shape {shape}" in str(error.value)
     stacked = f", by its first axis a stack of {shape[0]} frames" in str(error.value)
@@ -182,7 +183,7 @@ def test_the_setting_says_it(read, shape):
 
 def test_the_setting_counts_for_the_images_of_which_it_is_not_known(read):
     space = Dict(board=Box(0, 1, (5, 6, 7), BYTES), camera=Box(0, 255, (9, 9, 3), BYTES))
-    with pytest.raises(sw.DeclarationError, match=r"the observation's part board of shape \(5, 6"):
+    with pytest.raises(DeclarationError, match=r"the observation's part board of shape \(5, 6"):
         read(space)
     asked, _ = read(space, planes="first")
     assert {k: part.shape for k, part in asked.items()} == {"board": (5, 6, 7), "camera": (3, 9, 9)}
@@ -197,7 +198,7 @@ def test_a_selector_is_refused_before_its_skills_are_trained(tmp_path):
         return Shows(Box(0, 1, (5, 6, 7), BYTES))
 
     declared = sw.Hierarchy(make, [Win()], learn="apart", steps=64)
-    with pytest.raises(sw.DeclarationError, match="selector: the observation of shape"):
+    with pytest.raises(DeclarationError, match="selector: the observation of shape"):
         declared.train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
@@ -218,12 +219,12 @@ def test_the_critic_of_skills_reads_boards_as_the_selector_does(tmp_path, select
 def test_a_critic_of_its_own_reads_boards_as_the_actor_does():
     sw.PPO(network=sw.Network(planes="last"), critic=sw.Network(planes="last"))
     sw.PPO(network=sw.Network(planes="last"), critic=sw.Network())
-    with pytest.raises(sw.DeclarationError, match="planes of network counts for both"):
+    with pytest.raises(DeclarationError, match="planes of network counts for both"):
         sw.PPO(critic=sw.Network(planes="first"))
 
 
 def test_no_other_word_says_where_planes_are():
-    with pytest.raises(sw.DeclarationError, match="must be one of first, last, None"):
+    with pytest.raises(DeclarationError, match="must be one of first, last, None"):
         sw.Network(planes="middle")
 
 
@@ -281,7 +282,7 @@ def test_cells_are_read_one_by_one_wherever_their_axes_are(tmp_path):
         how = sw.PPO(num_envs=2, n_steps=8, network=cells, critic=critic)
         return sw.train_agent(lambda: Shows(space), how, 16, tmp_path / "run", quiet=True)
 
-    with pytest.raises(sw.DeclarationError, match="may have its planes"):
+    with pytest.raises(DeclarationError, match="may have its planes"):
         train(rest)
     train(None)
 

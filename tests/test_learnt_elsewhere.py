@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import skillweave as sw
+from skillweave.errors import DeclarationError
 
 SMALL = sw.PPO(num_envs=2, n_steps=8)
 
@@ -39,7 +40,7 @@ def declare(*skills):
 @pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
 def test_a_skill_with_a_policy_takes_no_settings_of_training(policy, field):
     skill = type("Cloned", (sw.Skill,), {"policy": policy, field: TRAINING[field]})()
-    with pytest.raises(sw.DeclarationError, match=f"'cloned' has a policy.* its {field} would be"):
+    with pytest.raises(DeclarationError, match=f"'cloned' has a policy.* its {field} would be"):
         declare(skill)
 
 
@@ -55,7 +56,7 @@ def test_all_settings_that_would_be_ignored_are_named():
         def success(self, step):
             return step.terminated
 
-    with pytest.raises(sw.DeclarationError, match="algorithm and steps and target_success would"):
+    with pytest.raises(DeclarationError, match="algorithm and steps and target_success would"):
         declare(Cloned())
 
 
@@ -102,7 +103,7 @@ def test_settings_that_come_later_are_refused_too():
     later = Ready()
     later.steps = 100
     for skill, field in ((Further(), "algorithm"), (later, "steps")):
-        with pytest.raises(sw.DeclarationError, match=f"its {field} would be ignored"):
+        with pytest.raises(DeclarationError, match=f"its {field} would be ignored"):
             declare(skill)
 
 
@@ -114,7 +115,7 @@ def test_a_policy_and_settings_of_training_on_one_object_are_refused_in_any_orde
                 setattr(self, name, {"policy": right, "algorithm": SMALL}[name])
 
     says = r"its algorithm would be ignored: leave out algorithm \(or .*skill\.algorithm = None\)"
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         declare(Ready())
     skill = Ready()
     skill.algorithm = None
@@ -123,7 +124,7 @@ def test_a_policy_and_settings_of_training_on_one_object_are_refused_in_any_orde
 
 def test_a_ready_skill_of_another_run_takes_none_either(tmp_path):
     run = sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", quiet=True)
-    with pytest.raises(sw.DeclarationError, match=r"'moves' has a policy.* its steps would be"):
+    with pytest.raises(DeclarationError, match=r"'moves' has a policy.* its steps would be"):
         declare(run.as_skill("moves", steps=10))
 
 
@@ -152,14 +153,14 @@ ELSEWHERE = {
 @pytest.mark.parametrize("named", [False, True])
 def test_start_from_shows_the_way_of_what_is_no_run(tmp_path, value, way, named):
     start, argument = ({"agent": value}, r"start_from\['agent'\]") if named else (value, "start_")
-    with pytest.raises(sw.DeclarationError, match=f"{argument}.*only from what a run.*{way}"):
+    with pytest.raises(DeclarationError, match=f"{argument}.*only from what a run.*{way}"):
         sw.train_agent("CartPole-v1", SMALL, 16, tmp_path / "run", start_from=start, quiet=True)
     assert not (tmp_path / "run").exists()
 
 
 def test_stable_baselines_leaves_out_the_ending(tmp_path):
     (tmp_path / "best.zip").write_bytes(b"")
-    with pytest.raises(sw.DeclarationError, match=r"best.zip', \"ppo\""):
+    with pytest.raises(DeclarationError, match=r"best.zip', \"ppo\""):
         sw.train_agent("CartPole-v1", SMALL, 16, start_from=tmp_path / "best", quiet=True)
 
 

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from small_runs import stage_entry
 
-from skillweave import PPO, Agent, Evaluation, Hierarchy, Network, Run, Skill, tree
-from skillweave import notebooks as module
+from skillweave import PPO, Agent, Hierarchy, Network, Run, Skill, notebooks as module, tree
 from skillweave.notebooks import facts, in_notebook, joined, table
 from skillweave.reporting.progress import EpisodeProgress, Progress
 from skillweave.reporting.video import Film
+from skillweave.types import Evaluation
 
 TINY = PPO(num_envs=2, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 

@@ -14,6 +14,7 @@ PROGRAM = """
 import multiprocessing, os, socket, subprocess, sys, time
 import gymnasium as gym, numpy as np
 import skillweave as sw
+from skillweave.evolution import Evolution
 
 def forever():
     while True:
@@ -52,7 +53,7 @@ class Env(gym.Env):
 what = sys.argv[1]
 blocks = {"sleep": lambda: time.sleep(1000), "socket": deaf, "swallows": forever}
 long = sw.PPO(num_envs=4, n_steps=8192, batch_size=64, update_epochs=1, network=sw.Network((4,)))
-evolve = sw.Evolution(population=2, generations=1, episodes=2) if what == "part" else None
+evolve = Evolution(population=2, generations=1, episodes=2) if what == "part" else None
 if __name__ == "__main__":
     if what == "spawn":
         multiprocessing.set_start_method("spawn")

@@ -9,25 +9,29 @@ import re
 import textwrap
 from collections.abc import Iterator
 from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pages import BLOCK, train_briefly
 
-import skillweave as sw
-from skillweave import Array, Policy, SkillweaveError
+from skillweave import SkillweaveError
 from skillweave.cli.commands import COMMANDS
 from skillweave.errors import KINDS
+from skillweave.public import HOMES
+from skillweave.types import Array, Policy
 
 ALIASES = ("Array",)
 """Names of what is another library's: the reference explains them."""
+THINGS = {n: getattr(import_module(m), n) for m, homes in HOMES.items() for n in homes}
+"""Every public name's object."""
 ARRAY = re.compile(r"\b(Array|Tensor|Views|Float|Int|Bool)\b")
 
 
 def public_functions(name: str) -> Iterator[tuple[str, Any]]:
     """The function of this name; or the constructor and public methods of the class."""
-    thing = getattr(sw, name)
+    thing = THINGS[name]
     if inspect.ismodule(thing):
         for part in vars(thing).values():
             if inspect.isclass(part) and part.__module__ == thing.__name__:
@@ -77,7 +81,7 @@ def section(text: str, title: str) -> str:
 
 def example_of(name: str) -> str:
     """The Python in a public name's docstring."""
-    return "\n".join(BLOCK.findall(inspect.getdoc(getattr(sw, name)) or ""))
+    return "\n".join(BLOCK.findall(inspect.getdoc(THINGS[name]) or ""))
 
 
 def raises(thing: Any) -> bool:
@@ -115,7 +119,7 @@ def missing(thing: Any) -> list[str]:
     return lacks
 
 
-NAMES = [name for name in sw.__all__ if name not in ALIASES]
+NAMES = [name for name in THINGS if name not in ALIASES]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -124,7 +128,7 @@ def test_a_public_name_says_all_that_a_user_needs(name: str) -> None:
     assert found == {}
 
 
-DATACLASSES = [kind for n in NAMES if dataclasses.is_dataclass(kind := getattr(sw, n))]
+DATACLASSES = [kind for n in NAMES if dataclasses.is_dataclass(kind := THINGS[n])]
 
 
 @pytest.mark.parametrize("kind", [*DATACLASSES, *COMMANDS], ids=lambda kind: kind.__name__)

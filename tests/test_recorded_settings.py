@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.algorithms import register_algorithm
+from skillweave.errors import DeclarationError
 
 SMALL = sw.PPO(num_envs=2, n_steps=8)
 
@@ -75,7 +77,7 @@ ODD = {
 @pytest.mark.parametrize("kind", ["agent", "hierarchy"])
 @pytest.mark.parametrize("value", ODD.values(), ids=ODD)
 def test_what_no_run_can_record_is_named_before_training(tmp_path, value, kind):
-    with pytest.raises(sw.DeclarationError) as error:
+    with pytest.raises(DeclarationError) as error:
         train(tmp_path / "run", value, kind)
     place = "kwargs['sizes']['a'][1][1] is" if isinstance(value, dict) and "a" in value else ""
     assert f"Arena: {place or 'kwargs[' + repr('sizes') + '] is'}" in str(error.value)
@@ -94,7 +96,7 @@ def test_the_function_that_is_proposed_trains(tmp_path, value):
 
 def test_of_a_registered_environment_gymnasiums_make_is_proposed(tmp_path):
     spec = sw.EnvSpec("CartPole-v1", kwargs={"max_episode_steps": np.array(7)})
-    with pytest.raises(sw.DeclarationError, match=r"return gymnasium.make\('CartPole-v1', max_ep"):
+    with pytest.raises(DeclarationError, match=r"return gymnasium.make\('CartPole-v1', max_ep"):
         sw.train_agent(spec, SMALL, 16, tmp_path / "run", quiet=True)
 
     def make():
@@ -165,9 +167,9 @@ def test_a_setting_of_an_own_algorithm_is_named(tmp_path):
     from skillweave.algorithms.ppo import PPOAlgorithm
 
     own = type("OwnAlgorithm", (PPOAlgorithm,), {"action_spaces": (gym.spaces.Discrete,)})
-    sw.register_algorithm(Own, own)
+    register_algorithm(Own, own)
     how = Own(num_envs=2, n_steps=8, table=np.zeros(3))
-    with pytest.raises(sw.DeclarationError, match=r"Own.table is array\(.*record a name"):
+    with pytest.raises(DeclarationError, match=r"Own.table is array\(.*record a name"):
         sw.train_agent("CartPole-v1", how, 16, tmp_path / "run", quiet=True)
     how = dataclasses.replace(how, table=(np.int64(1), 2))
     sw.train_agent("CartPole-v1", how, 16, tmp_path / "run", quiet=True)

@@ -21,7 +21,7 @@ from skillweave.collecting.collector import Collector
 from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.hierarchy import repair
 from skillweave.hierarchy.roles import roles_of
-from skillweave.planning import HandOver, Mission, held, record_calls
+from skillweave.planning import Handover, Mission, held, record_calls
 from skillweave.planning.record import RandomChoice
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import Matrix, RepairEntry
@@ -275,7 +275,7 @@ def test_calls_of_a_repair_have_the_selectors_limit() -> None:
     stage = repair.repair_stage(roles, stage_entry("r"), entry)
     collector = stage.learning_task(policies).collector(2, None)
     assert isinstance(collector, Collector)
-    assert collector.call_limit == 5, "of 8 by itself"
+    assert collector.limit == 5, "of 8 by itself"
 
 
 def test_what_is_not_better_is_not_kept(tmp_path: Path) -> None:
@@ -319,10 +319,10 @@ def test_a_pair_that_is_seldom_called_is_given_up(
     assert not (tmp_path / "new").exists()
 
 
-def matrix(*rows: tuple[float, float]) -> HandOver:
+def matrix(*rows: tuple[float, float]) -> Handover:
     """Rates of the skills a and b after start, a and b, from 100 calls each."""
     done = np.rint(100 * np.array(rows)).astype(np.int64)
-    return HandOver(("a", "b"), np.full((3, 2), 100), done, np.zeros(2, np.int64))
+    return Handover(("a", "b"), np.full((3, 2), 100), done, np.zeros(2, np.int64))
 
 
 @pytest.mark.parametrize(

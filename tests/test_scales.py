@@ -13,15 +13,15 @@ from skillweave.algorithms import config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.notices import collected_notices
-from skillweave.ops.moments import explained_variance, merge_moments, normalise, scale_of
-from skillweave.planning.neighbours import FeatureMap, Standard
+from skillweave.ops.moments import explained_variance, merge_moments, normalize, scale_of
+from skillweave.planning.neighbors import FeatureMap, Standard
 from skillweave.seeding import Seeds
 
 ROOT = Path(skillweave.__file__).parent
 DEVIATION = re.compile(r"\b(nan)?(std|var|var_mean|std_mean)\(|var\b.*sqrt\(|sqrt\(.*(\b|_)var\b")
 MAY_DEVIATE = {
     "ops/moments.py",  # the rule
-    "planning/neighbours.py",  # Standard, by the same rule
+    "planning/neighbors.py",  # Standard, by the same rule
     "training/evaluation.py",  # a confidence interval
     "training/episodes.py",  # a standard error
 }
@@ -43,7 +43,7 @@ def test_a_constant_is_seen_as_one_however_large(value, masked):
         mean, var, count = merge_moments(mean, var, count, torch.full((1, rows, 1), value), valid)
     assert scale_of(mean, var).item() == 1.0
     same = torch.full((1, 999), value)
-    assert normalise(same).abs().max() <= 1e-6 * max(1.0, abs(value))
+    assert normalize(same).abs().max() <= 1e-6 * max(1.0, abs(value))
     assert explained_variance(same + 1.0, same).item() == 0.0
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.algorithms import OnPolicy
 from skillweave.algorithms.config import (
     ActorCritic,
     OffPolicy,
@@ -24,6 +26,8 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution import Evolution, Mutations, Range, Tournament, Truncation
+from skillweave.public import HOMES
 from skillweave.schema import described, fitted
 
 if TYPE_CHECKING:
@@ -147,7 +151,7 @@ OFF_POLICY = {
 }  # fmt: skip
 ACTOR_CRITIC = OFF_POLICY | {"critic": or_none(NETWORK)}
 TABLE: dict[type[Any], dict[str, Kind]] = {
-    sw.OnPolicy: ON_POLICY,
+    OnPolicy: ON_POLICY,
     sw.PPO: PPO,
     sw.SelfImitationPPO: PPO | {
         "imitation_rows": AT_LEAST_ONE, "imitation_steps": AT_LEAST_ONE,
@@ -216,23 +220,23 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "log_calls_info": Kind((5, "x", None, {"x": 1}, [5], [""], [None]), (["x"], [])),
         "flat": or_none(ALGORITHM),
     },
-    sw.Range: {"low": ANY, "high": ANY, "scale": word("linear", "log")},
-    sw.Mutations: {
+    Range: {"low": ANY, "high": ANY, "scale": word("linear", "log")},
+    Mutations: {
         **dict.fromkeys(("none", "hyperparameters", "parameters", "architecture", "activation"),
                         Kind(FRACTION.refused, ())),
-        "ranges": or_none(Kind((5, "x", True, None, [], {"gamma": 3}, {5: sw.Range(1, 2)}),
-                               ({"gamma": sw.Range(0.5, 0.9)}, {}))),
+        "ranges": or_none(Kind((5, "x", True, None, [], {"gamma": 3}, {5: Range(1, 2)}),
+                               ({"gamma": Range(0.5, 0.9)}, {}))),
         "strength": NON_NEGATIVE, "share": FRACTION, "step": FRACTION, "layer_share": FRACTION,
         "layers": LIMITS, "units": LIMITS, "channels": LIMITS, "kernels": LIMITS,
         "activations": Kind((5, "x", None, (), ("x",), (1,)), (("tanh",), ["relu", "elu"])),
     },
-    sw.Tournament: {"size": AT_LEAST_ONE, "elitism": FLAG},
-    sw.Truncation: {"share": number(0, 0.5, zero=False)},
-    sw.Evolution: {
+    Tournament: {"size": AT_LEAST_ONE, "elitism": FLAG},
+    Truncation: {"share": number(0, 0.5, zero=False)},
+    Evolution: {
         "population": AT_LEAST_ONE, "generations": AT_LEAST_ONE, "episodes": AT_LEAST_ONE,
         "target": or_none(ANY), "start": word("config", "random"),
-        "selection": Kind((5, "x", None, []), (sw.Truncation(), sw.Tournament(3))),
-        "mutations": settings(sw.Mutations()),
+        "selection": Kind((5, "x", None, []), (Truncation(), Tournament(3))),
+        "mutations": settings(Mutations()),
     },
     sw.Ray: {
         "collectors": or_none(AT_LEAST_ONE),
@@ -276,7 +280,7 @@ class Stay(sw.Skill):
 
 NEEDED: dict[type[Any], dict[str, Any]] = {
     sw.Linear: {"start": 1.0, "end": 0.0},
-    sw.Range: {"low": 0.25, "high": 4.0, "scale": "linear"},
+    Range: {"low": 0.25, "high": 4.0, "scale": "linear"},
     sw.Guide: {"selector": np.sign, "target_kl": 0.1},
     sw.EnvSpec: {"env": "CartPole-v1"},
     sw.Agent: {"env": "CartPole-v1", "algorithm": sw.PPO(), "steps": 8},
@@ -286,7 +290,7 @@ NEEDED: dict[type[Any], dict[str, Any]] = {
 BESIDE: dict[tuple[type[Any], str], dict[str, Any]] = {
     (sw.DQN, "v_min"): {"v_max": 9.0},
     (sw.DQN, "v_max"): {"v_min": -9.0},
-    (sw.Range, "low"): {"high": 2.0},
+    (Range, "low"): {"high": 2.0},
     (sw.Hierarchy, "selector"): {"learn": "apart"},
 }
 """Fields without which another field cannot be set."""
@@ -310,7 +314,7 @@ def test_the_table_has_every_field(kind: type[Any]) -> None:
 
 
 def test_the_table_has_every_public_class_of_settings() -> None:
-    public = [getattr(sw, name) for name in sw.__all__]
+    public = [getattr(import_module(m), name) for m, homes in HOMES.items() for name in homes]
     checked = {k for k in public if isinstance(k, type) and hasattr(k, "_checks_fields")}
     assert len(checked) > 20
     assert checked <= set(TABLE)
@@ -359,9 +363,9 @@ def test_a_changed_attribute_is_checked_before_training() -> None:
             made.validate()
 
 
-@pytest.mark.parametrize("kind", [k for k in TABLE if issubclass(k, sw.OnPolicy | OffPolicy)])
+@pytest.mark.parametrize("kind", [k for k in TABLE if issubclass(k, OnPolicy | OffPolicy)])
 def test_a_file_is_held_against_the_same_checks(kind: Any) -> None:
-    if kind in (sw.OnPolicy, OffPolicy, ActorCritic):
+    if kind in (OnPolicy, OffPolicy, ActorCritic):
         return  # none is read from files
     data = config_to_json(kind())
     for name, field_kind in TABLE[kind].items():
@@ -455,7 +459,7 @@ def test_a_class_in_place_of_settings_gets_advice() -> None:
 
 
 @dataclass(frozen=True)
-class Own(sw.OnPolicy):
+class Own(OnPolicy):
     """Settings of a user's algorithm: a field of its own, and one that it inherits."""
 
     n_steps: int = 5
@@ -466,7 +470,7 @@ class Own(sw.OnPolicy):
 
 
 @dataclass(frozen=True)
-class Odd(sw.OnPolicy):
+class Odd(OnPolicy):
     """A field whose type only a type checker knows."""
 
     share: Unknown | None = None

@@ -20,7 +20,6 @@ from skillweave import (
     Apart,
     Hierarchy,
     Network,
-    RunError,
     Selection,
     SelfImitationPPO,
     Skill,
@@ -30,6 +29,7 @@ from skillweave import (
 )
 from skillweave.cli import main
 from skillweave.collecting.acting import Acting
+from skillweave.errors import RunError
 from skillweave.hierarchy import training
 from skillweave.reporting.report.facts import settings
 from skillweave.runs import initial_policies
@@ -381,7 +381,7 @@ def test_what_cannot_be_is_said_before_anything_is_written(case, source, tmp_pat
 
 
 def test_a_population_does_not_start_from_a_run(source, tmp_path):
-    from skillweave import Evolution
+    from skillweave.evolution import Evolution
 
     evolve = {"selector": Evolution(population=2, generations=2)}
     with pytest.raises(SkillweaveError, match=r"start_from: stage 'selector' evolves"):

@@ -28,20 +28,11 @@ from small_runs import (
     stage_entry,
 )
 
-from skillweave import (
-    SAC,
-    EnvSpec,
-    Evolution,
-    Hierarchy,
-    Lengths,
-    Mutations,
-    Skill,
-    SkillweaveError,
-    Together,
-)
+from skillweave import SAC, EnvSpec, Hierarchy, Lengths, Skill, SkillweaveError, Together
 from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.applying import differences
+from skillweave.evolution import Evolution, Mutations
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory

@@ -21,13 +21,13 @@ from skillweave import (
     Agent,
     Apart,
     EnvSpec,
-    Evolution,
     Hierarchy,
     Network,
     SelfImitationPPO,
     Together,
     load,
 )
+from skillweave.evolution import Evolution
 from tests.small_runs import Balance, Left, policies
 
 NETWORK = Network((8,), "relu")

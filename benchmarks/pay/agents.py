@@ -15,9 +15,10 @@ from benchmarks.grouped import act_by, regroup
 from benchmarks.pay.flat import Flat
 from benchmarks.pay.results import CODE, Result, Results, curve_of, read
 from benchmarks.pay.suite import Policies, Seldom, Shaped, Suite, Task
-from skillweave import Array, Hierarchy, Lengths, Selection, Skill, TrainDefaults
+from skillweave import Hierarchy, Lengths, Selection, Skill, TrainDefaults
 from skillweave.api import Run
 from skillweave.runs.directory import RunDirectory
+from skillweave.types import Array
 
 HIERARCHY, RANDOM, SINGLE = "hierarchy", "F4-random-skills", "F4-best-skill"
 FLAT, SHAPED, BONUS, TUNED = "F0-flat", "F1-skill-rewards", "F2-bonus", "F3-fine-tuned"

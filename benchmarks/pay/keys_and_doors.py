@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from benchmarks.pay.suite import Policies, Suite, Task
-from skillweave import Array, Hierarchy
-from skillweave.recipes import _rooms
-from skillweave.recipes import keys_and_doors as rooms
+from skillweave import Hierarchy
+from skillweave.recipes import _rooms, keys_and_doors as rooms
+from skillweave.types import Array
 
 SOLVED = 0.8
 

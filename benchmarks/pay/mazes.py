@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.pay.suite import Policies, Suite, Task
-from skillweave import Array, Hierarchy
+from skillweave import Hierarchy
 from skillweave.recipes import _mazes, mazes
+from skillweave.types import Array
 
 SOLVED = 0.9
 STARTS = {

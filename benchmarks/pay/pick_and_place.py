@@ -9,9 +9,9 @@ import numpy as np
 
 from benchmarks.grouped import regroup
 from benchmarks.pay.suite import Policies, Suite, Task
-from skillweave import Array, Hierarchy
-from skillweave.recipes import _arm as world
-from skillweave.recipes import pick_and_place as arm
+from skillweave import Hierarchy
+from skillweave.recipes import _arm as world, pick_and_place as arm
+from skillweave.types import Array
 
 DISTURBANCES = {"calm": world.CALM, "disturbed": world.Disturbances()}
 SOLVED = {"calm": 0.95, "disturbed": 0.85}

@@ -8,9 +8,9 @@ import numpy as np
 
 from benchmarks.grouped import regroup
 from benchmarks.pay.suite import Policies, Suite, Task
-from skillweave import Array, Hierarchy
-from skillweave.recipes import _cheetah as cheetah
-from skillweave.recipes import shuttle
+from skillweave import Hierarchy
+from skillweave.recipes import _cheetah as cheetah, shuttle
+from skillweave.types import Array
 
 POINTS = {
     "shuttle-2": (2.0, -2.0),

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import Array, EnvSpec, Hierarchy, Skill, Step
+from skillweave import EnvSpec, Hierarchy, Skill, Step
 from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.types import Policy
+from skillweave.types import Array, Policy
 
 Policies = Mapping[str, Policy]
 """The skills that were learnt on the first task, and those by hand, by name."""

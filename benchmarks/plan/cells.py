@@ -15,9 +15,11 @@ import numpy as np
 
 from benchmarks.pay.results import CODE, Result, Results
 from benchmarks.plan.families import Family, NewTask, Policies
-from skillweave import Apart, Evaluation, Hierarchy, Run, RunError, evaluate
+from skillweave import Apart, Hierarchy, Run, evaluate
+from skillweave.errors import RunError
 from skillweave.planning import CallLog, Explorer, record_calls
 from skillweave.runs.directory import RunDirectory
+from skillweave.types import Evaluation
 
 LOG_SEEDS = (101, 102, 103)
 """Seeds of the logs."""

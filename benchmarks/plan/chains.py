@@ -24,13 +24,13 @@ from benchmarks.common import table
 from benchmarks.pay.results import CODE, Result, of_other_code
 from benchmarks.plan.cells import Cells
 from benchmarks.plan.families import LEGS, lander
-from skillweave import Array, Run
+from skillweave import Run
 from skillweave.errors import SkillweaveError
 from skillweave.ops.threads import torch_threads
 from skillweave.planning import CallLog, record_calls
-from skillweave.planning.hand_over import calls_done
+from skillweave.planning.handover import calls_done
 from skillweave.recipes import lander_missions
-from skillweave.types import Memory
+from skillweave.types import Array, Memory
 
 CHAINS = (
     ("go_left", "hover"),

@@ -19,10 +19,8 @@ from skillweave import (
     SAC,
     Apart,
     EnvSpec,
-    Evolution,
     Hierarchy,
     Lengths,
-    Mutations,
     Network,
     Reflex,
     Selection,
@@ -31,6 +29,7 @@ from skillweave import (
     TrainDefaults,
 )
 from skillweave.api import Agent, Run
+from skillweave.evolution import Evolution, Mutations
 
 SEED = 3
 """Of every training."""

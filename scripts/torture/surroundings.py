@@ -30,9 +30,10 @@ import torch
 
 from scripts.torture.processes import fork, group_is_gone, kill_group, wait
 from scripts.torture.report import FILES, FINISHED, HANG, LEFT, LOST, REFUSED, TRACEBACK, Outcome
-from skillweave import DQN, PPO, SAC, Apart, EnvSpec, Evolution, Hierarchy, Network, Skill, load
+from skillweave import DQN, PPO, SAC, Apart, EnvSpec, Hierarchy, Network, Skill, load
 from skillweave.api import Agent
 from skillweave.errors import SkillweaveError
+from skillweave.evolution import Evolution
 from skillweave.runs.files import write_json
 
 PATIENCE = 120.0

@@ -390,7 +390,7 @@ class Algorithm:
     def _missing(self, method: str) -> NoReturn:
         raise DeclarationError(
             f"{type(self).__name__} has no method {method!r}, which every algorithm needs; "
-            "see skillweave.Algorithm"
+            "see skillweave.algorithms.Algorithm"
         )
 
 

@@ -57,8 +57,7 @@ class Compiled:
 
     def __call__(self, *args: Any) -> Any:
         """Call the function, compiled if possible."""
-        from torch._dynamo import config as dynamo
-        from torch._dynamo import exc
+        from torch._dynamo import config as dynamo, exc
 
         if self._program is self._function:
             return self._function(*args)

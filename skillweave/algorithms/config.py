@@ -507,8 +507,8 @@ def _not_registered(name: str) -> str:
     return (
         f"no algorithm is registered for {name}; there are: {', '.join(_REGISTERED)}. An algorithm "
         "of your own must be registered in every process that uses it, before it is used: call "
-        "skillweave.register_algorithm(its settings, its class) in the file that defines it, and "
-        "import that file in your program or recipe"
+        "skillweave.algorithms.register_algorithm(its settings, its class) in the file that "
+        "defines it, and import that file in your program or recipe"
     )
 
 

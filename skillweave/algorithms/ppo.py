@@ -28,7 +28,7 @@ from skillweave.networks.net import Net
 from skillweave.networks.stacked import Inputs, Layout, Views, take_rows
 from skillweave.ops.device import FLOAT, all_false
 from skillweave.ops.losses import approximate_kl, likelihood_ratio, ppo_policy_loss, value_loss
-from skillweave.ops.moments import explained_variance, masked_mean, normalise
+from skillweave.ops.moments import explained_variance, masked_mean, normalize
 from skillweave.ops.optim import adam_, clip_grad_norm_, kl_adapted_rate
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
@@ -468,7 +468,7 @@ def _advantage(
 ) -> Tensor:
     """Return the normalised advantage plus the stage's, in the same units, (P, N)."""
     if agent.config.normalize_advantage:
-        advantage = normalise(advantage, counts, min_std=agent.config.min_advantage_std)
+        advantage = normalize(advantage, counts, min_std=agent.config.min_advantage_std)
     return advantage if of_stage is None else advantage + of_stage
 
 

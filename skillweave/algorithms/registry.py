@@ -44,13 +44,14 @@ def register_algorithm(config_type: type[Any], algorithm_type: type[Algorithm]) 
     where = f"register_algorithm({name}, {algorithm_type.__name__})"
     if not issubclass(algorithm_type, Algorithm):
         raise DeclarationError(
-            f"{where}: {algorithm_type.__name__} is no subclass of skillweave.Algorithm"
+            f"{where}: {algorithm_type.__name__} is no subclass of skillweave.algorithms.Algorithm"
         )
     lacks = [k for k in REQUIRED if getattr(algorithm_type, k) is getattr(Algorithm, k)]
     lacks += [k for k in ("store", "action_spaces") if not hasattr(algorithm_type, k)]
     if lacks:
         raise DeclarationError(
-            f"{where}: {algorithm_type.__name__} lacks {', '.join(lacks)}; see skillweave.Algorithm"
+            f"{where}: {algorithm_type.__name__} lacks {', '.join(lacks)}; see "
+            "skillweave.algorithms.Algorithm"
         )
     settings = _SETTINGS.get(algorithm_type.store)
     if settings is None:

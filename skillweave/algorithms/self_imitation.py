@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from skillweave.algorithms.config import SelfImitationPPO
-from skillweave.algorithms.ppo import PPOAlgorithm, Terms
-from skillweave.algorithms.ppo import State as PPOState
+from skillweave.algorithms.ppo import PPOAlgorithm, State as PPOState, Terms
 from skillweave.algorithms.rollouts import Cells, first_true
 from skillweave.errors import RunError
 from skillweave.experience import Report, Rollout

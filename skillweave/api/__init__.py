@@ -64,7 +64,7 @@ from skillweave.paths import AGENT, join, level_of, name_of
 from skillweave.planning import CallLog, Planner
 from skillweave.planning.forecast import Forecast, forecast
 from skillweave.planning.record import with_returns
-from skillweave.planning.run_log import hand_over_json, hand_over_of
+from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.palette import RGB, color_of
 from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.report.single import write_report
@@ -769,8 +769,8 @@ class Run(TrainedPolicy):
     def info(self) -> dict[str, Any]:
         """Return its manifest, with the latest saved evaluation under ``evaluation``.
 
-        One that sampled actions on request is under ``evaluation_sampled``. ``hand_over`` has the
-        counts of the log of calls, if there is one: see ``CallLog.hand_over``.
+        One that sampled actions on request is under ``evaluation_sampled``. ``handover`` has the
+        counts of the log of calls, if there is one: see ``CallLog.handover``.
         """
         run = RunDirectory.open(self.path)
         scores = {
@@ -779,7 +779,7 @@ class Run(TrainedPolicy):
         }
         known = {k: v.to_json() for k, v in scores.items() if v is not None}
         content: dict[str, Any] = as_json(run.manifest)
-        return content | known | hand_over_json(hand_over_of(run))
+        return content | known | handover_json(handover_of(run))
 
     @Takes(RepairOptions)
     def repair(self, options: RepairOptions) -> Run:
@@ -791,7 +791,7 @@ class Run(TrainedPolicy):
         more than those that failed. A skill of PPO without a memory also rehearses: the KL from its
         earlier policy has a cost in the observations of its calls that were done after other skills
         (kickstarting, Schmitt et al. 2018), so that it does not forget. Before and after, calls are
-        recorded, and the hand-overs counted: the new weights are kept if this one is clearly better
+        recorded, and the handovers counted: the new weights are kept if this one is clearly better
         and no other one clearly worse. All other weights stay as they are. What was done is in
         ``Run.repairs``.
 

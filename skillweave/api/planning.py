@@ -24,7 +24,7 @@ from skillweave.paths import SELECTOR
 from skillweave.planning import Planner, successes
 from skillweave.planning.calls import seen_places
 from skillweave.planning.mission_text import RESERVED
-from skillweave.planning.neighbours import FEATURES
+from skillweave.planning.neighbors import FEATURES
 from skillweave.planning.predicates import WORD
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.runs.initial_policies import Learnt

@@ -25,12 +25,12 @@ def save_policy(
     path: str | Path,
     env: Any = None,
     *,
-    licence: str = "",
+    license: str = "",
     origin: str = "",
 ) -> Export:
     """Write a policy as ONNX files, ``policy.json`` and ``runner.py``; ``load_policy`` reads it.
 
-    ``policy.json`` has the spaces, the mapping, the rate and the range of goals, the licence, and a
+    ``policy.json`` has the spaces, the mapping, the rate and the range of goals, the license, and a
     checksum of each ONNX file. Python code is not written: ``Export.code`` lists it.
 
     Args:
@@ -38,7 +38,7 @@ def save_policy(
         path: a folder; files of the same names are replaced.
         env: the environment, as of a ``Hierarchy``, whose spaces a policy from elsewhere gets;
             None: the policy has its spaces.
-        licence: of the policy, "Apache-2.0" for example.
+        license: of the policy, "Apache-2.0" for example.
         origin: of the policy, an address for example.
 
     Returns:
@@ -49,7 +49,7 @@ def save_policy(
         DeclarationError: an argument is wrong.
     """
     folder = as_path(path, "path")
-    for name, text in (("licence", licence), ("origin", origin)):
+    for name, text in (("license", license), ("origin", origin)):
         schema.fitted(str, text, name)
     if not (hasattr(policy, "act") and hasattr(policy, "start")):
         raise DeclarationError(
@@ -67,7 +67,7 @@ def save_policy(
             f"save_policy(): {policy.name} has no spaces yet: give the environment, "
             "save_policy(policy, path, env)"
         )
-    return write_export(folder, policy, named, licence=licence, origin=origin)
+    return write_export(folder, policy, named, license=license, origin=origin)
 
 
 @checked_names

@@ -1,4 +1,4 @@
-"""The course of ``Run.repair``: measure a hand-over, train on, measure again, keep the better."""
+"""The course of ``Run.repair``: measure a handover, train on, measure again, keep the better."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ D = TypeVar("D", bound=Declaration)
 USUAL_STEPS = 200_000
 """Steps of a repair for which none are given."""
 GOOD = 0.95
-"""A hand-over that is done at least this often needs no repair."""
+"""A handover that is done at least this often needs no repair."""
 OF_THE_RUN = ("id", "sha256", "versions", "created", "stages", "track")
 """Fields of a manifest that a new run has of its own."""
 
@@ -178,7 +178,7 @@ def _measured(
     num_envs: int,
     progress: Progress,
 ) -> Measured:
-    """Measure the hand-over as it is.
+    """Measure the handover as it is.
 
     Raises:
         DeclarationError: there is nothing to repair, or the skill may not start there.

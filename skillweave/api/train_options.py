@@ -149,7 +149,7 @@ class AgentTraining(AgentOptions, _Task):
 
 @dataclass(frozen=True)
 class _Pair:
-    """The hand-over that is repaired."""
+    """The handover that is repaired."""
 
     skill: str
     """The skill that fails, by its path."""
@@ -171,7 +171,7 @@ class RepairOptions(Watched, _Pair):
     """A new directory; None: the next number of ``runs/<name>-repair-<n>``."""
     done: Mapping[str, Any] | None = None
     """By skill, the event that a call is for, in place of the skill's ``success``; as for
-    ``planning.hand_over``."""
+    ``planning.handover``."""
     calls: int = 200
     """Calls of the pair to measure at least, before and after; fewer where 500,000 steps do not
     hold them."""

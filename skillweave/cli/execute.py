@@ -26,8 +26,8 @@ from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy.weights import open_weights
 from skillweave.notices import notice
-from skillweave.planning import Explorer, HandOver, as_task
-from skillweave.planning.run_log import hand_over_json, hand_over_of
+from skillweave.planning import Explorer, Handover, as_task
+from skillweave.planning.run_log import handover_json, handover_of
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.reporting.plots import plot_run
 from skillweave.reporting.report.compare import write_comparison
@@ -110,11 +110,11 @@ def _log(command: commands.Log) -> None:
         info=command.info,
     )
     calls = run.calls
-    matrix = calls.hand_over()
+    matrix = calls.handover()
     result = {"run": str(command.run), "recorded": {"calls": len(log), "steps": log.steps}}
-    result |= {"calls": len(calls), "steps": calls.steps} | hand_over_json(matrix)
+    result |= {"calls": len(calls), "steps": calls.steps} | handover_json(matrix)
     text = f"recorded {len(log):,} calls, {log.steps:,} steps; the run has {calls.steps:,} steps"
-    print_result(command, result, "\n".join([text, *_hand_over_lines(matrix)]))
+    print_result(command, result, "\n".join([text, *_handover_lines(matrix)]))
 
 
 def _plan(command: commands.Plan) -> None:
@@ -249,12 +249,12 @@ def _info(command: commands.Info) -> None:
     sampled = load_evaluation(run, deterministic=False)
     scores = {} if saved is None else {"evaluation": saved.to_json()}
     scores |= {} if sampled is None else {"evaluation_sampled": sampled.to_json()}
-    matrix = hand_over_of(run)
-    lines = [*run_lines(manifest, [saved, sampled], command.target), *_hand_over_lines(matrix)]
-    print_result(command, as_json(manifest) | scores | hand_over_json(matrix), "\n".join(lines))
+    matrix = handover_of(run)
+    lines = [*run_lines(manifest, [saved, sampled], command.target), *_handover_lines(matrix)]
+    print_result(command, as_json(manifest) | scores | handover_json(matrix), "\n".join(lines))
 
 
-def _hand_over_lines(matrix: HandOver | str | None) -> list[str]:
+def _handover_lines(matrix: Handover | str | None) -> list[str]:
     """Return the matrix of a run's log of calls, as lines."""
     if matrix is None:
         return []

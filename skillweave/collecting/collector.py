@@ -100,13 +100,13 @@ class Collector:
         """What is kept of open calls, (N, …) each, whose shape is known when one begins."""
         self.search: Search | None = None
         """What leads to where a skill may start; None: it starts wherever episodes do."""
-        self.call_limit = None if self.skill is None else self.skill.max_steps
+        self.limit = None if self.skill is None else self.skill.max_steps
         """The most steps of a call of the skill; None: any number."""
         self.learning: OneLearner | LevelLearners
         if isinstance(who, Alone):
             self.learning = OneLearner(who, engine, acting)
             self.search = who.starts.search(who.skill, engine)
-            self.call_limit = who.call_limit or self.call_limit
+            self.limit = who.limit or self.limit
         else:
             self.learning = LevelLearners(who, engine, acting, learners, margins, self.open)
         self.policy, self.memory = self.learning.policy, self.learning.memory
@@ -189,12 +189,12 @@ class Collector:
             calls = self.learning.log(trace, self.log_calls)
         return Collected(batches, steps, episodes, info_keys=keys, longest=longest, calls=calls)
 
-    def play(self, request: Request, seeds: Seeds, limit: int) -> Array:
+    def play(self, request: Request, seeds: Seeds, max_steps: int) -> Array:
         """Play one episode in each environment, from its start.
 
         Args:
             request: who acts; ``rows`` does not count.
-            limit: steps after which an episode is cut.
+            max_steps: steps after which an episode is cut.
 
         Returns:
             (N, 4 + I), as ``Collected.episodes``; NaN where none could begin.
@@ -205,9 +205,9 @@ class Collector:
         playing, unknown = np.ones(self.num_envs, bool), np.ones(self.num_envs, bool)
         self._prepare(request)
         steps, self._ended = 0, []
-        while steps < limit and playing.any():
-            writer = self._writer(min(PLAYED, limit - steps))
-            while writer.row < min(PLAYED, limit - steps) and playing.any():
+        while steps < max_steps and playing.any():
+            writer = self._writer(min(PLAYED, max_steps - steps))
+            while writer.row < min(PLAYED, max_steps - steps) and playing.any():
                 self._step(writer)
                 for _, ids, _ in self._ended[-1:]:
                     playing[ids] = False
@@ -395,8 +395,8 @@ class Collector:
             goal: (N, *goal_shape).
         """
         end, skill = np.zeros(self.num_envs, np.int8), self.skill
-        if self.call_limit is not None:
-            end[rows[self.elapsed[rows] >= self.call_limit]] = LIMIT
+        if self.limit is not None:
+            end[rows[self.elapsed[rows] >= self.limit]] = LIMIT
         if step is not None and len(rows):
             elapsed, own_goal = self.elapsed[rows], None if goal is None else goal[rows]
             if self.policy.watches:

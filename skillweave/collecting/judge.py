@@ -156,7 +156,7 @@ def seen_by(
     rows: Array | None = None,
     goal: Array | None = None,
 ) -> Step:
-    """Return a step as a skill sees it, whose calls have their own time and limit.
+    """Return a step as a skill sees it, whose calls have their own time.
 
     Where the environment is scored by a task, a skill sees the environment's own reward.
 

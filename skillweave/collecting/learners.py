@@ -38,7 +38,7 @@ from skillweave.skills.own_part import OwnPart
 from skillweave.spaces import action_codec
 from skillweave.types import Array
 
-CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_limit")
+CALLS = (*OF_STEP, "elapsed", "skill", "call_elapsed", "call_end", "call_length")
 """The columns of a trace from which calls are logged."""
 
 
@@ -59,7 +59,7 @@ class Alone:
     """The skill's own part of observations and actions; None: it has all."""
     starts: Starts = field(default_factory=Starts)
     """How its calls start. Rows in which others act until it may start are not valid."""
-    call_limit: int | None = None
+    limit: int | None = None
     """The most steps of a call of the skill; None: its ``max_steps``."""
 
 
@@ -239,8 +239,8 @@ class LevelLearners:
             if level is self.root:
                 call_end = call_end.copy()
                 end_with_episode(call_end, end != RUNNING)
-                if "limit" in memory:
-                    out.write(call_limit=memory["limit"])
+                if "length" in memory:
+                    out.write(call_length=memory["length"])
             values = {"call_end": call_end}
             if whole:
                 values |= {"skill": memory["skill"], "call_elapsed": memory["elapsed"]}

@@ -185,11 +185,12 @@ def one_of(pool: MakePool) -> Callable[..., gym.Env[Any, Any]]:
 
     ```python
     import skillweave as sw
+    from skillweave.envs import one_of
 
     def pendulums(num_envs, threads, seed):
         return sw.envpool("Pendulum-v1", num_envs, threads, seed)
 
-    spec = sw.EnvSpec(sw.one_of(pendulums), pool=pendulums)
+    spec = sw.EnvSpec(one_of(pendulums), pool=pendulums)
     ```
 
     Its pictures are those of the pool's ``render``.

@@ -1,1 +1,17 @@
 """Evolution: a population that learns in stacks, is compared, selected and mutated."""
+
+from typing import TYPE_CHECKING
+
+from skillweave.public import lazy
+
+if TYPE_CHECKING:
+    from skillweave.evolution.config import (
+        Evolution as Evolution,
+        Mutations as Mutations,
+        Range as Range,
+        Tournament as Tournament,
+        Truncation as Truncation,
+    )
+    from skillweave.evolution.selection import Heir as Heir, ParentSelection as ParentSelection
+else:
+    __all__, __getattr__, __dir__ = lazy(__name__)

@@ -220,10 +220,10 @@ class Evolution:
     """A population in place of one agent: it trains, is compared, selected and mutated.
 
     ```python
-    import skillweave as sw
+    from skillweave.evolution import Evolution, Mutations, Range
 
-    ranges = {"learning_rate": sw.Range(1e-4, 1e-2)}
-    search = sw.Evolution(population=4, generations=5, mutations=sw.Mutations(ranges=ranges))
+    ranges = {"learning_rate": Range(1e-4, 1e-2)}
+    search = Evolution(population=4, generations=5, mutations=Mutations(ranges=ranges))
     ```
 
     Raises:

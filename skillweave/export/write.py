@@ -42,14 +42,14 @@ class Export:
 
 
 def write_export(
-    path: Path, policy: Policy, env: str, *, licence: str = "", origin: str = ""
+    path: Path, policy: Policy, env: str, *, license: str = "", origin: str = ""
 ) -> Export:
     """Write a policy for machines without this library; files of the same names are replaced.
 
     Args:
         path: the folder.
         env: the environment's name, for readers of ``policy.json``.
-        licence: of the policy, for them.
+        license: of the policy, for them.
         origin: of the policy, for them: an address, for example.
 
     Raises:
@@ -62,7 +62,7 @@ def write_export(
     content = {
         "format": FORMAT,
         "env": env,
-        "licence": licence,
+        "license": license,
         "origin": origin,
         "files": {name: checksum(data) for name, data in files.items()},
         "code": written.code,

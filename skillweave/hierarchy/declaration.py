@@ -24,7 +24,7 @@ from skillweave.hierarchy.settings import Settings, settings_in
 from skillweave.messages import short, suggest
 from skillweave.networks.config import seeing_all
 from skillweave.paths import AGENT, CRITIC, SELECTOR, join
-from skillweave.planning.neighbours import check_features
+from skillweave.planning.neighbors import check_features
 from skillweave.planning.predicates import named_predicates
 from skillweave.schema import Positive, check_fields, fitted
 from skillweave.skills import Skill, is_trained

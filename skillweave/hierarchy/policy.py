@@ -12,8 +12,7 @@ from skillweave.arguments import checked_names
 from skillweave.collecting.skill_set import SkillSet, acting_alone, acting_policy
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.policies.core import Memory as InPlaceMemory
-from skillweave.policies.core import flat, split
+from skillweave.policies.core import Memory as InPlaceMemory, flat, split
 from skillweave.policies.files import checksum
 from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide, Interruption

@@ -1,4 +1,4 @@
-"""Repair of a hand-over: a skill learns on from where another one ends, and is measured again."""
+"""Repair of a handover: a skill learns on from where another one ends, and is measured again."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from skillweave.hierarchy.assembly import parts_of, policy_at
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import Roles
 from skillweave.paths import level_of, name_of
-from skillweave.planning import CallLog, HandOver, join
-from skillweave.planning.hand_over import before_each, calls_done, shown_rate
+from skillweave.planning import CallLog, Handover, join
+from skillweave.planning.handover import before_each, calls_done, shown_rate
 from skillweave.planning.predicates import Held, as_event
 from skillweave.planning.record import RandomChoice, with_returns
 from skillweave.policies.core import Memory, Turn
@@ -60,7 +60,7 @@ class Repair:
     Attributes:
         skill: the path of the repaired skill.
         after: the path of the skill after which it was repaired.
-        before: the hand-over matrix with the earlier weights.
+        before: the handover matrix with the earlier weights.
         later: with the repaired ones.
         kept: True if the run has the repaired weights, False if the earlier ones.
         blame: the reason of the failure, before the repair.
@@ -69,8 +69,8 @@ class Repair:
 
     skill: str
     after: str
-    before: HandOver
-    later: HandOver
+    before: Handover
+    later: Handover
     kept: bool
     blame: str
     sentence: str
@@ -89,7 +89,7 @@ def repair_stage(
     """Return the stage of a run's entry in which a skill is repaired.
 
     Args:
-        done: as for ``hand_over``.
+        done: as for ``handover``.
     """
     path = repair.skill
     level, role = roles.levels[level_of(path)], roles[path]
@@ -203,9 +203,9 @@ class PairChoice(RandomChoice):
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement of hand-overs."""
+    """A measurement of handovers."""
 
-    matrix: HandOver
+    matrix: Handover
     log: CallLog
     """The calls of the skill, each with the call before it."""
     may_start: bool
@@ -233,7 +233,7 @@ def measure(
         skills: of one level; ``skill`` and ``after`` are names there.
         calls: calls of the pair; fewer where ``MOST_STEPS`` do not suffice, or where after
             ``ENOUGH_STEPS`` not even ``FEWEST`` are to be expected.
-        done: as for ``hand_over``.
+        done: as for ``handover``.
         tell: receives a sentence about what is done now.
     """
     names = tuple(s.name for s in skills.skills)
@@ -248,7 +248,7 @@ def measure(
         seed = SEED + len(parts)
         log, returns = with_returns(spec, skills, size, choose, num_envs, seed)
         steps += log.steps
-        found = log.hand_over(done)
+        found = log.handover(done)
         matrix = found if matrix is None else _sum(matrix, found)
         may = log.may_follow[log.skill == first][:, number * (log.choices // len(names))]
         may_start |= bool(may.any())
@@ -280,7 +280,7 @@ def measure(
         size = int(np.clip(needed, CHUNK, min(MOST_STEPS - steps, LARGEST_CHUNK)))
 
 
-def _sum(one: HandOver, other: HandOver) -> HandOver:
+def _sum(one: Handover, other: Handover) -> Handover:
     counts = {k: getattr(one, k) + getattr(other, k) for k in ("calls", "done", "cut")}
     return replace(one, **counts)
 
@@ -302,7 +302,7 @@ def rehearsed_obs(
         skill: the skill.
         part: its own part of observations; None: it sees all.
         after: the name of the other skill.
-        done: as for ``hand_over``.
+        done: as for ``handover``.
     """
     won = calls_done(log, done)
     before = before_each(log, won)
@@ -318,16 +318,16 @@ def rehearsed_obs(
     return goals.join(obs, goals.space.of_numbers(log.goals[skill.name])[log.owner[steps]])
 
 
-def matrix_to_json(matrix: HandOver) -> Matrix:
+def matrix_to_json(matrix: Handover) -> Matrix:
     """Return a matrix as a run records it."""
     calls, done, cut = (x.tolist() for x in (matrix.calls, matrix.done, matrix.cut))
     return Matrix(list(matrix.skills), calls, done, cut, list(matrix.by_itself))
 
 
-def matrix_from_json(entry: Matrix) -> HandOver:
+def matrix_from_json(entry: Matrix) -> Handover:
     """Return the matrix of ``matrix_to_json``."""
     calls, done, cut = (np.array(x, np.int64) for x in (entry.calls, entry.done, entry.cut))
-    return HandOver(tuple(entry.skills), calls, done, cut, tuple(entry.by_itself))
+    return Handover(tuple(entry.skills), calls, done, cut, tuple(entry.by_itself))
 
 
 def judge_repair(
@@ -355,7 +355,7 @@ def judge_repair(
     return not entry.undone
 
 
-def verdict(before: HandOver, later: HandOver, skill: str, after: str) -> tuple[bool, str]:
+def verdict(before: Handover, later: Handover, skill: str, after: str) -> tuple[bool, str]:
     """Return whether a repair is kept, and a sentence with the reason.
 
     It is kept if the pair is clearly better and no other pair clearly worse: their 95 % intervals
@@ -378,7 +378,7 @@ def verdict(before: HandOver, later: HandOver, skill: str, after: str) -> tuple[
     return True, f"{pair}; no other pair is clearly worse, so the repaired weights are kept"
 
 
-def _rates(before: HandOver, later: HandOver, place: tuple[int, int]) -> str:
+def _rates(before: Handover, later: Handover, place: tuple[int, int]) -> str:
     one, other = (shown_rate(m.done[place], m.calls[place]) for m in (before, later))
     return f"{one} before, {other} later"
 

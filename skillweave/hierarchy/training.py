@@ -112,7 +112,7 @@ def train(
     """Train, or finish training, the stages of a run; return the policy.
 
     Args:
-        done: the events by which a repair is judged, as for ``planning.hand_over``.
+        done: the events by which a repair is judged, as for ``planning.handover``.
     """
     course = Course(run, listeners, make_learner, done)
     if run.manifest["kind"] == "agent":

@@ -91,7 +91,7 @@ def make_encoder(name: Any, obs: ObsCodec) -> Encoder:
     if name not in _REGISTERED:
         raise DeclarationError(
             f"Network.encoder is {name!r}, which is not registered: call "
-            f"skillweave.register_encoder({name!r}, ...) before (registered: "
+            f"skillweave.algorithms.register_encoder({name!r}, ...) before (registered: "
             f"{', '.join(_REGISTERED) or 'none'})"
         )
     return _REGISTERED[name](obs)

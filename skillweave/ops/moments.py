@@ -58,7 +58,7 @@ def masked_var_mean(x: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Ten
     return masked_mean(away.square(), valid), mean
 
 
-def normalise(
+def normalize(
     x: Tensor, valid: Tensor | None = None, eps: float = 1e-8, min_std: float = 0.0
 ) -> Tensor:
     """Normalise to zero mean and unit deviation over all axes but the first.

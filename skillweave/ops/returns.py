@@ -24,11 +24,11 @@ def gae(
 
     ```python
     import torch
-    import skillweave as sw
+    from skillweave.algorithms import gae
 
     row = torch.ones(1, 3, 1)  # one member, three steps, one environment
     last = torch.tensor([False, False, True]).view(1, 3, 1)
-    advantage = sw.gae(row, 0.9 * row, 0 * row, 0 * row, last, torch.tensor([1.0]))
+    advantage = gae(row, 0.9 * row, 0 * row, 0 * row, last, torch.tensor([1.0]))
     assert torch.allclose(advantage.flatten(), torch.tensor([2.71, 1.9, 1.0]))
     ```
 

@@ -5,7 +5,7 @@ from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.forecast import Forecast
 from skillweave.planning.goal import GoalTask, reached
-from skillweave.planning.hand_over import CallEnds, Chain, HandOver
+from skillweave.planning.handover import CallEnds, Chain, Handover
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.mission import Mission, either, in_any_order
 from skillweave.planning.planner import Planner
@@ -21,7 +21,7 @@ __all__ = [
     "Explorer",
     "Forecast",
     "GoalTask",
-    "HandOver",
+    "Handover",
     "Mission",
     "Planner",
     "Predicate",

@@ -1,4 +1,4 @@
-"""Attribution of a failed hand-over: to the ends of the first skill, or to the second skill."""
+"""Attribution of a failed handover: to the ends of the first skill, or to the second skill."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.arguments import checked_names
 from skillweave.errors import RunError
 from skillweave.planning.compared import feature_maps
-from skillweave.planning.hand_over import (
+from skillweave.planning.handover import (
     START,
     LinkedCalls,
     before_each,
@@ -19,7 +19,7 @@ from skillweave.planning.hand_over import (
     shown_rate,
     wilson,
 )
-from skillweave.planning.neighbours import Standard, nearest
+from skillweave.planning.neighbors import Standard, nearest
 from skillweave.types import Array
 
 LEAST = 20
@@ -183,7 +183,7 @@ class BlamedCalls(LinkedCalls):
         Args:
             skill: the second skill.
             after: the first skill, or "start".
-            done: as for ``hand_over``.
+            done: as for ``handover``.
             features: as for ``Planner``; images need them.
 
         Raises:

@@ -13,7 +13,7 @@ from skillweave.messages import short, suggest
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import FeatureMap, Standard, nearest
+from skillweave.planning.neighbors import FeatureMap, Standard, nearest
 from skillweave.spaces import obs_codec
 from skillweave.types import Array
 
@@ -23,7 +23,7 @@ FEWEST = 30
 """Calls of a skill from which on it is measured whether a number says where they end."""
 MOST = 2_000
 """The most calls that this is measured by."""
-NEIGHBOURS = 5
+NEIGHBORS = 5
 BETTER = 0.95
 """The error of predicted ends, relative to that without some numbers, below which they help."""
 READ = 2_000
@@ -150,7 +150,7 @@ def _predict(few: Array, many: Array, values: Array) -> bool:
 
     def error(seen: Array) -> float:
         points = Standard(seen)(seen).astype(np.float32)
-        near, _ = nearest(points, points, NEIGHBOURS + 1, np.arange(len(points)))
+        near, _ = nearest(points, points, NEIGHBORS + 1, np.arange(len(points)))
         others = near != np.arange(len(points))[:, None]
         mean = (wanted[near] * others[..., None]).sum(1) / others.sum(1)[:, None]
         return float(np.square(mean - wanted).mean())

@@ -10,7 +10,7 @@ from skillweave.arguments import checked_names
 from skillweave.planning.calls import CallLog
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import check_features
+from skillweave.planning.neighbors import check_features
 from skillweave.planning.states import planning_states
 from skillweave.policies.core import Memory, Policy, Turn
 from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
@@ -36,7 +36,7 @@ class Explorer(Policy):
         radius: in standard deviations of the features, over all of them; None: a quarter of one
             in each feature, 0.25 √F.
         features: as for ``Planner``; what makes two calls alike, a place for example.
-        neighbours: K.
+        neighbors: K.
         gamma: γ of one step.
         temperature: as for ``Planner``.
         every: steps after which it plans again.
@@ -50,7 +50,7 @@ class Explorer(Policy):
         radius: float | None = None,
         *,
         features: Any = None,
-        neighbours: int = 3,
+        neighbors: int = 3,
         gamma: float = 0.997,
         temperature: float = 0.03,
         every: int = 4_000,
@@ -59,7 +59,7 @@ class Explorer(Policy):
         self.every = fitted(AtLeastOne, every, "Explorer: every")
         self._radius = fitted(Positive | None, radius, "Explorer: radius")
         self._features, self._gamma = features, fitted(Fraction, gamma, "Explorer: gamma")
-        self._neighbours = fitted(AtLeastOne, neighbours, "Explorer: neighbours")
+        self._neighbors = fitted(AtLeastOne, neighbors, "Explorer: neighbors")
         self._temperature = fitted(_Temperature, temperature, "Explorer: temperature")
         self._choices = 0
         self._graph: CallGraph | None = None
@@ -73,7 +73,7 @@ class Explorer(Policy):
         """Plan on the calls so far."""
         if len(log) < 2:
             return
-        graph = CallGraph(log, self._features, self._neighbours)
+        graph = CallGraph(log, self._features, self._neighbors)
         nothing = RewardMachine({})
         readings = nothing.acts.read(graph.log.as_steps())
         judged = graph.judge(

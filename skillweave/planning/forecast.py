@@ -11,7 +11,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import leaves
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.planning.lacking import names_of, read_log
 from skillweave.planning.machine import RewardMachine, predicate_of
 from skillweave.planning.planner import Planner
@@ -23,7 +23,7 @@ EPISODES = 200
 GOALS = 16
 """Episodes where each has a goal of its own, which needs a plan of its own."""
 EQUAL = 10
-"""Times K neighbours are looked at, as many calls may start in the same place."""
+"""Times K neighbors are looked at, as many calls may start in the same place."""
 MOST_CALLS = 100
 """The most calls of an episode."""
 UNLIKELY = 0.2
@@ -103,10 +103,10 @@ def forecast(planner: Planner) -> Forecast:
         was = state[here]
         at, may_here = np.arange(len(here)), may[here] | ~may[here].any(1, keepdims=True)
         option, near = planner.options(obs[here], state[here], may_here, rng)
-        wide = graph.near(obs[here], EQUAL * graph.neighbours)
+        wide = graph.near(obs[here], EQUAL * graph.neighbors)
         weights = wide.weights[at, option]
-        # Beyond the plan's K neighbours those count that are as near as the last of these.
-        weights = weights * (weights >= 0.999 * weights[:, graph.neighbours - 1, None])
+        # Beyond the plan's K neighbors those count that are as near as the last of these.
+        weights = weights * (weights >= 0.999 * weights[:, graph.neighbors - 1, None])
         drawn = weights.cumsum(1) < rng.random((len(here), 1)) * weights.sum(1, keepdims=True)
         piece = wide.pieces[at, option, np.minimum(drawn.sum(1), weights.shape[1] - 1)]
         far = near.distance[at, option] / graph.options.units[option]

@@ -24,7 +24,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import Standard, tie_order
+from skillweave.planning.neighbors import Standard, tie_order
 from skillweave.planning.states import exact_states
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import Levels, Near, OptionGroup, Options, Readings
@@ -91,7 +91,7 @@ class CallGraph:
         log: the calls.
         features: for all skills or by skill: places, or a function of observations; None: see
             ``compared_places``.
-        neighbours: K.
+        neighbors: K.
         skills: for initiation sets in observations that are not in the log; None: those that were
             recorded at the ends of calls.
         task: that will be planned, as far as it is known; see ``compared_places``.
@@ -105,7 +105,7 @@ class CallGraph:
         self,
         log: CallLog,
         features: Any = None,
-        neighbours: int = 5,
+        neighbors: int = 5,
         skills: SkillSet | None = None,
         task: RewardMachine | None = None,
     ) -> None:
@@ -120,12 +120,12 @@ class CallGraph:
                 "distances"
             )
             log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
-        self.log, self.neighbours, self.skills = log, neighbours, skills
+        self.log, self.neighbors, self.skills = log, neighbors, skills
         self.pieces = pieces = _pieces(log, skills)
         self.maps = feature_maps(log, features, np.concatenate([log.start, log.end]), task)
         aims = [_standard_goals(log, name) for name in log.skills]
         groups = tuple(self._groups(log.before[pieces.first], aims))
-        self.options = Options(groups, tuple(aims), neighbours, log.lengths)
+        self.options = Options(groups, tuple(aims), neighbors, log.lengths)
         self.choice_of = self.options.choice_of
         """(O,) int64, the choice of each option."""
         self.known = np.bincount(pieces.choice, minlength=log.choices)[self.choice_of] > 0
@@ -196,7 +196,7 @@ class CallGraph:
                 )
                 if n := len(alike):
                     some = alike[np.linspace(0, n - 1, min(n, SAMPLED)).astype(np.int64)]
-                    far = group.near(features[some], self.neighbours, own, call[some])[1]
+                    far = group.near(features[some], self.neighbors, own, call[some])[1]
                     group.usual = float(np.median(far[:, :, -1]))
                 yield group
 
@@ -213,7 +213,7 @@ class CallGraph:
         )
 
     def _without_own(self, near: Near) -> Near:
-        """Return the neighbours where no cut call is followed by its own pieces."""
+        """Return the neighbors where no cut call is followed by its own pieces."""
         cut = self._cut
         if not len(cut):
             return near
@@ -298,7 +298,7 @@ class CallGraph:
             best = np.full_like(value, -np.inf)
             for c in options:
                 q = np.zeros_like(value)
-                for k in range(self.neighbours):
+                for k in range(self.neighbors):
                     q += near.weights[:, c, k, None] * worth[near.pieces[:, c, k]]
                 q = np.where(q > 0, q * trust[:, c, None], q)
                 if novel is not None:

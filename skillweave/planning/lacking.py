@@ -9,7 +9,7 @@ import numpy as np
 from skillweave.errors import RunError, SkillError, SkillweaveError
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.machine import Arrow, RewardMachine, predicate_of
-from skillweave.planning.neighbours import Standard
+from skillweave.planning.neighbors import Standard
 from skillweave.planning.predicates import Predicate
 from skillweave.policies.core import observed
 from skillweave.policies.plan import Readings

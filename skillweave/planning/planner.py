@@ -22,7 +22,7 @@ from skillweave.planning.goal import GoalTask
 from skillweave.planning.graph import CallGraph
 from skillweave.planning.lacking import check_possible, obstacle, read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbours import check_features
+from skillweave.planning.neighbors import check_features
 from skillweave.planning.states import planning_states
 from skillweave.planning.task import Task, as_task
 from skillweave.policies.files import checksum
@@ -81,10 +81,10 @@ class Planner(ReadySelector):
             sees, and what changes in most steps, without numbers that never change within an
             episode, if they do not help to predict where calls end and the task does not read them;
             ``compared`` has the places. They are standardised by the log.
-        neighbours: K.
+        neighbors: K.
         gamma: γ of one step.
         caution: the share by which a value falls, about, where the nearest call is as far as the
-            last of the ``neighbours`` usually is.
+            last of the ``neighbors`` usually is.
         temperature: choices are sampled by exp(Q / (temperature · the largest |Q|)); 0: the best is
             chosen.
 
@@ -104,7 +104,7 @@ class Planner(ReadySelector):
         predicates: Mapping[str, Any] | None = None,
         skills: Any = None,
         features: Any = None,
-        neighbours: int = 5,
+        neighbors: int = 5,
         gamma: float = 0.999,
         caution: float = 0.03,
         temperature: float = 0.0,
@@ -122,7 +122,7 @@ class Planner(ReadySelector):
         self.graph = CallGraph(
             log,
             features,
-            fitted(AtLeastOne, neighbours, "Planner: neighbours"),
+            fitted(AtLeastOne, neighbors, "Planner: neighbors"),
             _skill_set(log, skills),
             self.task if isinstance(self.task, RewardMachine) else None,
         )

@@ -196,7 +196,7 @@ def successes(skills: Iterable[Skill]) -> dict[str, Predicate]:
         skills: of a hierarchy, ``hierarchy.skills``.
 
     Returns:
-        Predicates of a step, for ``Mission.from_text`` and for hand-over matrices.
+        Predicates of a step, for ``Mission.from_text`` and for handover matrices.
     """
     return {
         skill.name: Predicate(skill.success, skill.name, "step")

@@ -21,9 +21,15 @@ from skillweave.messages import short
 from skillweave.planning.calls import CallLog
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, check_size, goals_in
-from skillweave.policies.core import Around, CallEnd, Turn, World, restart
-from skillweave.policies.core import Memory as InPlaceMemory
-from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.core import (
+    Around,
+    CallEnd,
+    Memory as InPlaceMemory,
+    Policy as InPlace,
+    Turn,
+    World,
+    restart,
+)
 from skillweave.policies.parts import GOAL
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.seeding import Seeds, global_generators

@@ -45,7 +45,7 @@ STEPS = {"next_obs": "next_obs", "action": "env_action", "reward": "env_reward"}
 """By a column of a log's steps, the column of a trace."""
 MOST_BYTES = 4 * 2**30
 """The largest log."""
-CALL = ("skill", "elapsed", "end", "limit")
+CALL = ("skill", "elapsed", "end", "length")
 """What a recorder reads of a player's memory."""
 FED_ROWS = 64
 """The most steps of a trace that is fed step by step."""
@@ -78,7 +78,7 @@ class Recorder:
 
     A trace has the columns of ``SCHEMA`` that say what the environments did, and under the level's
     path ``skill`` (−1: none acts), ``call_elapsed``, ``call_end`` and, with chosen lengths,
-    ``call_limit``. A call starts where ``call_start`` is true, or without this column where
+    ``call_length``. A call starts where ``call_start`` is true, or without this column where
     ``call_elapsed`` is 1; an episode where ``elapsed`` is.
 
     Args:
@@ -278,8 +278,8 @@ class Recorder:
         new["number"], new["seed"] = self._calls + np.arange(len(new)), -1
         new["choice"] = trace[self._columns + "skill"][starts]
         if lengths := self.skills.lengths:
-            limit = trace[self._columns + "call_limit"][starts]
-            new["choice"] = new["choice"] * len(lengths) + np.searchsorted(lengths, limit)
+            length = trace[self._columns + "call_length"][starts]
+            new["choice"] = new["choice"] * len(lengths) + np.searchsorted(lengths, length)
         new["episode"], new["order"] = episode[starts], order[starts]
         new["age"] = trace["elapsed"][starts] - 1
         for name, goals in self.goals.items():
@@ -425,7 +425,7 @@ class TraceFeed:
 def calls_in(memory: Any, goals: Mapping[int, tuple[str, Goals]], rows: Array) -> Memory:
     """Return what a ``TraceFeed`` takes of a hierarchy's memory.
 
-    These are ``skill``, ``elapsed``, ``end`` and perhaps ``limit``, (k,) each, and the goals of
+    These are ``skill``, ``elapsed``, ``end`` and perhaps ``length``, (k,) each, and the goals of
     skills that have some, (k, *goal_shape).
 
     Args:

@@ -18,7 +18,7 @@ from skillweave.paths import CRITIC, SELECTOR
 from skillweave.planning.call_file import LoggedRun, write_calls
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.columns import columns_of
-from skillweave.planning.hand_over import HandOver
+from skillweave.planning.handover import Handover
 from skillweave.planning.recorder import MOST_BYTES
 from skillweave.policies.files import check_file
 from skillweave.runs.directory import CALLS, CALLS_LOCK, RunDirectory
@@ -48,7 +48,7 @@ def load_calls(run: RunDirectory) -> CallLog | None:
     return CallLog.load(path)
 
 
-def hand_over_of(run: RunDirectory) -> HandOver | str | None:
+def handover_of(run: RunDirectory) -> Handover | str | None:
     """Return the matrix of a run's log; a sentence where the log cannot be used; None without one.
 
     Reports about runs use it: a log that cannot be used is no reason to show nothing.
@@ -57,14 +57,14 @@ def hand_over_of(run: RunDirectory) -> HandOver | str | None:
         log = load_calls(run)
     except RunError as error:
         return str(error)
-    return None if log is None else log.hand_over()
+    return None if log is None else log.handover()
 
 
-def hand_over_json(matrix: HandOver | str | None) -> dict[str, Any]:
-    """Return an entry of a run's description for what ``hand_over_of`` returned."""
+def handover_json(matrix: Handover | str | None) -> dict[str, Any]:
+    """Return an entry of a run's description for what ``handover_of`` returned."""
     if matrix is None:
         return {}
-    return {"hand_over": {"error": matrix} if isinstance(matrix, str) else matrix.to_json()}
+    return {"handover": {"error": matrix} if isinstance(matrix, str) else matrix.to_json()}
 
 
 def needed_calls(run: RunDirectory) -> CallLog:

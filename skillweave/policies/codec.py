@@ -352,7 +352,7 @@ def read_folder(
     return found, content, archive or _archived(read)
 
 
-FIELDS = {"env": str, "licence": str, "origin": str, "files": dict, "code": dict, "policy": dict}
+FIELDS = {"env": str, "license": str, "origin": str, "files": dict, "code": dict, "policy": dict}
 """The fields of ``policy.json`` beside its format, and their types."""
 
 

@@ -95,23 +95,23 @@ def part_of(
     step: Step,
     elapsed: Array,
     rows: Array | None = None,
-    limit: int | None = None,
+    max_steps: int | None = None,
     goal: Array | None = None,
 ) -> Step:
-    """Return a step as seen by someone with a time and a limit of its own.
+    """Return a step as seen by someone with a time of its own.
 
     Args:
         elapsed: (m,) steps so far, this one included.
         rows: (m,) ascending, some rows of the step; None: all.
-        limit: steps after which its time is over; None: never.
+        max_steps: steps after which its time is over; None: never.
         goal: (m, *goal_shape); None: it has no goals.
     """
     every = rows is None or len(rows) == len(step.reward)  # then there is nothing to copy
     at = slice(None) if every else rows
     terminated = step.terminated[at]
     late = np.zeros(len(terminated), bool)
-    if limit is not None:
-        late = (elapsed >= limit) & ~terminated
+    if max_steps is not None:
+        late = (elapsed >= max_steps) & ~terminated
     info = step.info if rows is None or every else info_rows(step.info, rows, len(step.reward))
     return Step(
         step.obs[at],

@@ -1,4 +1,4 @@
-"""Policies as ``skillweave.Policy`` says, which return their memory: from and to those in place."""
+"""Policies as ``skillweave.types.Policy`` says, which return their memory, from and to others."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .parts import GOAL, OBSERVATION
 
 
 class Functional:
-    """A policy as ``skillweave.Policy`` says, over one whose memory is changed in place.
+    """A policy as ``skillweave.types.Policy`` says, over one whose memory is changed in place.
 
     Args:
         in_place: the same policy.
@@ -92,7 +92,7 @@ class Functional:
 
 
 class Returns(Policy):
-    """A policy of ``skillweave.Policy``: it is given its own rows, and returns its memory.
+    """A policy of ``skillweave.types.Policy``: it is given its own rows, and returns its memory.
 
     Args:
         who: begins messages: "skill 'x': its policy's act()".

@@ -3,7 +3,7 @@
 A ``Hierarchy`` remembers, for each environment:
 
 - ``skill``: the running one, −1 where no call has started in the episode;
-- ``elapsed``: steps of its call; ``limit``: the length that was chosen, where one is;
+- ``elapsed``: steps of its call; ``length``: the one that was chosen, where one is;
 - ``end``: why the latest call ended (``CallEnd``), RUNNING where it has not;
 - ``goal``: by the place of a skill with goals, that of its latest call;
 - by the place of each skill what its policy remembers; ``selector`` and ``guide``: the same;
@@ -255,7 +255,7 @@ class Hierarchy(Policy):
             "end": np.full(n, EPISODE, np.int8),
         }
         if self.lengths:
-            memory["limit"] = np.zeros(n, np.int64)
+            memory["length"] = np.zeros(n, np.int64)
         if self.goals:
             memory["goal"] = {str(i): goals.start(n) for i, goals in self.goals.items()}
         memory |= {str(i): skill.policy.start(n) for i, skill in enumerate(self.skills)}
@@ -375,7 +375,7 @@ class Hierarchy(Policy):
                 )
             memory["goal"][str(i)][rows[mine]] = goals[i][mine]
         if self.lengths:
-            memory["limit"][rows] = np.array(self.lengths)[choice % self._each]
+            memory["length"][rows] = np.array(self.lengths)[choice % self._each]
         fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
         memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
         for i, own in enumerate(self.skills):
@@ -524,7 +524,7 @@ class Hierarchy(Policy):
         elapsed, running = memory["elapsed"][rows], memory["skill"][rows]
         end = np.zeros(len(rows), np.int8)
         if self.lengths:
-            end[elapsed >= memory["limit"][rows]] = LIMIT
+            end[elapsed >= memory["length"][rows]] = LIMIT
         end[elapsed >= self._limits[running]] = LIMIT
         own = own_step(step)
         for i, mine in _by_skill(running):
@@ -563,8 +563,8 @@ class Hierarchy(Policy):
         self, memory: Memory, i: int, rows: Array, mine: Array, elapsed: Array, step: Step
     ) -> Step:
         """Return a step as skill ``i`` sees it in ``rows[mine]``."""
-        goal, limit = self.goal_of(memory, i, rows[mine]), self.skills[i].max_steps
-        return part_of(step, elapsed[mine], mine, limit, goal)
+        goal = self.goal_of(memory, i, rows[mine])
+        return part_of(step, elapsed[mine], mine, self.skills[i].max_steps, goal)
 
     def _interrupt(
         self, how: Interruption, memory: Memory, rows: Array, step: Step, end: Array
@@ -640,7 +640,7 @@ class Hierarchy(Policy):
             "end": range(len(CallEnd)),
         }
         if self.lengths:
-            found["limit"] = range(max(self.lengths) + 1)
+            found["length"] = range(max(self.lengths) + 1)
         found |= {f"goal.{i}": goals for i, goals in self.goals.items()}
         parts = {str(i): skill.policy for i, skill in enumerate(self.skills)}
         for name, part in {**parts, **self._ready}.items():

@@ -26,7 +26,7 @@ near."""
 FAR = 100.0
 """Deviations beyond which all values are equally far."""
 FURTHER = 2.0
-"""A neighbour counts only if it is at most so many times as far as the nearest, or as is usual:
+"""A neighbor counts only if it is at most so many times as far as the nearest, or as is usual:
 where the log has few calls, others are often behind a wall, and a small chance to pass it would
 grow with each call that is tried again."""
 MOST_OPTIONS = 10_000
@@ -131,7 +131,7 @@ class OptionGroup:
     goal: Array
     """(m,) int64, the call whose goal an option has if the piece is its nearest; −1: none."""
     usual: float
-    """The usual distance of a start's k-th neighbour among others."""
+    """The usual distance of a start's k-th neighbor among others."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.options <= MOST_OPTIONS or not self.usual >= 0:
@@ -199,7 +199,7 @@ class Options:
     groups: tuple[OptionGroup, ...]
     aims: tuple[Array | None, ...]
     """Of each skill, (C, G) float32, the standardised goals of all calls; None: it has none."""
-    neighbours: int
+    neighbors: int
     """K."""
     lengths: tuple[int, ...] = ()
     """That are chosen with a skill; (): none."""
@@ -210,10 +210,10 @@ class Options:
         of = [group.choice for group in self.groups]
         rising = list(self.lengths) == sorted(set(self.lengths))
         whole = of and of == sorted(of) and {*of} == {*range(self.choices)}
-        if not whole or not rising or self.neighbours < 1:
+        if not whole or not rising or self.neighbors < 1:
             raise PolicyError(
                 f"a plan with {len(self.aims)} skills, the lengths {self.lengths} and "
-                f"{self.neighbours} neighbours has options of the choices {of}"
+                f"{self.neighbors} neighbors has options of the choices {of}"
             )
         self.skill_of = np.arange(self.choices) // each
         """(choices,) int64, the skill of each choice."""
@@ -225,7 +225,7 @@ class Options:
         usual = np.array([group.usual for group in self.groups], np.float32)
         usual = np.where(np.isfinite(usual), np.maximum(usual, SOFT), np.float32(1.0))
         self.units = usual.repeat(counts)
-        """(O,) float32, the usual distance of the K-th neighbour of each option.
+        """(O,) float32, the usual distance of the K-th neighbor of each option.
 
         Where the log has too few calls to tell, it is 1, a standard deviation."""
         for aims in self.aims:
@@ -252,7 +252,7 @@ class Options:
         for group in self.groups:
             skill = self.skill_of[group.choice]
             to, aims = features[skill], self.aims[skill]
-            pieces, far, goal = group.near(to, most or self.neighbours, aims, without)
+            pieces, far, goal = group.near(to, most or self.neighbors, aims, without)
             limit = FURTHER * np.maximum(far[..., :1], np.float32(group.usual))
             found.append((pieces, np.where(far <= limit, far, np.float32(np.inf)), goal))
         pieces, distance, goal = (np.concatenate(part, 1) for part in zip(*found, strict=True))
@@ -266,7 +266,7 @@ class Options:
         Args:
             distance: (n, O), to the nearest piece of each option; infinite: it has none.
             caution: the share by which a value falls, about, where this distance is the usual one
-                of the K-th neighbour.
+                of the K-th neighbor.
         """
         far = np.where(np.isfinite(distance), distance, 0.0) / self.units
         share: Array = (1.0 / (1.0 + caution * far)).astype(np.float32)
@@ -324,10 +324,10 @@ def _blocks(n: int, each: int) -> list[slice]:
 
 
 def weights_of(distance: Array) -> Array:
-    """Return weights (…, K) of neighbours at these distances; they add up to 1."""
+    """Return weights (…, K) of neighbors at these distances; they add up to 1."""
     weights = 1.0 / (distance + SOFT)
-    normalised: Array = weights / weights.sum(-1, keepdims=True)
-    return normalised
+    normalized: Array = weights / weights.sum(-1, keepdims=True)
+    return normalized
 
 
 # The task ---------------------------------------------------------------------------------------

@@ -207,7 +207,7 @@ class Planned(Rule):
         place, share = corners
         q = np.empty(near.distance.shape, np.float32)
         for rows, each in self.worths(obs):
-            # (n, O, K, J): the worth of each neighbour at each corner.
+            # (n, O, K, J): the worth of each neighbor at each corner.
             worth = each[near.pieces[rows][..., None], place[rows][:, None, None, :]]
             q[rows] = ((worth * share[rows][:, None, None, :]).sum(3) * near.weights[rows]).sum(2)
         q = np.where(q > 0, q * self.options.trust(near.distance, self.caution), q)

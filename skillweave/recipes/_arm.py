@@ -8,7 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, EnvSpec, MissingExtra
+from skillweave import EnvSpec
+from skillweave.errors import MissingExtra
+from skillweave.types import Array
 
 NEAR = 0.05
 """Metres from the goal at which the block is there, as Gymnasium-Robotics has it."""

@@ -9,7 +9,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, PoolWrapper, envpool
+from skillweave import EnvSpec, envpool
+from skillweave.envs import PoolWrapper
+from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.types import Array
 
 ROUND = 1000.0
 """Reward of a finished round."""

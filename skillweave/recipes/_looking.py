@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import Array, Step
+from skillweave import Step
 from skillweave.recipes._rooms import ACTIONS, FORWARD, LEFT, RIGHT, SPACE, ahead, free
+from skillweave.types import Array
 
 Memory = dict[str, Array]
 TURNS = 4

@@ -14,7 +14,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, DeclarationError, EnvSpec, PoolWrapper, envpool
+from skillweave import EnvSpec, envpool
+from skillweave.envs import PoolWrapper
+from skillweave.errors import DeclarationError
+from skillweave.types import Array
 
 LANDER = "LunarLander-v3"
 EPISODE = 1000

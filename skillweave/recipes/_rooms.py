@@ -10,7 +10,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from skillweave import Array, DeclarationError, EnvSpec, MissingExtra, envpool
+from skillweave import EnvSpec, envpool
+from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.types import Array
 
 SMALL = (
     "DoorKey-8x8",

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Apart, Array, Hierarchy, Network, Selection, Skill, Step, Together
+from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, Together
 from skillweave.recipes._looking import LookAround
 from skillweave.recipes._rooms import (
     BALL,
@@ -44,6 +44,7 @@ from skillweave.recipes._rooms import (
     spec,
     steps_to,
 )
+from skillweave.types import Array
 
 
 class Errand(Skill):

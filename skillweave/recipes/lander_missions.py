@@ -21,19 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import (
-    PPO,
-    Apart,
-    Array,
-    DeclarationError,
-    Hierarchy,
-    Network,
-    Selection,
-    Skill,
-    Step,
-    TrainDefaults,
-)
+from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, TrainDefaults
+from skillweave.errors import DeclarationError
 from skillweave.recipes._missions import HALF, KINDS, PAD, POINTS, spec
+from skillweave.types import Array
 
 X = 0
 Y = 1

@@ -18,7 +18,6 @@ import numpy as np
 from skillweave import (
     PPO,
     Apart,
-    Array,
     Hierarchy,
     Network,
     Reflex,
@@ -28,6 +27,7 @@ from skillweave import (
     Together,
     TrainDefaults,
 )
+from skillweave.types import Array
 
 X, Y, ANGLE, LEFT_LEG, RIGHT_LEG = 0, 1, 4, 6, 7
 

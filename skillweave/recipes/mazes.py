@@ -23,19 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import (
-    PPO,
-    Apart,
-    Array,
-    Hierarchy,
-    Network,
-    Selection,
-    Skill,
-    Step,
-    TrainDefaults,
-    register_encoder,
-)
+from skillweave import PPO, Apart, Hierarchy, Network, Selection, Skill, Step, TrainDefaults
+from skillweave.algorithms import register_encoder
 from skillweave.recipes._mazes import GOAL, PLACE, SPEED, spec
+from skillweave.types import Array
 
 SLOW = 0.3
 """Metres a second, below which the ball counts as slow."""

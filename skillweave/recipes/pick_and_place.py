@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 import skillweave as sw
-from skillweave import PPO, Apart, Array, Guide, Hierarchy, Network, Skill, Step
-from skillweave.recipes._arm import CALM, Disturbances, spec
-from skillweave.recipes._arm import is_held as is_grasped
+from skillweave import PPO, Apart, Guide, Hierarchy, Network, Skill, Step
+from skillweave.recipes._arm import CALM, Disturbances, is_held as is_grasped, spec
+from skillweave.types import Array
 
 GRIPPER = slice(0, 3)
 BLOCK = slice(3, 6)

@@ -28,8 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from skillweave import PPO, Array, Automaton, Hierarchy, Network, Skill, Step, Together
+from skillweave import PPO, Automaton, Hierarchy, Network, Skill, Step, Together
 from skillweave.recipes._cheetah import LEG, SPEED, spec
+from skillweave.types import Array
 
 UNIT = 1000.0
 """A score is a return divided by this: the mean reward of a step."""

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import quote
 
-from skillweave.planning.run_log import hand_over_of
+from skillweave.planning.run_log import handover_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
 from skillweave.reporting.report.facts import WHY, facts, plain, settings, skill_rows, stage_rows
 from skillweave.runs.directory import RunDirectory
@@ -131,11 +131,11 @@ def _measured(saved: SavedEvaluation | None) -> str:
 
 def _handed_over(run: RunDirectory) -> list[str]:
     """Return the section on the run's log of calls, if it has one that is of its skills."""
-    matrix = hand_over_of(run)
+    matrix = handover_of(run)
     if matrix is None or isinstance(matrix, str):
         return []
     lines = [
-        "## Hand-over",
+        "## Handover",
         "",
         "The share of each skill's calls that are done, by the skill before.",
         text(matrix.meaning),

@@ -30,7 +30,7 @@ class Born:
     def number(self, setting: str) -> float:
         """Return the value of a setting as it is drawn; of several widths their sum."""
         value = self.settings[setting]
-        number: float = sum(value) if isinstance(value, list) else value
+        number = sum(value) if isinstance(value, list) else value
         return 1.0 - number if setting in COMPLEMENT else number
 
 

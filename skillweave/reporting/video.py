@@ -80,7 +80,7 @@ def render_policy(
     episodes = fitted(AtLeastOne, episodes, "episodes")
     every = fitted(AtLeastOne, every, "every")
     seed = fitted(Count, seed, "seed")
-    limit = LONG_EPISODE if max_steps is None else fitted(AtLeastOne, max_steps, "max_steps")
+    max_steps = LONG_EPISODE if max_steps is None else fitted(AtLeastOne, max_steps, "max_steps")
     rng = rng or (Seeds(seed) / "render").numpy()
     with global_generators(Seeds(seed) / "render" / "global"):
         env = env_spec.make(render_mode="rgb_array")
@@ -93,7 +93,7 @@ def render_policy(
                 EpisodeProgress(episodes, quiet=quiet, name="film") as progress,
             ):
                 film = _Film(env, video, every, label)
-                whole = SeededEpisodes(engine, range(seed, seed + episodes), limit)
+                whole = SeededEpisodes(engine, range(seed, seed + episodes), max_steps)
                 how: Any = {"deterministic": deterministic, "rng": rng}
                 for played in play(policy, whole, before_step=film.before_step, **how):
                     film.after_step(played)

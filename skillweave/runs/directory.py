@@ -52,8 +52,7 @@ from skillweave.runs.files import (
 )
 from skillweave.runs.jsonl import JsonLines
 from skillweave.runs.links import check_no_links
-from skillweave.runs.lock import NAME as LOCK
-from skillweave.runs.lock import Lock
+from skillweave.runs.lock import NAME as LOCK, Lock
 from skillweave.runs.manifest import (
     Checkpoint,
     LineageLine,

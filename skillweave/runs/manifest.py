@@ -179,7 +179,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Counts of calls, and of those that were done, by the skill before (``HandOver``)."""
+    """Counts of calls, and of those that were done, by the skill before (``Handover``)."""
 
     skills: list[str]
     calls: list[list[Count]]

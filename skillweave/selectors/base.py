@@ -16,13 +16,11 @@ from skillweave.messages import shortened
 from skillweave.policies.core import LastCall
 from skillweave.policies.functional import Functional
 from skillweave.policies.parts import GOAL
-from skillweave.policies.selectors import Rule
-from skillweave.policies.selectors import function_name as function_name
+from skillweave.policies.selectors import Rule, function_name as function_name
 from skillweave.policies.spaces import space_of
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import alone
-from skillweave.skills.outputs import Wrapped as Wrapped
-from skillweave.skills.outputs import answer, called
+from skillweave.skills.outputs import Wrapped as Wrapped, answer, called
 from skillweave.terminal import one_line
 from skillweave.types import Array, Memory, Memoryless, Step
 

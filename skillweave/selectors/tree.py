@@ -34,8 +34,7 @@ from typing import Any
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
-from skillweave.policies.selectors import Status as Status
-from skillweave.policies.selectors import function_name, skill_and_goal
+from skillweave.policies.selectors import Status as Status, function_name, skill_and_goal
 from skillweave.schema import fitted
 from skillweave.types import Array
 

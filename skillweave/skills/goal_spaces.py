@@ -14,8 +14,7 @@ import numpy as np
 from skillweave.messages import short
 from skillweave.policies.hierarchy import SKILL
 from skillweave.policies.parts import GOAL, OBSERVATION
-from skillweave.policies.spaces import Space as Data
-from skillweave.policies.spaces import at, space_of
+from skillweave.policies.spaces import Space as Data, at, space_of
 from skillweave.types import Array
 
 

@@ -23,8 +23,7 @@ from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Part
-from skillweave.policies.spaces import Space as Data
-from skillweave.policies.spaces import space_of
+from skillweave.policies.spaces import Space as Data, space_of
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import (

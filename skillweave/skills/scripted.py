@@ -11,8 +11,7 @@ from gymnasium.spaces import Dict, Tuple
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, PolicyError
 from skillweave.messages import short
-from skillweave.policies.core import Memory, Turn
-from skillweave.policies.core import Policy as InPlace
+from skillweave.policies.core import Memory, Policy as InPlace, Turn
 from skillweave.policies.mapped import Function
 from skillweave.policies.parts import GOAL
 from skillweave.policies.spaces import space_of

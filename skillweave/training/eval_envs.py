@@ -45,10 +45,10 @@ def episodes_of(
     params = algorithm.acting_params_of(policy.weights)
     gamma = np.array([algorithm.config.gamma])
     request = Request(0, (params,), gamma, acting_seeds, greedy=True)
-    limit = longest_evaluation(engine.time_limit)
+    longest = longest_evaluation(engine.time_limit)
     # Several threads wait for each other, forever on a busy machine.
     with torch_threads(1), global_generators(global_seeds):
-        episodes: Array = player.play(request, seeds / "start", limit)
+        episodes: Array = player.play(request, seeds / "start", longest)
     has_started: Array = ~np.isnan(episodes[:, RETURN])
     return episodes[has_started]
 

@@ -6,8 +6,7 @@ A pool of environments is faster; all its episodes start from one seed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from dataclasses import replace as replaced
+from dataclasses import dataclass, field, replace as replaced
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +37,7 @@ from skillweave.training.skill_report import (
     SkillReport,
     all_steps,
     skill_reports,
-    weak_hand_overs,
+    weak_handovers,
 )
 from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
@@ -200,7 +199,7 @@ class Evaluation:
 
     def _hints(self) -> list[str]:
         """Return hints of mistakes, and skills that seldom succeed after one other skill."""
-        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_hand_over", ()))]
+        return [*hints(self.skills), *(f"{s}." for s in vars(self).get("_handover", ()))]
 
     def __repr__(self) -> str:
         return f"<Evaluation: {self}>"
@@ -298,7 +297,7 @@ def evaluate(
     """
     episodes = fitted(AtLeastOne, episodes, "episodes")
     seed = fitted(Count, seed, "seed")
-    limit = fitted(AtLeastOne | None, max_steps, "max_steps")
+    max_steps = fitted(AtLeastOne | None, max_steps, "max_steps")
     n = USUAL_ENVS if num_envs is None else fitted(AtLeastOne, num_envs, "num_envs")
     if log_calls:
         check_logged(policy, info)
@@ -307,7 +306,7 @@ def evaluate(
     spec = replaced(env if isinstance(env, EnvSpec) else EnvSpec(env), engine=engine)
     with global_generators(Seeds(seed) / "evaluation"):
         keys = tuple(info) if log_calls else None
-        return _evaluate(policy, spec, episodes, seed, deterministic, n, limit, watch, keys)
+        return _evaluate(policy, spec, episodes, seed, deterministic, n, max_steps, watch, keys)
 
 
 def _evaluate(
@@ -317,7 +316,7 @@ def _evaluate(
     seed: int,
     deterministic: bool,
     n: int,
-    limit: int | None,
+    max_steps: int | None,
     watch: Callable[[Played], None] | None,
     info: tuple[str, ...] | None,
 ) -> Evaluation:
@@ -333,7 +332,7 @@ def _evaluate(
         seeds: Any = episode_seeds(seed, episodes)
         if pooled:  # its environments take no seeds of their own
             seeds = seeds[0] % POOL_SEEDS
-        most = limit or longest_evaluation(own_limit)
+        most = max_steps or longest_evaluation(own_limit)
         starts = SeededEpisodes(envs, seeds, most)
         first = starts.obs[:1].copy()
         moments = play(
@@ -343,7 +342,7 @@ def _evaluate(
             rng=np.random.default_rng([seed, 1]),
             seed=seed,
         )
-        if limit is None and own_limit is None:
+        if max_steps is None and own_limit is None:
             moments = _with_notice(moments, spec.name, most)
         how: dict[str, Any] = {"steps": False} if info is None else {"info": info, "spec": spec}
         calls = PlayedCalls(policy, spaces, own_rewards=True, **how)
@@ -463,7 +462,7 @@ def _scored(
         dict(calls.reflexes),
         None if skill is None else policy.path,
     )
-    vars(evaluation)["_hand_over"] = tuple(weak_hand_overs(calls)) if has_skills else ()
+    vars(evaluation)["_handover"] = tuple(weak_handovers(calls)) if has_skills else ()
     if skill is not None:
         reached = None
         if skill.defines("success"):

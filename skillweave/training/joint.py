@@ -293,8 +293,8 @@ class JointAgents(OneAgent):
         of_skills = {relative(k, self.level): r for k, r in requests.items()}
         request = replace(of_selector, below=of_skills)
         with torch_threads(1), global_generators(seeds / "global"):
-            limit = longest_evaluation(eval_envs.engine.time_limit)
-            return player.play(request, seeds / "start", limit)
+            longest = longest_evaluation(eval_envs.engine.time_limit)
+            return player.play(request, seeds / "start", longest)
 
     def saved(self, extra: dict[str, Tensor]) -> tuple[None, dict[str, Tensor]]:
         """Return all states among the extra tensors."""

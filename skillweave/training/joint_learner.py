@@ -12,7 +12,7 @@ from skillweave.buffers.rollout import RolloutStore
 from skillweave.collecting.acting import Request
 from skillweave.experience import Batch
 from skillweave.ops.device import FLOAT
-from skillweave.ops.moments import normalise
+from skillweave.ops.moments import normalize
 from skillweave.paths import CRITIC, SELECTOR, decides, join, name_of, relative
 from skillweave.training.learner import Learner, RolloutLearner, Stack
 from skillweave.types import Array, prefixed, unprefixed
@@ -97,7 +97,7 @@ class JointLearner:
         assert rollout is not None
         advantage = stack.algorithm.advantage(stack.state, rollout)
         min_std = stack.algorithm.config.min_advantage_std / stack.state.return_scale.item()
-        scaled: Array = normalise(advantage, eps=1e-3, min_std=min_std)[0].cpu().numpy()
+        scaled: Array = normalize(advantage, eps=1e-3, min_std=min_std)[0].cpu().numpy()
         return scaled
 
     def learn(self, update: int, steps: int, progress: float) -> dict[str, Tensor]:

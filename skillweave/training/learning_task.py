@@ -83,7 +83,7 @@ def skill_task(
     role: Role,
     reflexes: Sequence[Reflex] = (),
     starts: Starts | None = None,
-    call_limit: int | None = None,
+    limit: int | None = None,
 ) -> LearningTask:
     """Return the learning task of a skill's stage, or of a plain agent's.
 
@@ -91,10 +91,10 @@ def skill_task(
         role: who learns.
         reflexes: in force while it acts.
         starts: how calls of the skill start; None: wherever it may.
-        call_limit: the most steps of a call; None: the skill's own limit.
+        limit: the most steps of a call; None: the skill's own limit.
     """
     spec, skill = role.spec, role.skill
-    who = Alone(skill, tuple(reflexes), role.part, starts or Starts(), call_limit)
+    who = Alone(skill, tuple(reflexes), role.part, starts or Starts(), limit)
 
     def collector(
         num_envs: int, acting: Acting | None, first: int = 0, shared: bool = False

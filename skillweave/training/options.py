@@ -68,7 +68,7 @@ class CallReports(Reports):
     """Steps: the calls in the latest so many steps in which the selector acted, alone or together
     with skills, are the run's log of calls afterwards, as if ``Run.log_calls`` had recorded them;
     so ``Run.plan`` needs no further steps. Calls that are open at the end are left out. Skills that
-    learnt in these steps have changed since: ``hand_over`` may count their calls, but ``plan``
+    learnt in these steps have changed since: ``handover`` may count their calls, but ``plan``
     refuses them. A run that was interrupted logs the calls after it was continued. Nothing else
     changes. By default there is no log."""
     log_calls_info: Sequence[str] | None = None

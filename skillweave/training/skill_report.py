@@ -10,7 +10,7 @@ import numpy as np
 
 from skillweave.paths import join, level_of
 from skillweave.planning.columns import ENDS
-from skillweave.planning.hand_over import HandOver, pair_counts
+from skillweave.planning.handover import Handover, pair_counts
 from skillweave.planning.recorder import Recorder
 from skillweave.policies.core import CallEnd
 from skillweave.schema import Count
@@ -149,7 +149,7 @@ def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillRep
     return reports
 
 
-def weak_hand_overs(calls: PlayedCalls) -> list[str]:
+def weak_handovers(calls: PlayedCalls) -> list[str]:
     """Return sentences on skills that succeed much less often after one skill than elsewhere.
 
     Skills without ``success`` are left out.
@@ -162,14 +162,14 @@ def weak_hand_overs(calls: PlayedCalls) -> list[str]:
         judged = np.array([s.defines("success") for s in recorder.skills.skills])
         counts = judged[skill] & ~cut & ((before == 0) | np.roll(won, 1))
         pairs = pair_counts(before[counts], skill[counts], won[counts], len(names))
-        sentences += HandOver(names, *pairs, np.zeros(len(names), np.int64)).weakest()
+        sentences += Handover(names, *pairs, np.zeros(len(names), np.int64)).weakest()
     return sentences
 
 
 def _with_before(recorder: Recorder) -> tuple[Array, Array, Array]:
     """Return the calls of a level by episode, and the skill of each and of the one before.
 
-    The latter is a row of a ``HandOver``, (C,): 0 where the episode starts.
+    The latter is a row of a ``Handover``, (C,): 0 where the episode starts.
     """
     rows = recorder.rows()
     rows = rows[np.lexsort((rows["order"], rows["episode"]))]

@@ -284,7 +284,7 @@ class Course:
     make_learner: MakeLearner = OneAgent
     """Makes a stage's learner, by its entry."""
     done: Mapping[str, Any] | None = None
-    """The events by which a repair is judged, as for ``planning.hand_over``."""
+    """The events by which a repair is judged, as for ``planning.handover``."""
 
     def tell(self, entry: StageEntry, text: str) -> None:
         """Send a message about a stage to the listeners."""

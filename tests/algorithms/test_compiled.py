@@ -17,17 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import (
-    DQN,
-    PPO,
-    RNN,
-    SAC,
-    TD3,
-    Network,
-    SelfImitationPPO,
-    SkillweaveError,
-    register_encoder,
-)
+from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
+from skillweave.algorithms import register_encoder
 from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.shipping import packed, unpacked

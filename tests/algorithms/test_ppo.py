@@ -16,7 +16,7 @@ from skillweave.algorithms.ppo import PPOAlgorithm, State
 from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
-from skillweave.ops.moments import normalise
+from skillweave.ops.moments import normalize
 from skillweave.ops.returns import gae
 from skillweave.seeding import Seeds
 
@@ -196,7 +196,7 @@ def test_an_update_equals_ppo_written_plainly_with_torchs_modules_and_optimiser(
         raw = gae(
             tr.reward, tr.discount, value, critic(tr.next_obs)[..., 0], tr.last, state.gae_lambda
         )
-        target, advantage = raw + value, normalise(raw)
+        target, advantage = raw + value, normalize(raw)
     for _ in range(cfg.update_epochs):
         ratio = (policy().log_prob(tr.action) - old).exp()
         gain = torch.min(

@@ -11,27 +11,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from toys import Countdown, Echo, Masked, learn
-from toys import own_algorithm as example
+from toys import Countdown, Echo, Masked, learn, own_algorithm as example
 
-from skillweave import (
-    PPO,
-    SAC,
-    Algorithm,
-    Apart,
-    Evolution,
-    Hierarchy,
-    Mutations,
-    Network,
-    Skill,
-    register_algorithm,
-    train_agent,
-)
-from skillweave.algorithms import config as table
+from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
+from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution import Evolution, Mutations
 from skillweave.runs.files import read_tensors, write_tensors
 from skillweave.seeding import Seeds
 
@@ -187,7 +175,9 @@ def test_the_latest_of_a_name_counts_and_the_librarys_own_stay():
 def test_a_method_that_is_missing_is_named(method):
     kind = example().A2CAlgorithm
     lacking = type("Half", (kind,), {method: getattr(Algorithm, method)})
-    with pytest.raises(DeclarationError, match=rf"Half lacks {method}; see skillweave\.Algorithm"):
+    with pytest.raises(
+        DeclarationError, match=rf"Half lacks {method}; see skillweave\.algorithms\.Algorithm"
+    ):
         register_algorithm(example().A2C, lacking)
     algorithm = lacking(own(), BOX, LINE)
     given = {"fresh_state": 1, "parameter_groups": 0, "act": 4, "value": 2, "update": 3}[method]
@@ -203,7 +193,7 @@ def changed(**attributes: Any) -> Any:
 MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
     "no algorithm": (
         lambda: register_algorithm(example().A2C, int),  # type: ignore[arg-type]
-        r"int is no subclass of skillweave\.Algorithm",
+        r"int is no subclass of skillweave\.algorithms\.Algorithm",
     ),
     "settings of another store": (
         lambda: register_algorithm(example().A2C, changed(store="replay")),

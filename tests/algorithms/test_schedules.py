@@ -28,6 +28,7 @@ from skillweave.algorithms.parameters import rate_now
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.cli.overrides import apply_overrides
 from skillweave.errors import DeclarationError
+from skillweave.evolution import Evolution, Mutations, Range
 from skillweave.runs.manifest import as_json, read_manifest
 from skillweave.seeding import Seeds
 
@@ -181,16 +182,16 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
 
 def test_it_does_not_mutate():
     config = replace(ON, learning_rate=Linear(1e-3, 0))
-    assert "learning_rate" not in sw.Mutations().ranges_of(config)
-    assert "gamma" in sw.Mutations().ranges_of(config)
-    ranges = {"learning_rate": sw.Range(1e-4, 1e-2)}
+    assert "learning_rate" not in Mutations().ranges_of(config)
+    assert "gamma" in Mutations().ranges_of(config)
+    ranges = {"learning_rate": Range(1e-4, 1e-2)}
     with pytest.raises(DeclarationError, match="learning_rate is a schedule, which cannot mutate"):
-        sw.Mutations(ranges=ranges).ranges_of(config)
+        Mutations(ranges=ranges).ranges_of(config)
 
 
 def test_a_population_follows_it(tmp_path):
     config = replace(ON, learning_rate=Linear(2e-3, 1e-3))
-    evolution = sw.Evolution(population=2, generations=2, episodes=1)
+    evolution = Evolution(population=2, generations=2, episodes=1)
     run = sw.train_agent("CartPole-v1", config, 400, tmp_path / "run", quiet=True, evolve=evolution)
     assert run.policy.algorithm.config.learning_rate == Linear(2e-3, 1e-3)
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from declaring import plainly
 
-from benchmarks.pay import __main__ as command
-from benchmarks.pay import agents
+from benchmarks.pay import __main__ as command, agents
 from benchmarks.pay.agents import CHAINS, FLAT, HIERARCHY, SHAPED, TUNED, TUNING_SEED, Bench
 from benchmarks.pay.figures import draw, make_table, reported
 from benchmarks.pay.flat import Flat
@@ -30,18 +29,9 @@ from benchmarks.pay.results import (
     read,
 )
 from benchmarks.pay.suite import Seldom, Shaped, Suite, Task
-from skillweave import (
-    PPO,
-    EnvSpec,
-    Evaluation,
-    Hierarchy,
-    Network,
-    Run,
-    Skill,
-    SkillweaveError,
-    Step,
-)
+from skillweave import PPO, EnvSpec, Hierarchy, Network, Run, Skill, SkillweaveError, Step
 from skillweave.hierarchy import select_best
+from skillweave.types import Evaluation
 
 TINY = PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=Network(hidden=(8,)))
 

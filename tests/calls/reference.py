@@ -134,7 +134,7 @@ class Life:
         self.level, self.choices = level, choices
         self.count = len(level.skills)
         self.lengths = level.lengths or (None,)
-        self.skill, self.elapsed, self.end, self.limit = -1, 0, EPISODE, None
+        self.skill, self.elapsed, self.end, self.length = -1, 0, EPISODE, None
         self.chances: list[float] | None = None
         self.part: Any = None  # of the running skill: a Life, or what its policy remembers
         self.ready = Ready(level, level.selector) if level.ready else None
@@ -222,7 +222,7 @@ class Life:
     def begin(self, skill: int, length: int) -> None:
         """Start a call."""
         self.skill, self.elapsed, self.end = skill, 0, RUNNING
-        self.limit = self.lengths[length]
+        self.length = self.lengths[length]
 
     # After a step
 
@@ -262,7 +262,7 @@ class Life:
         """The running call has reached a limit."""
         case = self.level.skills[self.skill]
         most = case.call_steps or self.level.call_steps
-        limits = (self.limit, case.max_steps, most if isinstance(most, int) else None)
+        limits = (self.length, case.max_steps, most if isinstance(most, int) else None)
         return any(limit is not None and self.elapsed >= limit for limit in limits)
 
     def watch_skill(self, own: Shown) -> None:
@@ -288,7 +288,7 @@ class Life:
         """What holds now, by the names in a player's memory: of what runs."""
         found = {"skill": self.skill, "elapsed": self.elapsed, "end": int(self.end)}
         if self.level.lengths:
-            found["limit"] = self.limit
+            found["length"] = self.length
         if isinstance(self.part, Life):
             below = self.part.remembered()
         else:

@@ -90,7 +90,7 @@ def choices_of(level: LevelCase, steps: list[Got]) -> tuple[int, ...]:
     begins = (s.acted for s in steps if s.acted["elapsed"] == 0)
     if not level.lengths:
         return tuple(m["skill"] for m in begins)
-    return tuple(m["skill"] * len(level.lengths) + level.lengths.index(m["limit"]) for m in begins)
+    return tuple(m["skill"] * len(level.lengths) + level.lengths.index(m["length"]) for m in begins)
 
 
 def compare_decisions(case: Case, played: Played, root: int) -> None:

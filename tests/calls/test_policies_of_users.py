@@ -86,7 +86,7 @@ def paid(policy: Any) -> Any:
 
 
 def actions_of(policy: Any) -> list[int]:
-    """By ``skillweave.Policy``'s own protocol."""
+    """By ``skillweave.types.Policy``'s own protocol."""
     memory, found = policy.start(1), []
     for t in range(5):
         obs, no = np.full((1, 1), t, np.float32), np.zeros(1, bool)

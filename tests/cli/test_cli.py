@@ -430,10 +430,10 @@ def test_calls_are_logged_shown_and_planned_on(
     more = call("log", run, "--recipe", recipe, "--steps", 300, "--choose", "explore", "--json")
     assert more.code == 0, more.err
     assert more.json["steps"] >= 600 > more.json["recorded"]["steps"]
-    assert more.json["hand_over"]["skills"] == ["left", "balance"]
+    assert more.json["handover"]["skills"] == ["left", "balance"]
     shown = call("info", run)
     assert shown.out.splitlines()[-1].strip().startswith("No success()") or "elsewhere" in shown.out
-    assert call("info", run, "--json").json["hand_over"] == more.json["hand_over"]
+    assert call("info", run, "--json").json["handover"] == more.json["handover"]
     planned = call("plan", run, "tilted", "--recipe", recipe, "--episodes", 3, "--json")
     assert planned.code == 0, planned.err
     assert (planned.json["mission"], planned.json["episodes"]) == ("tilted", 3)
@@ -445,7 +445,7 @@ def test_calls_are_logged_shown_and_planned_on(
     assert "f.gif: " in film.out
     (run / "calls.safetensors").write_bytes(b"damaged")
     assert "log of calls: " in call("info", run).out
-    assert "error" in call("info", run, "--json").json["hand_over"]
+    assert "error" in call("info", run, "--json").json["handover"]
 
 
 def test_a_plan_without_a_log_records_one(call: Call, trained: Trained, tmp_path: Path) -> None:

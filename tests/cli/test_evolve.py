@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 from small_runs import stage_entry
 
-from skillweave import Evolution, Hierarchy, Range, Skill, Tournament, Truncation
+from skillweave import Hierarchy, Skill
 from skillweave.cli.main import main
 from skillweave.cli.overrides import parse_evolve
 from skillweave.errors import DeclarationError, MissingExtra, RunError
+from skillweave.evolution import Evolution, Range, Tournament, Truncation
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory

@@ -5,8 +5,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from reference_calls import POSITION, Counter, Left, Right, Walk, Zigzag
 from toy_acting import Choices, requests, valid_rows
 from toys import ASKS, SHOWS, alone_in, calling_in

@@ -151,7 +151,8 @@ def test_environments_arrive_as_they_are_registered_here_whatever_they_are_calle
 OWN_ALGORITHM = """
 from dataclasses import dataclass
 import gymnasium as gym
-from skillweave import PPO, register_algorithm
+from skillweave import PPO
+from skillweave.algorithms import register_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import skillweave as sw
+from skillweave.envs import PoolWrapper, one_of
 from skillweave.envs.make import make_engine, workers_for
 from skillweave.errors import DeclarationError, EnvError, MissingExtra
 
@@ -47,7 +48,7 @@ class OneClock(gym.Env):
         return np.array([self.time], np.float32), 0.0, self.time >= 10, False, {}
 
 
-class Doubled(sw.PoolWrapper):
+class Doubled(PoolWrapper):
     def see(self, obs, ids):
         return 2 * obs + ids[:, None].astype(np.float32)
 
@@ -122,7 +123,7 @@ def test_a_pool_of_another_environment_is_told():
 def test_what_envpool_shows_may_be_changed():
     pytest.importorskip("envpool")
 
-    class First(sw.PoolWrapper):
+    class First(PoolWrapper):
         def __init__(self, pool):
             super().__init__(pool, gym.spaces.Box(-np.inf, np.inf, (1,), np.float32))
 
@@ -171,7 +172,7 @@ class Parts(Clock):
         return np.full((len(ids), 4, 5, 3), self.time[ids][:, None, None, None], np.uint8)
 
 
-class Later(sw.PoolWrapper):
+class Later(PoolWrapper):
     def see(self, obs, ids):
         return obs | {"time": obs["time"] + 100}
 
@@ -181,7 +182,7 @@ def later(num_envs, threads, seed):
 
 
 def test_observations_of_parts_come_out_of_a_pool_as_out_of_single_environments():
-    spec = sw.EnvSpec(sw.one_of(later), pool=later)
+    spec = sw.EnvSpec(one_of(later), pool=later)
     pool, single = make_engine(spec, N), make_engine(replace(spec, engine="sync"), N)
     assert (type(pool).__name__, type(single).__name__) == ("EnvPoolEngine", "GymnasiumEngine")
     obs, other = pool.reset(7), single.reset(7)
@@ -202,7 +203,7 @@ def test_observations_of_parts_come_out_of_a_pool_as_out_of_single_environments(
 
 
 def test_one_environment_of_a_pool_is_one_of_gymnasium():
-    env = sw.one_of(later)("rgb_array")
+    env = one_of(later)("rgb_array")
     check_env(env, skip_render_check=True)
     obs, info = env.reset(seed=5)
     assert (obs["root"], obs["time"]) == (5, [100.0])
@@ -215,8 +216,8 @@ def test_one_environment_of_a_pool_is_one_of_gymnasium():
         terminated = env.step(1)[2]
     assert terminated
     assert env.reset()[0]["root"] == 5  # the same pool goes on
-    assert sw.one_of(later)().render() is None
-    clock = sw.one_of(Clock)("rgb_array")
+    assert one_of(later)().render() is None
+    clock = one_of(Clock)("rgb_array")
     with pytest.raises(gym.error.ResetNeeded):
         clock.step(1)
     clock.reset()
@@ -225,33 +226,33 @@ def test_one_environment_of_a_pool_is_one_of_gymnasium():
 
 
 def test_one_environment_of_a_pool_has_the_pools_name_and_starts_anywhere_without_a_seed():
-    assert sw.EnvSpec(sw.one_of(later), pool=later).name == "later"
-    assert sw.EnvSpec(sw.one_of(Clock), pool=Clock).name == "Clock"
-    starts = {int(sw.one_of(later)().reset()[0]["root"]) for _ in range(8)}
+    assert sw.EnvSpec(one_of(later), pool=later).name == "later"
+    assert sw.EnvSpec(one_of(Clock), pool=Clock).name == "Clock"
+    starts = {int(one_of(later)().reset()[0]["root"]) for _ in range(8)}
     assert len(starts) > 1
 
 
 def test_one_of_takes_a_function():
     with pytest.raises(DeclarationError, match=r"one_of\(\) got 'CartPole-v1'; it takes the func"):
-        sw.one_of("CartPole-v1")
+        one_of("CartPole-v1")
 
 
 def test_a_pool_with_other_parts_is_told():
     def other(num_envs, threads, seed):
         space = gym.spaces.Dict(time=gym.spaces.Box(0, 1000, (2,)), root=gym.spaces.Discrete(1000))
-        return sw.PoolWrapper(Parts(num_envs, threads, seed), space)
+        return PoolWrapper(Parts(num_envs, threads, seed), space)
 
     with pytest.raises(EnvError, match=r"later: its pool's observation_space is Dict"):
-        make_engine(sw.EnvSpec(sw.one_of(later), pool=other), 2)
+        make_engine(sw.EnvSpec(one_of(later), pool=other), 2)
 
 
 def test_parts_of_a_pool_may_come_in_another_order():
     def other(num_envs, threads, seed):
         space = Parts.observation_space
         turned = gym.spaces.Dict([(k, space[k]) for k in reversed(list(space))])
-        return sw.PoolWrapper(Parts(num_envs, threads, seed), turned)
+        return PoolWrapper(Parts(num_envs, threads, seed), turned)
 
-    engine = make_engine(sw.EnvSpec(sw.one_of(later), pool=other), 2)
+    engine = make_engine(sw.EnvSpec(one_of(later), pool=other), 2)
     assert type(engine).__name__ == "EnvPoolEngine"
     obs = engine.reset(9)
     assert (obs["root"].tolist(), obs["time"].tolist()) == ([9, 9], [[0.0], [0.0]])
@@ -263,8 +264,8 @@ def test_one_environment_of_envpool_plays_the_episodes_of_its_seed():
     def poles(num_envs, threads, seed):
         return sw.envpool("CartPole-v1", num_envs, threads, seed, max_episode_steps=12)
 
-    env = sw.one_of(poles)()
-    spec = sw.EnvSpec(sw.one_of(poles), pool=poles)
+    env = one_of(poles)()
+    spec = sw.EnvSpec(one_of(poles), pool=poles)
     agent = sw.from_function(lambda obs: (obs[:, 2] + 0.5 * obs[:, 3] > 0).astype(int))
     for engine in ("sync", "envpool"):
         assert sw.evaluate(agent, spec, episodes=3, engine=engine).lengths == (12, 12, 12)

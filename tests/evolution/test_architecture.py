@@ -11,18 +11,9 @@ import pytest
 import torch
 from toys import random_critic
 
-from skillweave import (
-    CNN,
-    DQN,
-    PPO,
-    RNN,
-    SAC,
-    TD3,
-    Mutations,
-    Network,
-    SelfImitationPPO,
-)
+from skillweave import CNN, DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO
 from skillweave.errors import DeclarationError
+from skillweave.evolution import Mutations
 from skillweave.evolution.architecture import Change, check_architecture, draw_change, rebuilt
 from skillweave.evolution.stacks import Member, copy, join, split
 from skillweave.ops.optim import adam_

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 from small_runs import interrupt_at_checkpoint
 
-from skillweave import (
-    PPO,
-    Apart,
-    EnvSpec,
-    Evolution,
-    Hierarchy,
-    Network,
-    Skill,
-)
+from skillweave import PPO, Apart, EnvSpec, Hierarchy, Network, Skill
+from skillweave.evolution import Evolution
 from skillweave.evolution.part import Part
 from skillweave.runs.files import read_tensors
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import CNN, DQN, PPO, SAC, TD3, Evolution, Mutations, Network, Range
+from skillweave import CNN, DQN, PPO, SAC, TD3, Network
 from skillweave.algorithms.parameters import LARGEST
 from skillweave.errors import DeclarationError
+from skillweave.evolution import Evolution, Mutations, Range
 from skillweave.evolution.config import KINDS
 from skillweave.evolution.mutation import (
     check_mutations,

@@ -7,18 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skillweave import (
-    DQN,
-    PPO,
-    SAC,
-    Evolution,
-    Heir,
-    Mutations,
-    Range,
-    Tournament,
-    Truncation,
-)
+from skillweave import DQN, PPO, SAC
 from skillweave.errors import DeclarationError, TrainingError
+from skillweave.evolution import Evolution, Heir, Mutations, Range, Tournament, Truncation
 from skillweave.evolution.config import evolution_from_json, evolution_to_json
 from skillweave.evolution.selection import select
 

@@ -16,21 +16,11 @@ import pytest
 import torch
 from small_runs import assert_metrics_fit, interrupt_at_checkpoint
 
-from skillweave import (
-    DQN,
-    PPO,
-    RNN,
-    Agent,
-    EnvSpec,
-    Evolution,
-    Mutations,
-    Network,
-    Ray,
-    SkillweaveError,
-)
+from skillweave import DQN, PPO, RNN, Agent, EnvSpec, Network, Ray, SkillweaveError
 from skillweave.collecting.placement import Placement, make_collectors
 from skillweave.collecting.workers import WorkerHost, Workers
 from skillweave.errors import DeclarationError
+from skillweave.evolution import Evolution, Mutations
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts

@@ -21,20 +21,22 @@ from skillweave import (
     Agent,
     Apart,
     EnvSpec,
-    Evolution,
-    Heir,
     Hierarchy,
-    Mutations,
     Network,
-    Range,
     Skill,
     SkillweaveError,
-    Tournament,
-    Truncation,
     train_agent,
 )
 from skillweave.errors import DeclarationError
-from skillweave.evolution import stage as evolving
+from skillweave.evolution import (
+    Evolution,
+    Heir,
+    Mutations,
+    Range,
+    Tournament,
+    Truncation,
+    stage as evolving,
+)
 from skillweave.evolution.fitness import FitnessEnvs
 from skillweave.evolution.part import has_diverged
 from skillweave.evolution.population import Population

@@ -211,7 +211,7 @@ GOING: dict[str, Any] = {
     "few numbers": ("number", {}),
     "two skills": ("box", {"more": True}),
     "lengths": ("box", {"call_steps": Lengths(2, 5)}),
-    "more neighbours than options": ("box", {"neighbours": 40}),
+    "more neighbors than options": ("box", {"neighbors": 40}),
 }
 
 

@@ -39,7 +39,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.selectors import ready_selector
 from skillweave.skills.foreign_policy import made_up
-from skillweave.types import Array, Policy
+from skillweave.types import Array, LastCall, Policy
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("stable_baselines3")
@@ -67,7 +67,7 @@ def acts_alike(one: Policy, other: Policy, batches: Any) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_a_saved_policy_acts_the_same_where_it_is_loaded(name: str, tmp_path: Path) -> None:
     policy = CASES[name](tmp_path).policy.bind(SPACE, ACTION, "it")
-    export = sw.save_policy(policy, tmp_path / "out", licence="MIT", origin="made here")
+    export = sw.save_policy(policy, tmp_path / "out", license="MIT", origin="made here")
     for file in tmp_path.glob("*.*"):
         file.unlink()  # the folder is enough
     loaded = sw.load_policy(tmp_path / "out", code=export.functions)
@@ -75,7 +75,7 @@ def test_a_saved_policy_acts_the_same_where_it_is_loaded(name: str, tmp_path: Pa
     assert loaded.action_space == ACTION
     acts_alike(policy, loaded, observations(3, 20, seed=5))
     content = json.loads((tmp_path / "out/policy.json").read_text())
-    assert (content["licence"], content["origin"]) == ("MIT", "made here")
+    assert (content["license"], content["origin"]) == ("MIT", "made here")
     again = sw.save_policy(loaded, tmp_path / "again")
     copied = sw.load_policy(tmp_path / "again", code=again.functions)
     acts_alike(policy, copied, observations(3, 10, seed=6))
@@ -156,7 +156,7 @@ GUIDED = ActiveGuide(
 )
 
 
-def choose(obs: Array, last: sw.LastCall) -> Array:
+def choose(obs: Array, last: LastCall) -> Array:
     return np.where(last.succeeded, 1, (obs[:, T].astype(int) + last.skill) % 2)
 
 
@@ -246,7 +246,7 @@ def changed(folder: Path, change: Callable[[Any], Any]) -> None:
     ("change", "message"),
     [
         (lambda x: x.update(format=2), "has format 2, but this version reads 3: export .* again"),
-        (lambda x: x.pop("licence"), "no field 'licence'"),
+        (lambda x: x.pop("license"), "no field 'license'"),
         (lambda x: x["files"].update({"agent.onnx": "0" * 64}), "agent.onnx has another checksum"),
         (lambda x: x["files"].update({"../net.onnx": "0" * 64}), "no file of the folder"),
         (lambda x: x["files"].update({"run.py": "0" * 64}), "no file of the folder"),

@@ -9,6 +9,7 @@ import pytest
 from goals.worlds import SPACES, Rest, aim_of, declared, go_to, place_of
 
 import skillweave as sw
+from skillweave.errors import RunError
 from skillweave.hierarchy.repair import rehearsed_obs
 from skillweave.planning import CallLog, join
 from skillweave.skills.goals import goals_of
@@ -117,5 +118,5 @@ def test_logs_with_other_goals_are_not_joined() -> None:
     log = ready().log_calls(100, num_envs=2)
     other = ready("bits").log_calls(100, num_envs=2)
     assert SPACES["box"] != SPACES["bits"]
-    with pytest.raises(sw.RunError):
+    with pytest.raises(RunError):
         join([log, other])

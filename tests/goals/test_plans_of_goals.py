@@ -13,7 +13,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 
 import skillweave as sw
-from skillweave.errors import SkillError
+from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import CallLog, Explorer, Mission, Planner, Predicate
 from skillweave.planning.graph import CallGraph
 from skillweave.policies.spaces import space_of
@@ -64,7 +64,7 @@ def bound(planner: Planner, space: Any) -> Planner:
 def test_values_are_those_of_a_skill_for_each_goal(goals: Any) -> None:
     """With few goals and with many: the best goal from each start is known on a line."""
     log = jumps(goals, np.repeat(np.arange(11), 3))  # every call three times
-    planner = Planner(log, Mission(at(9), at(1)), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, Mission(at(9), at(1)), neighbors=1, gamma=GAMMA, caution=0.0)
     obs = np.float32([[p] for p in range(11)])
     reached = GAMMA ** (np.abs(9 - np.arange(11)) - 1.0)
     there_and_back = (reached + reached * GAMMA**8) / 2
@@ -85,21 +85,21 @@ def test_calls_count_for_one_another_by_start_and_goal() -> None:
     ends = np.where(goals > 0.5, 5, -5)
     log = log_of(["go"], [(0, [(0, [end], True, "end")]) for end in ends.tolist()])
     log.goals["go"] = goals[:, None]
-    planner = Planner(log, at(5), neighbours=3, caution=0.0)
+    planner = Planner(log, at(5), neighbors=3, caution=0.0)
     assert planner.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0, abs=1e-3)
     option = planner.graph.near(np.zeros((1, 1), np.float32))
     aims = goals[option.goal[0]]
     worth = (planner.plan[option.pieces[0], 0] * option.weights[0]).sum(1)
     assert (worth[aims > 0.6] > 0.99).all()
     assert (worth[aims < 0.4] < 0.01).all()
-    assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbour differs
+    assert ((worth > 0.01) & (worth < 0.99)).any()  # beside the edge, where a neighbor differs
 
 
 def test_fewer_calls_than_options() -> None:
     """Options without a call are worth nothing, and are never chosen."""
     log = log_of(["go"], [(p, [(0, [p + 1], True, "end")]) for p in range(5)])
     log.goals["go"] = np.arange(1.0, 6.0)[:, None]
-    planner = bound(Planner(log, at(1), neighbours=2, caution=0.0), LINE)
+    planner = bound(Planner(log, at(1), neighbors=2, caution=0.0), LINE)
     obs = np.float32([[4], [0]])
     near, corners = planner.graph.near(obs), planner.states.corners(planner.machine.start(2))
     assert np.isfinite(planner.in_place.valued(near, obs, corners)).sum() == 10
@@ -116,7 +116,7 @@ def test_goals_of_a_log_of_which_every_so_many_th_call_counts(monkeypatch: Any) 
     aims = []
     for task in (at(9), at(1)):
         with pytest.warns(UserWarning, match="the plan uses 50 of them"):
-            planner = bound(Planner(log, task, neighbours=1, gamma=GAMMA), LINE)
+            planner = bound(Planner(log, task, neighbors=1, gamma=GAMMA), LINE)
         choice, _ = planner.act(planner.start(2), obs)
         aims.append(choice["goal"]["go"][:, 0].tolist())
     assert aims == [[10, 10], [0, 0]]
@@ -126,14 +126,14 @@ def test_a_logged_goal_has_no_distance_to_itself() -> None:
     """Not even by rounding, where its numbers are large beside their differences."""
     log = log_of(["go"], [(0, [(0, [i], True, "end")]) for i in range(40)])
     log.goals["go"] = np.random.default_rng(0).normal(size=(40, 2))
-    near = CallGraph(log, neighbours=1).near(np.zeros((1, 1), np.float32))
+    near = CallGraph(log, neighbors=1).near(np.zeros((1, 1), np.float32))
     assert (near.distance == 0).all()
 
 
 def test_a_goal_that_failed_is_not_repeated_forever() -> None:
     """The log says that goals above lead to 3; now there is a wall."""
     log = jumps((0, 10), np.repeat(np.arange(11), 3))
-    planner = bound(Planner(log, at(9), neighbours=1, gamma=GAMMA), LINE)
+    planner = bound(Planner(log, at(9), neighbors=1, gamma=GAMMA), LINE)
     memory, obs, aims = planner.start(1), np.float32([[2]]), []
     for _ in range(6):
         choice, memory = planner.act(memory, obs)
@@ -177,10 +177,10 @@ def test_a_planner_is_declared_as_a_selector(tmp_path: Any) -> None:
 def test_another_log_s_goals_are_refused(tmp_path: Any) -> None:
     log = ready().log_calls(300, num_envs=4)
     run = ready("number")
-    with pytest.raises(sw.RunError, match="changed since the log"):
+    with pytest.raises(RunError, match="changed since the log"):
         run.plan(near(1.4, 0.3), log)
     other = declared(run.hierarchy.skills, selector=Planner(log, near(1.4, 0.3)))
-    with pytest.raises(sw.RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
+    with pytest.raises(RunError, match=r"goals of go_to \(2 numbers\).*go_to \(1 number\)"):
         other.train(tmp_path / "run", quiet=True)
 
 
@@ -189,7 +189,7 @@ def test_a_guide_of_one_skill_with_goals_is_refused() -> None:
     run = declared(skills).train(quiet=True)
     log = run.log_calls(300, num_envs=4)
     guide = sw.Guide(Planner(log, near(1.4, 0.3)), restrict=False, target_kl=0.1)
-    with pytest.raises(sw.DeclarationError, match="says nothing about goals"):
+    with pytest.raises(DeclarationError, match="says nothing about goals"):
         declared(skills, selector=sw.PPO(), guide=guide).train(quiet=True)
 
 
@@ -230,9 +230,9 @@ def test_exploring_draws_goals_for_new_calls() -> None:
     assert 10 < len(np.unique(log.goals["go_to"][mine], axis=0)) < mine.sum()
 
 
-def test_hand_over_and_chains_go_by_skill() -> None:
+def test_handover_and_chains_go_by_skill() -> None:
     log = ready().log_calls(1_000, num_envs=4)
-    rate, count = log.hand_over().of("go_to", after="go_to")
+    rate, count = log.handover().of("go_to", after="go_to")
     assert 0 < rate <= 1
     assert count > 5
     assert 0 < log.chain("go_to", "go_to").estimate <= 1
@@ -294,7 +294,7 @@ def test_a_task_knows_no_goal(task: Any) -> None:
         run.plan(task, log)
     if callable(task):
         with pytest.raises(SkillError, match=r"step\.goal: that is None here, .* write the pred"):
-            log.hand_over(done={"go_to": task})
+            log.handover(done={"go_to": task})
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from worlds import ON, SMALL, SPACES, GoTo, Point, Rest, declared, far_corner, g
 import skillweave as sw
 from skillweave.collecting.judge import JudgedBy
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
+from skillweave.evolution import Evolution
 from skillweave.experience import Batch
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills.goal_spaces import draw_from, shown_goal, with_goal
@@ -56,7 +57,7 @@ UNSUPPORTED: dict[str, Any] = {
 def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, learns, tmp_path):
     how: dict[str, Any] = {} if learns else {"policy": lambda self, obs, goal: obs}
     skill = type("GoTo", (GoTo,), {"goal_space": space, **how})()
-    with pytest.raises(sw.DeclarationError, match=f"skill 'go_to': .*{says}"):
+    with pytest.raises(DeclarationError, match=f"skill 'go_to': .*{says}"):
         declared([skill]).train(tmp_path / "run", quiet=True)
 
 
@@ -482,7 +483,7 @@ SELECTORS = {
     ("stage", "learns_by"), [("go_to", "PPO"), ("selector", "PPO"), ("selector", "DQN")]
 )
 def test_evolution_with_goals(stage, learns_by, tmp_path):
-    evolution = sw.Evolution(population=2, generations=2, episodes=1)
+    evolution = Evolution(population=2, generations=2, episodes=1)
     late = type("Late", (Rest,), {"initiation": lambda self, obs: obs[:, 0] > 0})()
     how = {"selector": SELECTORS[learns_by], "steps": 900}
     run = declared([go_to("number"), late], **how).train(

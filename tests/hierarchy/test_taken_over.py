@@ -6,10 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from declaring import plainly
-from small_runs import ON, Balance, Left, Push, assert_same, interrupt_at_checkpoint
-from small_runs import Left as SmallLeft
+from small_runs import (
+    ON,
+    Balance,
+    Left,
+    Left as SmallLeft,
+    Push,
+    assert_same,
+    interrupt_at_checkpoint,
+)
 
-from skillweave import Agent, EnvSpec, Evolution, Hierarchy, Reflex, SkillweaveError
+from skillweave import Agent, EnvSpec, Hierarchy, Reflex, SkillweaveError
+from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
 
 pytestmark = pytest.mark.filterwarnings("ignore:Overwriting")

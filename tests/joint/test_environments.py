@@ -13,6 +13,7 @@ from small_runs import assert_same, reports_every, stopped_run
 from torch import nn
 
 import skillweave as sw
+from skillweave.errors import DeclarationError
 from skillweave.export.runner import Runner
 from skillweave.hierarchy.roles import roles_of
 from skillweave.planning import CallLog
@@ -55,7 +56,7 @@ def test_a_plain_agent_acts_as_it_is_evaluated(kind, squash, tmp_path):
 @pytest.mark.parametrize("algorithm", [sw.SAC(), sw.DQN(), sw.TD3()], ids=["SAC", "DQN", "TD3"])
 def test_other_algorithms_say_which_one_can(algorithm, tmp_path):
     words = r"cannot act in Dict.*; PPO, SelfImitationPPO can"
-    with pytest.raises(sw.DeclarationError, match=words):
+    with pytest.raises(DeclarationError, match=words):
         sw.train_agent(on("dict"), algorithm, 100, tmp_path / "run", quiet=True)
 
 
@@ -244,5 +245,5 @@ def test_a_correction_of_several_parts_says_what_works(tmp_path):
         policy = sw.Residual(by_hand)
 
     says = r"needs a Box of real numbers, .* correct one part of real numbers \(acts\)"
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         reach([Better()]).train(tmp_path / "run", quiet=True)

@@ -16,6 +16,7 @@ from torch.distributions import Categorical, Normal
 import skillweave as sw
 from skillweave.envs.checks import CheckedEnv
 from skillweave.envs.infos import checked_mask, random_actions
+from skillweave.errors import DeclarationError, EnvError, SkillError
 from skillweave.networks.heads import head_of
 from skillweave.policies.spaces import space_of
 from skillweave.spaces import action_codec, env_form, obs_dtype, obs_shape, put_observation
@@ -125,7 +126,7 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
 
 
 def test_the_rest_of_the_action_may_be_forbidden(tmp_path):
-    with pytest.raises(sw.SkillError, match=r"forbids the value 0 at choice 0 .* another rest"):
+    with pytest.raises(SkillError, match=r"forbids the value 0 at choice 0 .* another rest"):
         reach([Arm(), Grip()], env=masked()).train(tmp_path / "run", quiet=True)
 
 
@@ -134,7 +135,7 @@ def test_choices_of_a_part_may_all_be_forbidden(tmp_path):
         acts = 0
 
     env = masked("whole")
-    with pytest.raises(sw.SkillError, match=r"forbids the value 0 at place 1"):
+    with pytest.raises(SkillError, match=r"forbids the value 0 at place 1"):
         reach([First()], env=env).train(tmp_path / "run", quiet=True)
     # The middle of the first number is 0 from -1 on, and the second may be 4.
     reach([First()], env=env, rest=[0, 4], steps=64).train(tmp_path / "two", quiet=True)
@@ -180,10 +181,10 @@ WRONG: dict[str, Any] = {
 @pytest.mark.parametrize(("mask", "says"), WRONG.values(), ids=WRONG)
 def test_a_wrong_mask_names_its_part(mask, says, tmp_path):
     policy = sw.train_agent(masked(), ON, 64, tmp_path / "run", quiet=True).policy
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         sw.Player(policy).act(np.zeros(3, np.float32), mask=mask)
     spec = sw.EnvSpec(lambda: Reach(info={"action_mask": mask}), workers=1)
-    with pytest.raises(sw.EnvError, match=says):
+    with pytest.raises(EnvError, match=says):
         sw.train_agent(spec, ON, 64, tmp_path / "two", quiet=True)
 
 
@@ -205,7 +206,7 @@ def test_real_numbers_have_no_mask(tmp_path):
         action_space=real,
     )
     seen = np.zeros(3, np.float32)
-    with pytest.raises(sw.DeclarationError, match=r"mask is \[1, 0\], but .* real numbers alone"):
+    with pytest.raises(DeclarationError, match=r"mask is \[1, 0\], but .* real numbers alone"):
         sw.Player(policy).act(seen, mask=[1, 0])
     assert set(sw.Player(policy).act(seen, info={"action_mask": [1, 0]})) == {"arm"}
 

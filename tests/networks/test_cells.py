@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from skillweave import PPO, Network, register_encoder
+from skillweave import PPO, Network
+from skillweave.algorithms import register_encoder
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.errors import DeclarationError
 from skillweave.networks.encoders import (

@@ -10,7 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 from toys import Echo, learn
 
-import skillweave
+from skillweave.algorithms import register_encoder
 from skillweave.algorithms.config import DQN, PPO
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.errors import DeclarationError, SkillweaveError
@@ -171,7 +171,7 @@ class Halves:
 @pytest.fixture
 def _halves(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(encoders, "_REGISTERED", {})
-    skillweave.register_encoder("halves", Halves)
+    register_encoder("halves", Halves)
 
 
 ENDS = {
@@ -204,7 +204,8 @@ def test_a_registered_encoder_learns_saves_and_loads(name):
 def test_an_encoder_that_nobody_registered_names_those_that_are():
     with pytest.raises(DeclarationError) as error:
         Net("net", obs_codec(image_space()), Network(encoder="wholes"), 2)
-    said = "'wholes', which is not registered: call skillweave.register_encoder('wholes', ...)"
+    call = "call skillweave.algorithms.register_encoder('wholes', ...)"
+    said = f"'wholes', which is not registered: {call}"
     assert said in str(error.value)
     assert "registered: halves" in str(error.value)
 

@@ -22,12 +22,12 @@ from torch import nn
 from toys import Echo, learn
 
 import skillweave as sw
-from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Mutations, Network, SkillweaveError
-from skillweave import named as naming
+from skillweave import DQN, PPO, RNN, SAC, TD3, Hierarchy, Network, SkillweaveError, named as naming
 from skillweave.algorithms.config import config_from_json, config_to_json
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution import Evolution, Mutations
 from skillweave.named import Named, named
 from skillweave.networks.encoders import make_encoder
 from skillweave.networks.own import ModuleEncoder
@@ -349,7 +349,7 @@ def test_a_run_says_that_it_needs_code_and_loads_with_its_declaration(tmp_path, 
 def test_a_population_learns_with_it_where_its_architecture_stays(tmp_path):
     config = replace(ON, network=Network((8,), encoder=Features))
     mutations = Mutations(0.2, 0.5, 0.2, 0.0, 0.1)
-    evolution = sw.Evolution(population=3, generations=2, mutations=mutations)
+    evolution = Evolution(population=3, generations=2, mutations=mutations)
     how = {"quiet": True, "evolve": evolution}
     sw.train_agent("CartPole-v1", config, 900, tmp_path / "run", **how)
     with pytest.raises(

@@ -8,7 +8,7 @@ from skillweave.ops.moments import (
     masked_mean,
     masked_var_mean,
     merge_moments,
-    normalise,
+    normalize,
 )
 
 NAN = float("nan")
@@ -29,17 +29,17 @@ def test_their_variance_by_hand():
 
 
 def test_valid_samples_are_normalised_as_if_there_were_no_others():
-    kept = normalise(X[:1, VALID[0]])
-    assert torch.allclose(normalise(X[:1], VALID[:1])[0, VALID[0]], kept[0])
+    kept = normalize(X[:1, VALID[0]])
+    assert torch.allclose(normalize(X[:1], VALID[:1])[0, VALID[0]], kept[0])
 
 
 def test_a_deviation_that_is_too_small_is_not_made_one():
     few = torch.tensor([[1.0, 3.0], [0.001, 0.003]])
-    found = normalise(few, min_std=0.1)
+    found = normalize(few, min_std=0.1)
     torch.testing.assert_close(found, torch.tensor([[-1.0, 1.0], [-0.01, 0.01]]))
-    assert torch.equal(found[0], normalise(few)[0])
+    assert torch.equal(found[0], normalize(few)[0])
     valid = torch.tensor([[True, True, False]])
-    found = normalise(torch.tensor([[0.001, 0.003, 99.0]]), valid, min_std=0.1)
+    found = normalize(torch.tensor([[0.001, 0.003, 99.0]]), valid, min_std=0.1)
     torch.testing.assert_close(found[:, :2], torch.tensor([[-0.01, 0.01]]))
 
 

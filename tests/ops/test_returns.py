@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from skillweave.ops.moments import explained_variance, normalise
+from skillweave.ops.moments import explained_variance, normalize
 from skillweave.ops.returns import discounted, gae, td_target
 
 
@@ -82,9 +81,9 @@ def test_gae_equals_the_scalar_recursion_for_every_member_and_environment(seed):
     np.testing.assert_allclose(gae(*tensors).numpy(), expected, rtol=1e-9, atol=1e-12)
 
 
-def test_normalise_works_on_each_member_by_itself():
+def test_normalize_works_on_each_member_by_itself():
     x = torch.stack([torch.arange(6.0), 100.0 * torch.arange(6.0) + 7.0]).reshape(2, 3, 2)
-    y = normalise(x)
+    y = normalize(x)
     torch.testing.assert_close(y.flatten(1).mean(1), torch.zeros(2), atol=1e-6, rtol=0)
     torch.testing.assert_close(y.flatten(1).std(1, unbiased=False), torch.ones(2))
     torch.testing.assert_close(y[0], y[1], atol=1e-5, rtol=0)

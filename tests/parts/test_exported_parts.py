@@ -15,6 +15,7 @@ from torch import nn
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.errors import SkillError
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
 from skillweave.hierarchy.policy import HierarchyPolicy
@@ -122,7 +123,7 @@ def test_a_mask_is_cut_in_the_runner(tmp_path):
         assert action == player.act(obs, info=info)
         assert info["action_mask"][action]
         obs, *_, info = world.step(action)
-    with pytest.raises(sw.SkillError, match="allows none of the choices"):
+    with pytest.raises(SkillError, match="allows none of the choices"):
         runner.act(obs, mask=[0, 0, 1, 0])
 
 

@@ -11,6 +11,7 @@ from crane import Crane
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 import skillweave as sw
+from skillweave.errors import DeclarationError, SkillError
 from skillweave.skills.own_part import OwnPart, part_from_json, part_to_json, rest_of
 from skillweave.spaces import pack
 
@@ -214,7 +215,7 @@ def mine(**attributes: Any) -> sw.Skill:
     ],
 )
 def test_what_a_skill_cannot_declare(attributes, says):
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         mine(**attributes).validate()
 
 
@@ -250,7 +251,7 @@ def test_what_a_skill_cannot_declare(attributes, says):
     ],
 )
 def test_what_does_not_fit_the_spaces(sees, acts, rest, space, says):
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         part(sees, acts, rest, space)
 
 
@@ -268,7 +269,7 @@ def test_a_function_that_gives_no_number_is_an_error():
     obs = observations()
     assert own.part.see(obs).shape == (4, 3)
     obs["hook"][1] = 0.0
-    with pytest.raises(sw.SkillError, match=r"skill 'x': sees gives .*inf.*finite numbers"):
+    with pytest.raises(SkillError, match=r"skill 'x': sees gives .*inf.*finite numbers"):
         own.part.see(obs)
 
 

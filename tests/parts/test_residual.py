@@ -14,6 +14,8 @@ from torch import nn
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy
+from skillweave.errors import DeclarationError, PolicyError
+from skillweave.evolution import Evolution
 
 often = reports_every(40)
 OFTEN = sw.TrainDefaults(checkpoint_every=60)
@@ -210,7 +212,7 @@ def one(obs: Any) -> Any:
 
 @pytest.mark.slow
 def test_a_population_learns_corrections():
-    evolve = {"better": sw.Evolution(population=2, generations=2)}
+    evolve = {"better": Evolution(population=2, generations=2)}
     run = crane([Better()], learn="apart", steps=1200).train(evolve=evolve, quiet=True)
     assert run.evaluate(2).returns
 
@@ -228,7 +230,7 @@ def test_a_population_learns_corrections():
     ],
 )
 def test_what_is_no_correction(policy, scale, says):
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         sw.Residual(policy, scale)
 
 
@@ -257,16 +259,16 @@ LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
     ],
 )
 def test_a_skill_is_no_policy(skill, says):
-    with pytest.raises(sw.DeclarationError, match=rf"^Residual\.policy {says}$"):
+    with pytest.raises(DeclarationError, match=rf"^Residual\.policy {says}$"):
         sw.Residual(skill)
     as_policy = type("Better", (sw.Skill,), {"policy": skill})
-    with pytest.raises(sw.DeclarationError, match=rf"skill 'better': policy {says}$"):
+    with pytest.raises(DeclarationError, match=rf"skill 'better': policy {says}$"):
         crane([as_policy()]).train(quiet=True)
 
 
 def test_what_learns_on_is_not_corrected():
     module = sw.from_torch(nn.Sequential(nn.Linear(3, 3)), learn=True)
-    with pytest.raises(sw.DeclarationError, match=r"with learn=True.*leave out learn"):
+    with pytest.raises(DeclarationError, match=r"with learn=True.*leave out learn"):
         sw.Residual(module)
 
 
@@ -280,20 +282,20 @@ def test_what_learns_on_is_not_corrected():
 )
 def test_what_does_not_fit_is_refused_before_training(skill, env, says):
     world = sw.EnvSpec(lambda: Crane(env), engine="sync", workers=1)
-    with pytest.raises(sw.DeclarationError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         crane([skill], env=world).train(quiet=True)
 
 
 def test_what_has_a_policy_is_not_one():
     ready = crane([Arm()], steps=130).train(quiet=True)
-    with pytest.raises(sw.DeclarationError, match=r"has a policy, but is none.*\.policy"):
+    with pytest.raises(DeclarationError, match=r"has a policy, but is none.*\.policy"):
         crane([declared(ready)]).train(quiet=True)
-    with pytest.raises(sw.DeclarationError, match=r"the skill 'ready', and no policy.*\.policy"):
+    with pytest.raises(DeclarationError, match=r"the skill 'ready', and no policy.*\.policy"):
         declared(ready.as_skill("ready"))
 
 
 def test_a_ready_policy_of_another_shape_is_refused():
-    with pytest.raises(sw.PolicyError, match=r"skill 'better'.*\(2, 3\) was expected"):
+    with pytest.raises(PolicyError, match=r"skill 'better'.*\(2, 3\) was expected"):
         crane([declared(lambda obs: obs["arm"])]).train(quiet=True)
 
 

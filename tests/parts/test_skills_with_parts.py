@@ -12,6 +12,8 @@ from crane import ON, SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
 from small_runs import assert_same, reports_every, stopped_run
 
 import skillweave as sw
+from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
+from skillweave.evolution import Evolution
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import as_json
@@ -158,10 +160,10 @@ def test_a_run_without_its_code_has_the_parts(tmp_path):
 def test_other_parts_are_not_loaded(skills, rest, says, tmp_path):
     run = crane(rest="hold").train(tmp_path / "run", quiet=True)
     other = crane(skills, rest=rest)
-    with pytest.raises(sw.RunError, match=says):
+    with pytest.raises(RunError, match=says):
         other.load(run.path)
     file = run.save_weights(tmp_path / "weights.safetensors")
-    with pytest.raises(sw.RunError, match=says):
+    with pytest.raises(RunError, match=says):
         other.load_weights(file)
 
 
@@ -183,7 +185,7 @@ def learnt(tmp_path_factory):
 def test_a_skill_does_not_start_with_what_it_learnt_on_another_part(changes, says, learnt):
     moved = crane([type("Arm", (Arm,), changes)(), Hook()], learn="apart", steps=200)
     where = r"start_from: 'arm' cannot start with what it learnt in .*"
-    with pytest.raises(sw.RunError, match=rf"{where}its {says}.*'arm' begins new"):
+    with pytest.raises(RunError, match=rf"{where}its {says}.*'arm' begins new"):
         moved.train(start_from=learnt, quiet=True)
     started = moved.train(start_from={"hook": learnt}, quiet=True)
     assert [set(stage.get("starts", {})) for stage in started.info()["stages"]][:2] == [
@@ -253,21 +255,21 @@ def test_a_nested_hierarchy_learns(learn, tmp_path):
 def test_a_hierarchy_has_no_part_of_its_own():
     inner = crane([Arm(), Hook()], name="inner")
     part = type("Part", (sw.Skill,), {"policy": inner, "acts": (0, 1)})()
-    with pytest.raises(sw.DeclarationError, match="a hierarchy, so it has no acts of its own"):
+    with pytest.raises(DeclarationError, match="a hierarchy, so it has no acts of its own"):
         crane([part])
 
 
 def test_a_rest_that_means_nothing_is_refused():
     every = type("Every", (sw.Skill,), {})()
-    with pytest.raises(sw.DeclarationError, match="rest is 'hold', but no skill writes a part"):
+    with pytest.raises(DeclarationError, match="rest is 'hold', but no skill writes a part"):
         crane([every], rest="hold")
-    with pytest.raises(sw.DeclarationError, match="rest is 'keep'; it must be"):
+    with pytest.raises(DeclarationError, match="rest is 'keep'; it must be"):
         crane(rest="keep")
 
 
 def test_what_does_not_exist_is_refused_before_training():
     wrong = type("Arm", (Arm,), {"acts": (0, 3)})()
-    with pytest.raises(sw.DeclarationError, match=r"skill 'arm': acts.*does not exist"):
+    with pytest.raises(DeclarationError, match=r"skill 'arm': acts.*does not exist"):
         crane([wrong, Hook()]).train(quiet=True)
 
 
@@ -302,7 +304,7 @@ def test_ready_skills_have_parts(tmp_path):
 
 def test_a_ready_policy_of_another_shape_is_refused():
     wrong = type("Arm", (Arm,), {"policy": staticmethod(lambda obs: np.zeros((len(obs), 3)))})()
-    with pytest.raises(sw.PolicyError, match=r"skill 'arm'.*\(2, 2\) was expected"):
+    with pytest.raises(PolicyError, match=r"skill 'arm'.*\(2, 2\) was expected"):
         crane([wrong]).train(quiet=True)
 
 
@@ -374,7 +376,7 @@ def test_masks_are_cut_to_the_part():
 
 
 def test_a_mask_that_forbids_the_rest_is_an_error():
-    with pytest.raises(sw.SkillError, match=r"skill 'hook'.*forbids the value 0 at place 0.*rest"):
+    with pytest.raises(SkillError, match=r"skill 'hook'.*forbids the value 0 at place 0.*rest"):
         crane([Hook()], env=on("several", True)).train(quiet=True)
     # Zero of place 0 is forbidden in some steps, one in others, two never.
     run = crane([Hook()], env=on("several", True), rest=(2, 0, 0)).train(quiet=True)
@@ -384,14 +386,14 @@ def test_a_mask_that_forbids_the_rest_is_an_error():
 def test_a_mask_that_leaves_no_choice_is_an_error():
     low = type("Low", (Arm,), {"acts": (0,)})()
     free = type("Free", (sw.Skill,), {})()
-    with pytest.raises(sw.SkillError, match=r"skill 'low'.*allows none of the choices"):
+    with pytest.raises(SkillError, match=r"skill 'low'.*allows none of the choices"):
         crane([low, free], env=on("one", True)).train(quiet=True)
 
 
 @pytest.mark.slow
 def test_a_population_learns_parts(tmp_path):
     how = {"learn": "apart", "rest": "hold", "steps": 1200}
-    evolve = {"arm": sw.Evolution(population=2, generations=2)}
+    evolve = {"arm": Evolution(population=2, generations=2)}
     run = crane(**how).train(tmp_path / "run", evolve=evolve, quiet=True)
     assert run.policy.skills.policies[0].action_space.shape == (2,)
 
@@ -413,12 +415,12 @@ def test_calls_are_logged(tmp_path):
     assert log.action.shape[1:] == (3,)
     log.check_skills(run.policy.skills)
     other = crane(selector=in_turn).train(quiet=True)
-    with pytest.raises(sw.RunError, match="has changed since the log was recorded"):
+    with pytest.raises(RunError, match="has changed since the log was recorded"):
         log.check_skills(other.policy.skills)
 
 
 def test_rows_of_a_part_cannot_be_judged_again():
     from skillweave.collecting.judge import judged_by
 
-    with pytest.raises(sw.DeclarationError, match=r"skill 'arm'.*leave out sees"):
+    with pytest.raises(DeclarationError, match=r"skill 'arm'.*leave out sees"):
         judged_by(Arm(), on())

@@ -184,7 +184,7 @@ def test_an_evaluation_says_what_seldom_succeeds_after_one_skill() -> None:
     )
     policy = hierarchy(turn, skills=skills)
     score = evaluate(policy, SPEC, episodes=30, log_calls=True)
-    (sentence,) = score.calls.hand_over().weakest()
+    (sentence,) = score.calls.handover().weakest()
     assert re.match(r"'look' succeeds in 0% of \d+ calls .* after 'rest'; in 100% of", sentence)
     assert score.for_people().count(sentence) == 1
     assert sentence in score._repr_html_().replace("&#x27;", "'")

@@ -37,7 +37,7 @@ def test_a_call_that_ends_by_itself_with_the_episode_is_done(tmp_path: Path) -> 
     log = run.log_calls(1_000)
     last = log.of("last")
     assert 0 < last.terminated.sum() < len(last)
-    matrix = log.hand_over()
+    matrix = log.handover()
     assert matrix.of("last", after="first")[0] == matrix.of("last", after="start")[0] == 1.0
     ends = log.call_ends("last")
     assert ends.reasons["own"] == ends.own_with_episode == len(last)

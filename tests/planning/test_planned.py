@@ -63,7 +63,7 @@ def columns_near(obs: Any, goal: Any) -> Any:
 
 
 def bound(space: Any = LINE) -> Planner:
-    planner = Planner(aimed(), Mission(at(9), at(1)), neighbours=2).among(("go",))
+    planner = Planner(aimed(), Mission(at(9), at(1)), neighbors=2).among(("go",))
     choices = choice_space(1, {"go": space}, ["go"])
     return planner.bind(planner.log.observation_space, choices, "selector")
 
@@ -200,7 +200,7 @@ def changed(x: Any, path: str, value: Any) -> Any:
         ("features.0.places", lambda x: x - 1, "places of a plan"),
         ("features.0.mean", lambda x: x[:0], "mean of a plan"),
         ("features.0.places", np.zeros((1, 1), int), "places of a plan"),
-        ("options.neighbours", 0, "0 neighbours"),
+        ("options.neighbors", 0, "0 neighbors"),
         ("options.lengths", (3, 1), r"the lengths \(3, 1\)"),
         ("options.lengths", (1, 3), r"options of the choices \[0\]"),
         ("options.aims", (None,), "but no goals"),

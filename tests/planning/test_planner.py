@@ -12,7 +12,7 @@ from planning.logs import log_of
 from planning.steps import step_to
 from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
 
-from skillweave import EnvSpec, Hierarchy, HierarchyPolicy, Lengths, evaluate
+from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.errors import DeclarationError, RunError, SkillError
 from skillweave.planning import (
@@ -27,14 +27,14 @@ from skillweave.planning import (
     held,
     record_calls,
 )
-from skillweave.planning.neighbours import nearest, tie_order
+from skillweave.planning.neighbors import nearest, tie_order
 from skillweave.planning.states import LEVELS, exact_states, planning_states
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import nearest_corner
 from skillweave.selectors import LastCall
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-from skillweave.types import Array
+from skillweave.types import Array, HierarchyPolicy
 
 GAMMA = 0.9
 LINE = 10
@@ -109,7 +109,7 @@ TASKS = {
 @pytest.mark.parametrize("name", TASKS)
 def test_values_are_those_of_dynamic_programming(name: str) -> None:
     task = TASKS[name]
-    planner = Planner(line(), task, neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(line(), task, neighbors=1, gamma=GAMMA, caution=0.0)
     for (place, state), wanted in by_dynamic_programming(task).items():
         got = planner.values(np.array([[place]], np.float32), np.array([state]))[0]
         np.testing.assert_allclose(got, wanted, atol=2e-3, err_msg=f"{place} {state}")
@@ -122,18 +122,18 @@ def test_values_are_weighted_means_of_the_nearest_calls() -> None:
         [(-0.01, [(0, [5], True, "own")]), (0.03, [(0, [0], True, "own")]),
          (0, [(1, [0], True, "own")])],
     )  # fmt: skip
-    planner = Planner(log, at(5), neighbours=2, gamma=0.5, caution=0.0)
+    planner = Planner(log, at(5), neighbors=2, gamma=0.5, caution=0.0)
     scale = 1 / np.concatenate([log.start, log.end]).std()
     w = np.array([1 / (0.01 * scale + 0.01), 1 / (0.03 * scale + 0.01)])
     share = w[0] / w.sum()
     q = planner.values(np.zeros((1, 1), np.float32))[0]
     assert 0.5 < share <= q[0] < 1
     assert q[1] < q[0]
-    # With one neighbour, the nearer one alone counts.
-    sure = Planner(log, at(5), neighbours=1, gamma=0.5, caution=0.0)
+    # With one neighbor, the nearer one alone counts.
+    sure = Planner(log, at(5), neighbors=1, gamma=0.5, caution=0.0)
     assert sure.values(np.zeros((1, 1), np.float32))[0, 0] == pytest.approx(1.0)
     # A distance costs a share of the value; the two calls are 0.04 apart, which is usual.
-    careful = Planner(log, at(5), neighbours=1, gamma=0.5, caution=1.0)
+    careful = Planner(log, at(5), neighbors=1, gamma=0.5, caution=1.0)
     far = careful.values(np.float32([[-0.01], [-0.5]]))[:, 0]
     assert far[0] == pytest.approx(1.0, abs=1e-3)
     assert far[1] == pytest.approx(1 / (1 + 0.49 / 0.04), abs=1e-3)
@@ -148,11 +148,11 @@ def test_nothing_follows_where_the_episode_terminated() -> None:
             (1, [(0, [3], True, "own")]),
         ],
     )
-    planner = Planner(log, at(3), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, at(3), neighbors=1, gamma=GAMMA, caution=0.0)
     assert planner.values(np.float32([[0], [1], [2]]))[:, 0].tolist() == pytest.approx([0, 1, 1])
     cut = Planner(
         replace(log, terminated=log.terminated & False, truncated=log.terminated),
-        at(3), neighbours=1, gamma=GAMMA, caution=0.0,
+        at(3), neighbors=1, gamma=GAMMA, caution=0.0,
     )  # fmt: skip
     assert cut.values(np.float32([[0]]))[0, 0] == pytest.approx(GAMMA)
 
@@ -172,7 +172,7 @@ def test_a_call_that_was_cut_would_have_gone_on(why: str) -> None:
         first = np.arange(len(log)) == 0
         reason = np.where(first, CallEnd.INTERRUPTED, log.end_reason).astype(np.int8)
         log = replace(log, end_reason=reason, truncated=np.zeros(len(log), bool))
-    planner = Planner(log, at(-1), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, at(-1), neighbors=1, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[0], [3]]))
     assert q[:, 0].tolist() == [0, 0]
     assert q[1, 1] == pytest.approx(1.0)
@@ -184,7 +184,7 @@ def test_a_position_that_a_skill_does_not_see_counts() -> None:
         ((p, p % 2), [(0, [(p + 1, (p + 1) % 2), (p + 2, p % 2)], True, "own")]) for p in range(9)
     ]
     log = replace(log_of(["go"], calls, size=2), sees=((1,),))
-    planner = Planner(log, at(5), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, at(5), neighbors=1, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[3, 1], [8, 0]]))[:, 0]
     assert q[0] > q[1] == 0.0
 
@@ -193,9 +193,9 @@ def test_only_what_may_follow_counts() -> None:
     log = line()
     may = np.ones((len(log), 2), bool)
     may[log.end[:, 0] == 6, 1] = False  # at 6 "right" may not start
-    planner = Planner(replace(log, may_follow=may), at(9), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(replace(log, may_follow=may), at(9), neighbors=1, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[3], [4]]))
-    free = Planner(log, at(9), neighbours=1, gamma=GAMMA, caution=0.0)
+    free = Planner(log, at(9), neighbors=1, gamma=GAMMA, caution=0.0)
     q_free = free.values(np.float32([[3], [4]]))
     assert q[0, 1] < q_free[0, 1]
     assert q[1, 1] == pytest.approx(q_free[1, 1])
@@ -210,7 +210,7 @@ def test_a_counter_that_is_longer_than_a_call_leads_on() -> None:
     at_end = np.float32([[10]] * 4)
     for steps in (100, 1_000):
         task = Mission(held(at(10), steps))
-        planner = Planner(line(), task, neighbours=1, gamma=0.999, caution=0.0)
+        planner = Planner(line(), task, neighbors=1, gamma=0.999, caution=0.0)
         assert planning_states(task).count == min(steps, LEVELS) + 1
         counted = np.array([0, steps // 3, steps // 2, steps - 3])
         q = planner.values(at_end, np.stack([0 * counted, counted], 1))
@@ -246,7 +246,7 @@ def test_every_length_is_learnt_from_the_longest() -> None:
         choice=plain.skill * 3 + 2,
         may_follow=np.ones((len(plain), 6), bool),
     )
-    planner = Planner(log, Mission(at(4), at(5), at(4)), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, Mission(at(4), at(5), at(4)), neighbors=1, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[3]]))[0]
     # Right for two steps: 4, 5; then left for one.
     assert q[3] == q[4] == q.max()
@@ -254,7 +254,7 @@ def test_every_length_is_learnt_from_the_longest() -> None:
     # Of a call that was chosen short, nothing is known about longer ones.
     short = replace(log, choice=plain.skill * 3)
     assert (
-        Planner(short, at(9), neighbours=1).values(np.float32([[3]]))[0].tolist()[1:3]
+        Planner(short, at(9), neighbors=1).values(np.float32([[3]]))[0].tolist()[1:3]
         == [-np.inf] * 2
     )
 
@@ -274,7 +274,7 @@ def test_goals_that_observations_hold() -> None:
             )
     log = log_of(["left", "right"], calls, size=2)
     task = GoalTask(near, columns=(1,))
-    planner = Planner(log, task, features=[0], neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, task, features=[0], neighbors=1, gamma=GAMMA, caution=0.0)
     for goal in (0, 3, 8, 10):
         q = planner.values(np.float32([[p, goal] for p in range(LINE + 1)]))
         for p in range(LINE + 1):
@@ -294,7 +294,7 @@ def test_goals_that_observations_hold() -> None:
 def test_a_call_that_failed_is_not_repeated_forever() -> None:
     """The log says that "right" leads from 2 to 3; now there is a wall."""
     log = line()
-    planner = Planner(log, at(9), neighbours=1, gamma=GAMMA).among(log.skills)
+    planner = Planner(log, at(9), neighbors=1, gamma=GAMMA).among(log.skills)
     memory = planner.start(1)
     chosen = []
     obs = np.float32([[2]])
@@ -453,7 +453,7 @@ def long_calls() -> CallLog:
 
 def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed() -> None:
     log = long_calls()
-    planner = Planner(log, Mission(at(8), at(2)), neighbours=1, gamma=GAMMA, caution=0.0)
+    planner = Planner(log, Mission(at(8), at(2)), neighbors=1, gamma=GAMMA, caution=0.0)
     # From 5, which is passed in the middle of both calls: "right" reaches 8 after 3 steps, the end
     # of the call after 30 more, and from there "left" reaches 2 after 8.
     pieces = planner.graph.pieces
@@ -462,7 +462,7 @@ def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed() -> Non
     assert q[0, 1] == pytest.approx(GAMMA**2 / 2 + GAMMA ** (35 + 7) / 2, rel=1e-3)
     assert q[1, 0] == pytest.approx(GAMMA**7 / 2, rel=1e-3)
     # The counters of a task go on from piece to piece.
-    sits = Planner(log, Mission(held(at(10), 20)), neighbours=1, gamma=GAMMA, caution=0.0)
+    sits = Planner(log, Mission(held(at(10), 20)), neighbors=1, gamma=GAMMA, caution=0.0)
     assert sits.values(np.float32([[0]]))[0, 1] == pytest.approx(GAMMA**28, rel=1e-3)
     # A skill with a memory does something else if it is called in the middle.
     with pytest.warns(UserWarning, match="these skills have a memory: left. The planner"):
@@ -470,7 +470,7 @@ def test_a_call_says_what_its_skill_does_from_everywhere_that_it_passed() -> Non
     assert np.bincount(whole.graph.pieces.choice).tolist() == [1, 8]
 
 
-def test_neighbours_are_of_other_calls_each() -> None:
+def test_neighbors_are_of_other_calls_each() -> None:
     points = np.float32([[0], [0.1], [0.2], [1], [5], [6]])
     group = np.array([7, 7, 7, 8, 9, 9])
     near, far = nearest(points, np.float32([[0.12], [5.9]]), 4, group)
@@ -524,7 +524,7 @@ def test_a_key_of_info_that_was_not_recorded_is_named(log: CallLog) -> None:
     with pytest.raises(RunError, match=r"reads info\['door'\].*record it: .*info=\['door'\]"):
         Planner(log, Predicate(opened))
     with pytest.raises(RunError, match="which the log does not have"):
-        log.hand_over({"wait": opened})
+        log.handover({"wait": opened})
     known = record_calls(SPEC, skill_set(), 500, info=["door"])
     assert Planner(known, Predicate(opened)).values(known.start[:1]).max() > 0
 
@@ -547,7 +547,7 @@ def test_other_skills_and_spaces_are_refused(log: CallLog) -> None:
         ({"task": 3}, DeclarationError, "the task is 3"),
         ({"task": "key"}, DeclarationError, "'key' is no known predicate"),
         ({"gamma": 1.1}, DeclarationError, "gamma is 1.1; it must be between 0 and 1"),
-        ({"neighbours": 0}, DeclarationError, "neighbours is 0"),
+        ({"neighbors": 0}, DeclarationError, "neighbors is 0"),
         ({"temperature": -1}, DeclarationError, "temperature is -1"),
         ({"skills": 3}, DeclarationError, "skills is 3; give a policy"),
         ({"features": [7]}, DeclarationError, r"of skill 'get_key' are \[7\]; give places"),
@@ -695,7 +695,7 @@ def test_calls_behind_a_wall_do_not_count() -> None:
     before = [*np.arange(0, 0.6, 0.02).tolist(), 1.0, 1.01, 0.99]
     calls = [(p, [(0, [p], False, "own")]) for p in before]
     calls += [(p, [(0, [9], True, "own")]) for p in (1.2, 1.21, 1.22, 1.23, 1.24)]
-    planner = Planner(log_of(["try"], calls), at(9), neighbours=5, gamma=GAMMA, caution=0.0)
+    planner = Planner(log_of(["try"], calls), at(9), neighbors=5, gamma=GAMMA, caution=0.0)
     q = planner.values(np.float32([[1.0], [1.2]]))[:, 0]
     # Else each call that is tried again before the wall would have a chance.
     assert q.tolist() == pytest.approx([0.0, 1.0], abs=1e-3)

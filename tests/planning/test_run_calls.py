@@ -17,7 +17,7 @@ from shared_runs import SMALL, Left, Right, declare
 import skillweave as sw
 from skillweave.api import Run
 from skillweave.envs.engine import GymnasiumEngine
-from skillweave.errors import DeclarationError, RunError
+from skillweave.errors import DeclarationError, Interrupted, RunError
 from skillweave.planning import CallLog, record_calls, run_log
 from skillweave.runs.directory import CALLS, RunDirectory
 
@@ -215,7 +215,7 @@ def test_an_interrupted_recording_keeps_its_calls(run: Run) -> None:
             signal.raise_signal(signal.SIGINT)
         return np.zeros(len(obs), int)
 
-    with pytest.raises(sw.Interrupted, match=r"calls .* were recorded and are kept"):
+    with pytest.raises(Interrupted, match=r"calls .* were recorded and are kept"):
         run.log_calls(1_000_000, choose=choose, num_envs=4)
     assert 0 < run.calls.steps < 1_000_000
     assert (run.calls.end_reason > 0).all()

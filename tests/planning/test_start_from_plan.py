@@ -315,7 +315,7 @@ def test_a_planner_that_guides_remembers_the_calls_that_were_made() -> None:
     calls += [(p, [(0, [p - 1], True, "limit")]) for p in range(1, 9)]
     log = log_of(["left", "right"], calls)
     task = Mission(lambda obs: obs[:, 0] == 0)
-    planner = Planner(log, task, neighbours=1, gamma=0.9).among(log.skills)
+    planner = Planner(log, task, neighbors=1, gamma=0.9).among(log.skills)
     obs = np.float32([[2]])
     memory = planner.start(1)
     choice, memory = planner.act(memory, obs)

@@ -15,9 +15,7 @@ from skillweave import (
     PPO,
     Apart,
     Automaton,
-    Evolution,
     Hierarchy,
-    LastCall,
     Lengths,
     Skill,
     SkillweaveError,
@@ -28,7 +26,9 @@ from skillweave import (
     tree,
 )
 from skillweave.errors import DeclarationError, RunError, SkillError
+from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
+from skillweave.types import LastCall
 
 
 class GetKey(Skill):

@@ -20,12 +20,13 @@ from ready_selectors.chain import (
     has_key,
 )
 
-from skillweave import PPO, Automaton, Hierarchy, LastCall, SkillweaveError, tree
+from skillweave import PPO, Automaton, Hierarchy, SkillweaveError, tree
 from skillweave.cli import main
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
 from skillweave.skills import Skill
+from skillweave.types import LastCall
 
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16)
 

@@ -9,8 +9,7 @@ import pytest
 
 from skillweave import Apart, Step, Together, envpool
 from skillweave.errors import DeclarationError, MissingExtra
-from skillweave.recipes import _rooms as world
-from skillweave.recipes import keys_and_doors as rooms
+from skillweave.recipes import _rooms as world, keys_and_doors as rooms
 
 SKILLS = {s.name: s for s in (make() for make in rooms.SKILLS)}
 

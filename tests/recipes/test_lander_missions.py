@@ -11,8 +11,7 @@ import pytest
 from benchmarks.pay.lander_missions import suite
 from skillweave import Apart, EnvSpec, Selection, Step
 from skillweave.errors import DeclarationError
-from skillweave.recipes import _missions as world
-from skillweave.recipes import lander_missions as missions
+from skillweave.recipes import _missions as world, lander_missions as missions
 
 LEFT, RIGHT, ABOVE, PAD = (-0.5, 0.75), (0.5, 0.75), (0.0, 0.6), (0.1, 0.0)
 SKY = (0.0, 1.2)

@@ -11,8 +11,7 @@ import torch
 
 from skillweave import Step
 from skillweave.errors import DeclarationError, MissingExtra
-from skillweave.recipes import _mazes as world
-from skillweave.recipes import mazes
+from skillweave.recipes import _mazes as world, mazes
 
 CORNER = np.array(
     [[1, 1, 1, 1, 1], [1, 0, 0, 0, 1], [1, 1, 1, 0, 1], [1, 0, 0, 0, 1], [1] * 5], bool

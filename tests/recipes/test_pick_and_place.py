@@ -11,8 +11,7 @@ import pytest
 
 from skillweave import Apart, Step
 from skillweave.errors import MissingExtra
-from skillweave.recipes import _arm as world
-from skillweave.recipes import pick_and_place as arm
+from skillweave.recipes import _arm as world, pick_and_place as arm
 
 
 class Distances(gym.Env):

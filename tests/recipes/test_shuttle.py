@@ -8,11 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from benchmarks.pay.shuttle import POINTS
-from benchmarks.pay.shuttle import suite as shuttle_suite
+from benchmarks.pay.shuttle import POINTS, suite as shuttle_suite
 from skillweave import SkillweaveError, Step
-from skillweave.recipes import _cheetah as cheetah
-from skillweave.recipes import shuttle
+from skillweave.recipes import _cheetah as cheetah, shuttle
 
 COST = -0.25
 

@@ -13,10 +13,12 @@ from reporting.cart import RECIPE
 
 import skillweave as sw
 from skillweave.cli import main
+from skillweave.errors import DeclarationError, RunError
 from skillweave.reporting.curves_figure import plot_curves
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.several import open_runs
 from skillweave.training.evaluation_file import save_evaluation
+from skillweave.types import Evaluation
 
 pytest.importorskip("matplotlib")
 
@@ -65,9 +67,9 @@ def test_a_directory_of_runs_stands_for_its_runs_in_their_order(
     for name in ("s10", "s9"):
         shutil.copytree(folder / "base", tmp_path / name)
     assert [run.path.name for run in open_runs([tmp_path])] == ["s9", "s10"]
-    with pytest.raises(sw.RunError, match="holds no run"):
+    with pytest.raises(RunError, match="holds no run"):
         open_runs([folder / "sweep" / "plots"])
-    with pytest.raises(sw.DeclarationError, match="no runs were given"):
+    with pytest.raises(DeclarationError, match="no runs were given"):
         open_runs([])
 
 
@@ -121,7 +123,7 @@ def test_other_bands_agents_metrics_and_names(folder: Path, tmp_path: Path) -> N
 def test_what_cannot_be_drawn_is_told(
     folder: Path, tmp_path: Path, how: dict[str, object], says: str
 ) -> None:
-    with pytest.raises(sw.DeclarationError) as error:
+    with pytest.raises(DeclarationError) as error:
         plot_curves(folder / "sweep", tmp_path / "x", **how)  # type: ignore[arg-type]
     assert says in str(error.value)
     assert not list(tmp_path.iterdir())
@@ -161,7 +163,7 @@ def test_tasks_of_0_and_1_are_drawn_in_percent(folder: Path, tmp_path: Path) -> 
     before = plot_curves(runs, tmp_path / "a").paths[1].read_text()
     assert "episodes solved" not in before
     for path in runs.glob("s*"):
-        score = sw.Evaluation((0.0, 1.0), (5, 5), None)
+        score = Evaluation((0.0, 1.0), (5, 5), None)
         save_evaluation(RunDirectory.open(path), score, 0, deterministic=True)
     # Matplotlib writes each text as a comment beside its outlines.
     after = plot_curves(runs, tmp_path / "b").paths[1].read_text()

@@ -146,7 +146,7 @@ def test_it_opens_without_errors_and_network_at_any_width(
 
 def test_a_cell_of_the_matrix_shows_its_calls(film: Any) -> None:
     film.wait_for_function("document.getElementById('pair-video').readyState >= 2")
-    cells = json.loads(film.locator("#data").text_content())["hand_over"]
+    cells = json.loads(film.locator("#data").text_content())["handover"]
     buttons = film.locator("#pairs button")
     assert buttons.count() == len(cells["cells"])
     for i in range(buttons.count()):
@@ -265,7 +265,7 @@ def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> 
     opened.page.close()
 
 
-def test_films_of_hand_overs_and_choices_name_goals(browser: Any, pages: dict[str, Path]) -> None:
+def test_films_of_handovers_and_choices_name_goals(browser: Any, pages: dict[str, Path]) -> None:
     opened = Opened(browser, pages["goals"])
     page, goal = opened.page, "(0.9, 0.9)"
     page.wait_for_function("document.getElementById('pair-video').readyState >= 2")

@@ -13,7 +13,7 @@ from goals.worlds import SPACES, Drawn, GoTo, Rest, aim_of, declared
 
 from skillweave.reporting.report.calls import decision_data
 from skillweave.reporting.report.charts import choices
-from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.handover import handover_section
 from skillweave.reporting.report.single import play_episodes
 from skillweave.skills.goal_spaces import shown_goal
 
@@ -117,7 +117,7 @@ def test_the_map_of_goals_shows_their_whole_range(tmp_path: Path) -> None:
     assert [encoding[axis]["scale"]["domain"] for axis in "xy"] == [[-1, 1], [-1, 1]]
 
 
-def test_films_of_hand_overs_and_choices_name_goals(tmp_path: Path) -> None:
+def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     skills = [walks("two", SPACES["box"]), walks("other", SPACES["dict"]), Rest()]
 
@@ -129,8 +129,8 @@ def test_films_of_hand_overs_and_choices_name_goals(tmp_path: Path) -> None:
     run = declared(skills, env=Drawn, selector=selector).train(tmp_path / "run", quiet=True)
     log, spec = run.log_calls(400, num_envs=2), run.declaration.spec
     with_goals = {skill.name: skill for skill in skills[:2]}
-    section = hand_over_section(log, spec, {}, with_goals, filmed=True)
-    clips = [(c, clip) for c in section.data["hand_over"]["cells"].values() for clip in c["clips"]]
+    section = handover_section(log, spec, {}, with_goals, filmed=True)
+    clips = [(c, clip) for c in section.data["handover"]["cells"].values() for clip in c["clips"]]
     assert {cell["skill"] for cell, _ in clips} == {"two", "other", "rest"}
     for cell, clip in clips:
         for skill, goal in ((cell["skill"], "goal"), (cell["before"], "before_goal")):
@@ -138,7 +138,7 @@ def test_films_of_hand_overs_and_choices_name_goals(tmp_path: Path) -> None:
             assert re.fullmatch(form.get(skill, ""), clip[goal])
     logged = {shown_goal(goal.astype(np.float32)) for goal in log.goals["two"][log.skill == 0]}
     assert {clip["goal"] for cell, clip in clips if cell["skill"] == "two"} <= logged
-    none = hand_over_section(log, spec, {}, {}, filmed=True).data["hand_over"]["cells"]
+    none = handover_section(log, spec, {}, {}, filmed=True).data["handover"]["cells"]
     assert {clip["goal"] for cell in none.values() for clip in cell["clips"]} == {""}
 
     played = play_episodes(run.policy, spec, 4, 0, 0, True, 2)

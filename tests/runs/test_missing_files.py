@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from skillweave import Agent, Apart, Evolution, Hierarchy, SkillweaveError, Together, TrainDefaults
+from skillweave import Agent, Apart, Hierarchy, SkillweaveError, Together, TrainDefaults
 from skillweave.cli import main
+from skillweave.evolution import Evolution
 from tests.small_runs import ON, Left, Push, policies
 
 

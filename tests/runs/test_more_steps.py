@@ -27,26 +27,17 @@ from small_runs import (
 )
 
 import skillweave as sw
-from skillweave import (
-    SAC,
-    Agent,
-    EnvSpec,
-    Evolution,
-    Hierarchy,
-    Network,
-    Reflex,
-    Run,
-    RunError,
-    SkillweaveError,
-)
+from skillweave import SAC, Agent, EnvSpec, Hierarchy, Network, Reflex, Run, SkillweaveError
 from skillweave.cli.main import main
-from skillweave.errors import DeclarationError
+from skillweave.errors import DeclarationError, RunError
+from skillweave.evolution import Evolution
 from skillweave.runs import files
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.runs.manifest import StageEntry
 from skillweave.training import stage_log
 from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.types import TrainEvent
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -173,9 +164,9 @@ def test_a_run_that_a_callback_ended_learns_on(path: Path) -> None:
 
 
 def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> None:
-    calls: list[sw.TrainEvent] = []
+    calls: list[TrainEvent] = []
 
-    def stop(event: sw.TrainEvent) -> bool:
+    def stop(event: TrainEvent) -> bool:
         calls.append(event)
         return event.steps < 200
 
@@ -184,7 +175,7 @@ def test_a_callback_that_has_ended_a_stage_is_not_called_again(path: Path) -> No
 
 
 def test_an_error_of_a_callback_at_the_last_checkpoint_is_not_a_full_disk(path: Path) -> None:
-    def fail(event: sw.TrainEvent) -> None:
+    def fail(event: TrainEvent) -> None:
         if event.kind == "checkpoint" and event.steps >= 256:
             raise SkillweaveError("mine")
 

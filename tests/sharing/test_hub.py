@@ -68,11 +68,11 @@ def test_calls_go_up_if_asked(run: sw.Run, hub: Hub) -> None:
     assert "calls.safetensors" not in run.push(NAME)["files"]
     assert "calls.safetensors" in run.push(NAME, calls=True)["files"]
     page = hub.files(NAME)["README.md"].decode()
-    section = page.partition("## Hand-over")[2].partition("## Training")[0]
+    section = page.partition("## Handover")[2].partition("## Training")[0]
     assert "| after | left | " in section
-    assert str(log.hand_over().rows()[0][1]).rstrip(")").partition("(")[2] in section
+    assert str(log.handover().rows()[0][1]).rstrip(")").partition("(")[2] in section
     loaded = sw.from_hub(NAME)
-    assert loaded.info()["hand_over"] == run.info()["hand_over"] == log.hand_over().to_json()
+    assert loaded.info()["handover"] == run.info()["handover"] == log.handover().to_json()
     assert (loaded.calls.next_obs == log.next_obs).all()
     with pytest.raises(RunError, match=r"success\(\) of 'left' is not known: load the run with"):
         loaded.log_calls(100)

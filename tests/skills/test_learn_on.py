@@ -7,6 +7,7 @@ import torch
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.errors import DeclarationError, PolicyError, RunError
 from skillweave.seeding import Seeds
 
 sb3 = pytest.importorskip("stable_baselines3")
@@ -164,7 +165,7 @@ def test_a_sequential_module():
 def test_a_network_of_other_sizes_is_named_with_them(tmp_path):
     policy = sw.from_torch(torch.nn.Sequential(torch.nn.Linear(5, 2)), learn=True)
     with pytest.raises(
-        sw.PolicyError, match=r"networks \(actor 5 to 2\) .* values than Box.* and Box"
+        PolicyError, match=r"networks \(actor 5 to 2\) .* values than Box.* and Box"
     ):
         hierarchy(skill(policy)).train(tmp_path / "run", quiet=True)
 
@@ -237,7 +238,7 @@ def test_a_plain_agent_starts_from_it(tmp_path):
     config = learnable.learning_on(SMALL["PPO"], "agent")
     run = sw.Agent(World, config, 16).train(tmp_path / "run", start_from=learnable, quiet=True)
     assert "agent" in run.info()["stages"][0]["starts"]
-    with pytest.raises(sw.DeclarationError, match=r"write PPO\(.*normalize_obs=False"):
+    with pytest.raises(DeclarationError, match=r"write PPO\(.*normalize_obs=False"):
         sw.Agent(World, SMALL["PPO"], 16).train(
             tmp_path / "other", start_from=learnable, quiet=True
         )
@@ -246,13 +247,13 @@ def test_a_plain_agent_starts_from_it(tmp_path):
 class TestRefused:
     def test_another_algorithm(self, tmp_path):
         walk = skill(sw.from_sb3(model_of("SAC", World()), learn=True))
-        with pytest.raises(sw.DeclarationError, match=r"'walk'.*SAC learns on by SAC.*is PPO"):
+        with pytest.raises(DeclarationError, match=r"'walk'.*SAC learns on by SAC.*is PPO"):
             hierarchy(walk).train(tmp_path / "run", quiet=True)
 
     def test_other_spaces(self, tmp_path):
         env = World(gym.spaces.Box(-2, 2, (5,), np.float32))
         walk = skill(sw.from_sb3(model_of("PPO", env), learn=True))
-        with pytest.raises(sw.PolicyError, match=r"'walk'.*observation_space"):
+        with pytest.raises(PolicyError, match=r"'walk'.*observation_space"):
             hierarchy(walk).train(tmp_path / "run", quiet=True)
 
     def test_other_goals(self, tmp_path):
@@ -274,9 +275,9 @@ class TestRefused:
                 return skill(policy, goal_space=wide, reward=reward, steps=16)
 
             says = r"was trained for goals of Box\(-1.*but now its goal_space is Box\(-3"
-            with pytest.raises(sw.PolicyError, match=f"skill 'walk': .*{says}"):
+            with pytest.raises(PolicyError, match=f"skill 'walk': .*{says}"):
                 hierarchy(goes(3.0)).train(tmp_path / "run", quiet=True)
-            with pytest.raises(sw.PolicyError, match=f"start_from: 'walk': .*{says}"):
+            with pytest.raises(PolicyError, match=f"start_from: 'walk': .*{says}"):
                 hierarchy(goes(3.0, None)).train(
                     tmp_path / "run", quiet=True, start_from={"walk": policy}
                 )
@@ -285,7 +286,7 @@ class TestRefused:
 
     def test_a_module_of_another_size(self, tmp_path):
         walk = skill(sw.from_torch(torch.nn.Linear(5, 2), learn=True))
-        with pytest.raises(sw.PolicyError, match="does not fit 'walk'"):
+        with pytest.raises(PolicyError, match="does not fit 'walk'"):
             hierarchy(walk).train(tmp_path / "run", quiet=True)
 
     @pytest.mark.parametrize(
@@ -303,39 +304,39 @@ class TestRefused:
         ids=lambda m: type(m).__name__,
     )
     def test_a_module_of_other_layers(self, module):
-        with pytest.raises(sw.PolicyError, match="cannot learn on"):
+        with pytest.raises(PolicyError, match="cannot learn on"):
             sw.from_torch(module, learn=True)
 
     def test_a_mapping(self):
         model = model_of("PPO", World())
-        with pytest.raises(sw.DeclarationError, match=r"leave out sees and every.*class"):
+        with pytest.raises(DeclarationError, match=r"leave out sees and every.*class"):
             sw.from_sb3(model, sees=(0, 1, 2), every=2, learn=True)
-        with pytest.raises(sw.DeclarationError, match=r"leave out sees.*class"):
+        with pytest.raises(DeclarationError, match=r"leave out sees.*class"):
             sw.from_torch(torch.nn.Linear(3, 2), every=2, learn=True)
 
     def test_images_and_gsde(self):
         space = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
         images = sb3.PPO("CnnPolicy", World(space, DISCRETE), device="cpu")
-        with pytest.raises(sw.PolicyError, match=r"cannot learn on.*NatureCNN"):
+        with pytest.raises(PolicyError, match=r"cannot learn on.*NatureCNN"):
             sw.from_sb3(images, learn=True)
-        with pytest.raises(sw.PolicyError, match="gSDE"):
+        with pytest.raises(PolicyError, match="gSDE"):
             sw.from_sb3(model_of("PPO", World(), use_sde=True), learn=True)
 
     def test_numbers_that_are_not_finite(self):
         module = torch.nn.Linear(3, 2)
         module.weight.data[0, 0] = float("nan")
-        with pytest.raises(sw.PolicyError, match="NaN"):
+        with pytest.raises(PolicyError, match="NaN"):
             sw.from_torch(module, learn=True)
 
     def test_a_zip_without_trust_repeats_what_was_asked(self, tmp_path):
         model_of("PPO", World()).save(tmp_path / "m.zip")
-        with pytest.raises(sw.PolicyError, match=r"\"?'?ppo'?\"?, trust=True, learn=True\)"):
+        with pytest.raises(PolicyError, match=r"\"?'?ppo'?\"?, trust=True, learn=True\)"):
             sw.from_sb3(tmp_path / "m.zip", learn=True)
-        with pytest.raises(sw.RunError, match="does not exist"):
+        with pytest.raises(RunError, match="does not exist"):
             sw.from_sb3(tmp_path / "other.zip", learn=True)
 
     def test_another_word_for_learn(self):
-        with pytest.raises(sw.DeclarationError, match="learn is 'yes'"):
+        with pytest.raises(DeclarationError, match="learn is 'yes'"):
             sw.from_sb3(model_of("PPO", World()), learn="yes")
-        with pytest.raises(sw.DeclarationError, match="learn is 1"):
+        with pytest.raises(DeclarationError, match="learn is 1"):
             sw.from_torch(torch.nn.Linear(3, 2), learn=1)

@@ -7,8 +7,14 @@ from collections import Counter
 
 from living import all_end
 
-from scripts.torture.processes import fork as start
-from scripts.torture.processes import group_is_gone, kill_group, note, run_cases, wait
+from scripts.torture.processes import (
+    fork as start,
+    group_is_gone,
+    kill_group,
+    note,
+    run_cases,
+    wait,
+)
 from scripts.torture.report import CRASH, EQUAL, HANG, TRACEBACK, Outcome
 
 WHAT = {3: "raises", 5: "hangs", 7: "aborts", 8: "leaves", 11: "ignores the end"}

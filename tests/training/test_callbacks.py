@@ -13,9 +13,11 @@ import torch
 from small_runs import OFF, ON, Balance, Left, Push, assert_same, lines
 
 import skillweave as sw
-from skillweave import Agent, Apart, EnvSpec, Evolution, Hierarchy, SkillweaveError, TrainEvent
+from skillweave import Agent, Apart, EnvSpec, Hierarchy, SkillweaveError
 from skillweave.errors import Interrupted
+from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
+from skillweave.types import TrainEvent
 
 SYNC = EnvSpec("CartPole-v1", engine="sync", workers=1)
 EVALUATED: dict[str, Any] = {"eval_every": 200, "eval_episodes": 2, "checkpoint_every": 150}

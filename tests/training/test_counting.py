@@ -7,6 +7,7 @@ from declaring import plainly
 
 import skillweave as sw
 from skillweave.envs import engine as engines
+from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
 
 NET = sw.Network((8,))
@@ -88,7 +89,7 @@ def test_the_search_for_a_start_is_reported_and_counts_against_the_budget(settin
 def test_the_fitness_of_a_population_is_reported_and_counts_against_the_budget(
     algorithm, made, tmp_path
 ):
-    search = sw.Evolution(population=3, generations=4, episodes=5)
+    search = Evolution(population=3, generations=4, episodes=5)
     spec = sw.EnvSpec(Walk, engine="sync")
     run = sw.train_agent(spec, algorithm, 800, tmp_path / "run", quiet=True, evolve=search)
     assert reported(run) == made[0]
@@ -138,7 +139,7 @@ def test_the_default_selector_makes_hundreds_of_updates(tmp_path):
 
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
-@pytest.mark.parametrize("evolve", [None, sw.Evolution(population=2, generations=10, episodes=1)])
+@pytest.mark.parametrize("evolve", [None, Evolution(population=2, generations=10, episodes=1)])
 def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_to_their_ends(
     algorithm, evolve, tmp_path
 ):
@@ -162,13 +163,13 @@ def test_episodes_longer_than_what_lies_between_cuts_or_generations_are_learnt_t
 @pytest.mark.parametrize("algorithm", [SMALL, sw.DQN(**REPLAY, network=NET)])
 def test_a_population_reports_its_search_for_a_start(algorithm, made, tmp_path):
     declared = hierarchy(algorithm=algorithm, selector_steps=300)
-    search = {"late": sw.Evolution(population=2, generations=3, episodes=2)}
+    search = {"late": Evolution(population=2, generations=3, episodes=2)}
     run = declared.train(tmp_path / "run", quiet=True, evolve=search)
     assert reported(run) == made[0]
 
 
 def test_a_population_whose_budget_ends_it_early_says_so(tmp_path, capsys):
-    search = sw.Evolution(population=2, generations=5, episodes=20)
+    search = Evolution(population=2, generations=5, episodes=20)
     spec = sw.EnvSpec(Walk, engine="sync")
     run = sw.train_agent(spec, SMALL, 300, tmp_path / "run", evolve=search)
     assert run.info()["stages"][0]["winner"]["generations"] < 5

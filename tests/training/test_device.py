@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from skillweave import DQN, PPO, SAC, Evolution, Network, SkillweaveError, train_agent
+from skillweave import DQN, PPO, SAC, Network, SkillweaveError, train_agent
+from skillweave.evolution import Evolution
 from skillweave.runs.files import read_tensors
 
 NET = Network((8,))

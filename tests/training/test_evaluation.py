@@ -10,7 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from skillweave import PPO, EnvSpec, Evaluation, Skill, SkillweaveError, envpool, evaluate
+from skillweave import PPO, EnvSpec, Skill, SkillweaveError, envpool, evaluate
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs import checks
@@ -18,6 +18,7 @@ from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED, interquartile_mean
+from skillweave.types import Evaluation
 
 torch.set_num_threads(1)
 

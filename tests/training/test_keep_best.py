@@ -27,7 +27,6 @@ from skillweave import (
     Agent,
     Apart,
     EnvSpec,
-    Evolution,
     Hierarchy,
     Skill,
     SkillweaveError,
@@ -36,6 +35,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave.algorithms.policy import make_algorithm
+from skillweave.evolution import Evolution
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors

@@ -16,7 +16,6 @@ from skillweave import (
     Agent,
     Apart,
     EnvSpec,
-    Evolution,
     Hierarchy,
     Ray,
     Skill,
@@ -28,6 +27,7 @@ from skillweave import (
 from skillweave.cli import main
 from skillweave.envs.engine import SyncEnvs
 from skillweave.envs.infos import info_numbers
+from skillweave.evolution import Evolution
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory

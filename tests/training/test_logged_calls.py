@@ -16,18 +16,10 @@ from small_runs import (
     interrupt_at_checkpoint,
 )
 
-from skillweave import (
-    EnvSpec,
-    Evolution,
-    Hierarchy,
-    Lengths,
-    Ray,
-    Run,
-    Skill,
-    TrainDefaults,
-)
+from skillweave import EnvSpec, Hierarchy, Lengths, Ray, Run, Skill, TrainDefaults
 from skillweave.collecting import placement
 from skillweave.errors import DeclarationError, EnvError, Interrupted, RunError
+from skillweave.evolution import Evolution
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.planning import CallLog
 from skillweave.planning.calls import LEARNING
@@ -132,7 +124,7 @@ def test_skills_that_learn_meanwhile_are_counted_and_not_planned_with(tmp_path: 
     log = run.calls
     assert log.checksums[0] == LEARNING != log.checksums[1]
     assert_whole(log, run.policy, LIMITS)
-    assert log.hand_over().calls.sum() > 20
+    assert log.handover().calls.sum() > 20
     with pytest.raises(RunError, match="'left' has changed since the log was recorded"):
         run.plan(lambda step: step.next_obs[:, 0] > 0)
 

@@ -3,16 +3,9 @@
 import pytest
 from declaring import plainly
 
-from skillweave import (
-    DQN,
-    SAC,
-    Apart,
-    Evolution,
-    Hierarchy,
-    Network,
-    train_agent,
-)
+from skillweave import DQN, SAC, Apart, Hierarchy, Network, train_agent
 from skillweave.errors import SkillweaveError
+from skillweave.evolution import Evolution
 from skillweave.skills import Skill
 
 SMALL = {"num_envs": 4, "batch_size": 8, "learning_starts": 40, "network": Network((4,))}

@@ -16,9 +16,7 @@ from skillweave import (
     PPO,
     Agent,
     Apart,
-    Array,
     EnvSpec,
-    Evolution,
     Hierarchy,
     Network,
     Selection,
@@ -29,6 +27,7 @@ from skillweave import (
     train_agent,
 )
 from skillweave.envs import engine as engines
+from skillweave.evolution import Evolution
 from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
@@ -36,6 +35,7 @@ from skillweave.runs.files import read_tensors
 from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.stage import Target
+from skillweave.types import Array
 
 NET = Network((8,))
 SMALL = PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=NET)

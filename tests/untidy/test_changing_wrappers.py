@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import EnvError
 
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
@@ -23,7 +24,7 @@ class Own(gym.wrappers.NormalizeObservation):
 )
 def test_they_are_refused_before_anything_is_trained(wrapper, instead, tmp_path):
     spec = sw.EnvSpec("CartPole-v1", wrappers=(wrapper,))
-    with pytest.raises(sw.EnvError, match=instead):
+    with pytest.raises(EnvError, match=instead):
         sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
 

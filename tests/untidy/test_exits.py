@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import EnvError, PolicyError, SkillError
 
 SMALL = sw.PPO(num_envs=2, n_steps=8, batch_size=16, update_epochs=1, network=sw.Network((4,)))
 WHERE = r".* SystemExit: enough \(test_exits\.py, line \d+\)"
@@ -39,7 +40,7 @@ def test_in_action_masks(workers, tmp_path):
             return np.ones(2, bool)
 
     spec = sw.EnvSpec(Masked, engine="sync", workers=workers)
-    with pytest.raises(sw.EnvError) as found:
+    with pytest.raises(EnvError) as found:
         sw.train_agent(spec, SMALL, 64, tmp_path / "run", quiet=True)
     assert found.match(r"environment 0, step 3 of its episode: action_masks\(\) raised" + WHERE)
 
@@ -77,7 +78,7 @@ def test_in_a_function_that_answers_once(tmp_path):
         return np.ones(len(obs), bool) if later.calls == 1 else leave()
 
     later.calls = 0
-    with pytest.raises(sw.SkillError, match=r"skill 'leaves': initiation\(\)") as found:
+    with pytest.raises(SkillError, match=r"skill 'leaves': initiation\(\)") as found:
         sw.Hierarchy(
             Ramp, [skill(initiation=later), Stay()], algorithm=SMALL, selector=SMALL, steps=64
         ).train(tmp_path / "run", quiet=True)
@@ -108,5 +109,5 @@ def test_in_a_function_of_a_hierarchy(how, tmp_path):
 
 
 def test_in_a_policy_that_is_evaluated():
-    with pytest.raises(sw.PolicyError, match=r"raised" + WHERE):
+    with pytest.raises(PolicyError, match=r"raised" + WHERE):
         sw.evaluate(sw.from_function(leave), Ramp, episodes=1)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import EnvError
+from skillweave.evolution import Evolution
 
 
 def small(num_envs: int) -> sw.PPO:
@@ -86,14 +88,14 @@ def test_a_simulator_of_which_there_can_be_one_works_in_every_mode(learn, tmp_pa
 
 def test_more_than_can_be_made_names_the_setting(tmp_path):
     Counted.allowed = 3
-    with pytest.raises(sw.EnvError, match=r"3 could be made.*num_envs=3"):
+    with pytest.raises(EnvError, match=r"3 could be made.*num_envs=3"):
         hierarchy("together", 8).train(tmp_path / "run", quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
 
 def test_where_two_are_needed_one_is_refused_before_anything_is_trained(tmp_path):
     Counted.allowed = 1
-    with pytest.raises(sw.EnvError, match=r"port 2000 is in use.*leave eval_every out"):
+    with pytest.raises(EnvError, match=r"port 2000 is in use.*leave eval_every out"):
         hierarchy("apart", 1).train(tmp_path / "run", eval_every=200, quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
 
@@ -131,7 +133,7 @@ def test_members_of_a_population_are_compared_in_no_more_than_they_train_in(tmp_
     for n in (1, 2, 16):
         Counted.alive = Counted.most = 0
         spec = sw.EnvSpec(Starts, engine="sync", workers=1)
-        how = sw.Evolution(population=2, generations=2, episodes=7)
+        how = Evolution(population=2, generations=2, episodes=7)
         run = sw.train_agent(spec, small(n), 256 * n, tmp_path / f"{n}", evolve=how, quiet=True)
         lines = (run.path / "lineage.jsonl").read_text().splitlines()
         found.append([json.loads(line)["fitness"] for line in lines])
@@ -145,11 +147,11 @@ def test_members_of_a_population_are_compared_in_no_more_than_they_train_in(tmp_
 @pytest.mark.parametrize("stage", ["agent", "selector"])
 def test_a_population_of_a_simulator_of_which_there_can_be_one_is_refused_at_once(stage, tmp_path):
     Counted.allowed = 1
-    search = sw.Evolution(population=3)
+    search = Evolution(population=3)
     says = r"port 2000 is in use.*A population needs several environments at once, here 3 of them"
     agent = sw.Agent(sw.EnvSpec(Counted, workers=1), small(1), 600)
     declared = agent if stage == "agent" else hierarchy("apart", 1)
-    with pytest.raises(sw.EnvError, match=says):
+    with pytest.raises(EnvError, match=says):
         declared.train(tmp_path / "run", evolve={stage: search}, quiet=True)
     assert (Counted.begun, Counted.alive) == (0, 0)
     assert not (tmp_path / "run").exists()
@@ -157,10 +159,10 @@ def test_a_population_of_a_simulator_of_which_there_can_be_one_is_refused_at_onc
 
 def test_a_population_that_needs_more_than_can_be_made_names_its_settings(tmp_path):
     Counted.allowed = 4
-    with pytest.raises(sw.EnvError, match=r"here 8 of them to train in.*\(population\) and num"):
+    with pytest.raises(EnvError, match=r"here 8 of them to train in.*\(population\) and num"):
         sw.train_agent(
             sw.EnvSpec(Counted, workers=1), small(2), 600, tmp_path / "run", quiet=True,
-            evolve=sw.Evolution(population=4, episodes=3),
+            evolve=Evolution(population=4, episodes=3),
         )  # fmt: skip
     assert (Counted.begun, Counted.alive) == (0, 0)
 

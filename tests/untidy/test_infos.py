@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import SkillError
+from skillweave.evolution import Evolution
 
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 READ: list[int] = []
@@ -119,7 +121,7 @@ def test_dicts_of_any_kind_are_read_by_their_keys(tmp_path):
 
 def test_members_of_a_population_may_tell_other_kinds(tmp_path):
     values = [0, 2**60 + 1, 0.5, {"a": 1}, np.arange(3), "goal", ABSENT]
-    evolve = sw.Evolution(population=2, generations=2)
+    evolve = Evolution(population=2, generations=2)
     sw.train_agent(telling(values), SMALL, 1_500, tmp_path / "run", evolve=evolve, quiet=True)
 
 
@@ -141,7 +143,7 @@ class Doubles(Scores):
 )
 def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, tmp_path):
     spec = telling([1.5, other])
-    with pytest.raises(sw.SkillError) as caught:
+    with pytest.raises(SkillError) as caught:
         sw.Hierarchy(spec, [skill], steps=256, algorithm=SMALL, selector=SMALL).train(
             tmp_path / "run", quiet=True
         )
@@ -152,7 +154,7 @@ def test_a_key_that_is_read_must_hold_numbers_in_all_environments(skill, other, 
 
 def test_a_key_that_nobody_gives_is_named(tmp_path):
     spec = telling([ABSENT])
-    with pytest.raises(sw.SkillError, match=r"no environment set this key .*'always'"):
+    with pytest.raises(SkillError, match=r"no environment set this key .*'always'"):
         sw.Hierarchy(spec, [Scores()], steps=256, algorithm=SMALL, selector=SMALL).train(
             tmp_path / "run", quiet=True
         )

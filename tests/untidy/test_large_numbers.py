@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import EnvError
 
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
 
@@ -44,7 +45,7 @@ def train(first, dtype, parts, path, quiet=True):
 
 @pytest.mark.parametrize("parts", [False, True], ids=["box", "dict"])
 def test_numbers_beyond_float32_are_refused(parts, tmp_path):
-    with pytest.raises(sw.EnvError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
+    with pytest.raises(EnvError, match=r"1 of 2 numbers.*larger than 3.4e\+38.*float32"):
         train(1e300, np.float64, parts, tmp_path / "run")
 
 

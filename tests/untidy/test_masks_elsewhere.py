@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import skillweave as sw
+from skillweave.errors import DeclarationError, EnvError
 from skillweave.export.runner import Runner
 
 SMALL = sw.PPO(num_envs=4, n_steps=16, batch_size=32, update_epochs=1, network=sw.Network((8,)))
@@ -167,7 +168,7 @@ def test_masks_may_be_given_in_many_ways(kind, mask, tmp_path):
 @pytest.mark.parametrize("mask", [[1, 0], "all", np.ones(7)])
 def test_a_mask_that_is_none_names_environment_and_step(kind, mask, tmp_path):
     spec = sw.EnvSpec(lambda: kind(lambda env: mask), workers=1)
-    with pytest.raises(sw.EnvError, match=r"environment 0, step 0 .*6 in all"):
+    with pytest.raises(EnvError, match=r"environment 0, step 0 .*6 in all"):
         sw.train_agent(spec, SMALL, 256, tmp_path / "run", quiet=True)
 
 
@@ -192,7 +193,7 @@ def test_a_player_is_not_given_a_wrong_mask(mask):
         observation_space=Slots("none").observation_space,
         action_space=Slots("none").action_space,
     )
-    with pytest.raises(sw.DeclarationError, match="action_mask"):
+    with pytest.raises(DeclarationError, match="action_mask"):
         sw.Player(policy).act(np.zeros(6, np.int8), mask=mask)
 
 
@@ -212,7 +213,7 @@ def test_a_method_that_fails_is_named(tmp_path):
         def action_masks(self):
             raise ValueError("no board")
 
-    with pytest.raises(sw.EnvError, match=r"action_masks\(\) raised ValueError: no board"):
+    with pytest.raises(EnvError, match=r"action_masks\(\) raised ValueError: no board"):
         sw.train_agent(
             sw.EnvSpec(lambda: Broken("none"), workers=1), SMALL, 256, tmp_path / "run", quiet=True
         )

@@ -113,7 +113,7 @@ def choices(skills: Sequence[str], colors: Sequence[str], *, goals: bool = False
     return chart("The selector's choices over two coordinates", 360, mark=mark, encoding=encoding)
 
 
-def hand_over(names: tuple[str, str]) -> Spec:
+def handover(names: tuple[str, str]) -> Spec:
     """Return a chart of calls over two coordinates, by what became of them.
 
     Args:

@@ -12,7 +12,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.paths import AGENT, join
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
 from skillweave.reporting.palette import RGB, color_of, hex_of
@@ -46,7 +46,7 @@ from skillweave.reporting.report.facts import (
 )
 from skillweave.reporting.report.film import Film, episode_shot, make_film
 from skillweave.reporting.report.goals import goal_pictures
-from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.handover import handover_section
 from skillweave.reporting.report.page import Section, library, write_page
 from skillweave.reporting.report.verdict import is_binary, no_verdict, solved, verdict
 from skillweave.runs.directory import RunDirectory
@@ -229,10 +229,10 @@ def write_report(
         log = load_calls(run)
     except SkillweaveError as error:
         log = None
-        missing.append(f"There is no hand-over: {_sentence(error)}")
+        missing.append(f"There is no handover: {_sentence(error)}")
     if log is not None and len(log):
         with_goals = {} if played is None else played.with_goals
-        sections.append(hand_over_section(log, spec, colors, with_goals, filmed=filmed > 0))
+        sections.append(handover_section(log, spec, colors, with_goals, filmed=filmed > 0))
         missing += sections[-1].missing
         if played is not None:
             pictures = goal_pictures({"": log}, with_goals, "of the run’s log")
@@ -241,7 +241,7 @@ def write_report(
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": metrics_of(all_curves)}
-    context |= {"episodes": 0, "has_skills": False, "hand_over": None, "goals": []}
+    context |= {"episodes": 0, "has_skills": False, "handover": None, "goals": []}
     for section in sections:
         context |= section.context
         data |= section.data

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from skillweave.paths import level_of
-from skillweave.planning.hand_over import wilson
+from skillweave.planning.handover import wilson
 from skillweave.reporting.report.facts import number, percent, scale_of
 from skillweave.runs.manifest import StageEntry
 from skillweave.training.evaluation import Evaluation

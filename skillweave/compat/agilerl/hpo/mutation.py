@@ -6,8 +6,7 @@ import numpy as np
 
 from skillweave.compat.agilerl.agent import random_seed
 from skillweave.errors import DeclarationError
-from skillweave.evolution.config import KINDS, Range
-from skillweave.evolution.config import Mutations as Native
+from skillweave.evolution.config import KINDS, Mutations as Native, Range
 
 _WORDS = {
     "none": "None",

@@ -133,10 +133,10 @@
     video.append(make("track", { kind: "captions", label: "Skills", srclang: "en", src: URL.createObjectURL(captions) }));
   };
 
-  // Hand-over: the chosen cell, its films and its calls
+  // Handover: the chosen cell, its films and its calls
 
-  const handOver = () => {
-    const { cells, colors, words, names, points, spec, film } = data.hand_over;
+  const handover = () => {
+    const { cells, colors, words, names, points, spec, film } = data.handover;
     const video = $("pair-video");
     const buttons = [...document.querySelectorAll("#pairs button")];
     let cell, clip;
@@ -223,7 +223,7 @@
     }
     select((document.querySelector("#pairs .weak button") ?? buttons[0]).dataset.cell);
   };
-  if (data.hand_over && document.querySelector("#pairs button")) handOver();
+  if (data.handover && document.querySelector("#pairs button")) handover();
 
   // Episodes: timelines, the chosen call, the film
 

@@ -1,4 +1,4 @@
-"""The hand-over section of a report, from the log of calls in the run: a matrix, films, ends."""
+"""The handover section of a report, from the log of calls in the run: a matrix, films, ends."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import short
-from skillweave.planning import CallLog, HandOver
-from skillweave.planning.hand_over import before_each
+from skillweave.planning import CallLog, Handover
+from skillweave.planning.handover import before_each
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
     coordinates,
@@ -70,7 +70,7 @@ class _Cell:
     clips: list[_Clip] = field(default_factory=list)
 
 
-def hand_over_section(
+def handover_section(
     log: CallLog,
     spec: EnvSpec | None,
     colors: Mapping[str, str],
@@ -86,7 +86,7 @@ def hand_over_section(
         with_goals: the skills with goals, by path.
         filmed: play calls again, and film them.
     """
-    matrix, missing = log.hand_over(), []
+    matrix, missing = log.handover(), []
     before = before_each(log, log.succeeded)
     cells = {
         (i, j): _Cell(np.flatnonzero((before == i) & (log.skill == j)))
@@ -97,7 +97,7 @@ def hand_over_section(
         try:
             film = _film(log, spec, cells, matrix)
         except SkillweaveError as error:
-            missing.append(f"There is no film of hand-overs: {str(error).rstrip('.')}.")
+            missing.append(f"There is no film of handovers: {str(error).rstrip('.')}.")
     named = None if spec is None else spec.observation_names()
     named = None if names_misfit(log.start[:1], named) else named
     if film is None:
@@ -112,16 +112,16 @@ def hand_over_section(
         },
         "colors": dict(colors),
         "words": list(done),
-        "spec": charts.hand_over(done),
+        "spec": charts.handover(done),
         **points,
     }
     if film is not None:
         data["film"] = {"fps": film.fps}
-    context = {"hand_over": _words(log, matrix, named), "hand_film": film}
-    return Section(context, {"hand_over": data}, missing)
+    context = {"handover": _words(log, matrix, named), "hand_film": film}
+    return Section(context, {"handover": data}, missing)
 
 
-def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, Any]:
+def _words(log: CallLog, matrix: Handover, named: ObsNames | None) -> dict[str, Any]:
     weak = set(matrix.weak())
     rows = []
     for i, name in enumerate(matrix.before):
@@ -151,7 +151,7 @@ def _words(log: CallLog, matrix: HandOver, named: ObsNames | None) -> dict[str, 
     }
 
 
-def _interval(matrix: HandOver, i: int, j: int) -> str:
+def _interval(matrix: Handover, i: int, j: int) -> str:
     low, high = (percent(float(bound[i, j])) for bound in matrix.interval)
     return f"{low} to {high}"
 
@@ -215,7 +215,7 @@ def _points(
 
 
 def _cell(
-    matrix: HandOver,
+    matrix: Handover,
     i: int,
     j: int,
     log: CallLog,
@@ -260,9 +260,9 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
 # The film
 
 
-@global_generators(Seeds(0) / "hand-over film")
+@global_generators(Seeds(0) / "handover film")
 def _film(
-    log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
+    log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: Handover
 ) -> Film | None:
     """Play calls of each cell again, and film them; None: none can be played again.
 
@@ -286,7 +286,7 @@ def _film(
 
 
 def _choose_clips(
-    log: CallLog, cells: Mapping[tuple[int, int], _Cell], matrix: HandOver
+    log: CallLog, cells: Mapping[tuple[int, int], _Cell], matrix: Handover
 ) -> list[_Clip]:
     """Choose calls of each cell, one that was not done and one that was, as many as fit.
 

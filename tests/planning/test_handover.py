@@ -1,4 +1,4 @@
-"""Hand-over matrices and chains, by hand and against episodes that are played."""
+"""Handover matrices and chains, by hand and against episodes that are played."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from planning.logs import log_of
 
 from skillweave.errors import DeclarationError, RunError
 from skillweave.planning import CallLog, held
-from skillweave.planning.hand_over import HandOver, wilson
+from skillweave.planning.handover import Handover, wilson
 
 A, B = 0, 1
 
@@ -31,7 +31,7 @@ def log() -> CallLog:
 
 
 def test_the_matrix_by_hand(log: CallLog) -> None:
-    matrix = log.hand_over()
+    matrix = log.handover()
     assert matrix.before == ("start", "go", "stay")
     # After "go": B won, B lost, A won (though the limit came then). After a lost call: nothing.
     assert matrix.calls.tolist() == [[3, 1], [1, 2], [1, 0]]
@@ -39,7 +39,7 @@ def test_the_matrix_by_hand(log: CallLog) -> None:
     assert matrix.cut.tolist() == [0, 1]
     assert matrix.of("stay", after="go") == (0.5, 2)
     assert np.isnan(matrix.rate[2, 1])
-    any_end = log.hand_over(only_after_done=False)
+    any_end = log.handover(only_after_done=False)
     assert any_end.calls.tolist() == [[3, 1], [2, 2], [2, 0]]
     assert any_end.done.tolist() == [[2, 1], [2, 1], [1, 0]]
 
@@ -49,7 +49,7 @@ def test_done_may_be_an_event_inside_the_call(log: CallLog) -> None:
         return obs[:, 0] == 2
 
     # "stay" is done where two steps in succession end at 2, "go" where one does.
-    matrix = log.hand_over({"stay": held(at_two, 2), "go": at_two})
+    matrix = log.handover({"stay": held(at_two, 2), "go": at_two})
     assert matrix.calls.tolist() == [[3, 1], [0, 2], [1, 0]]
     assert matrix.done.tolist() == [[2, 0], [0, 1], [0, 0]]
     assert matrix.cut.tolist() == [1, 1]
@@ -63,11 +63,11 @@ def test_intervals() -> None:
 
 
 def test_it_is_shown_as_a_table(log: CallLog) -> None:
-    lines = str(log.hand_over()).splitlines()
+    lines = str(log.handover()).splitlines()
     assert lines[0].split() == ["after", "go", "stay"]
     assert lines[2].split("  ")[-1].strip() == "50% of 2 (9% to 91%)"
     assert lines[3].split()[-1] == "–"
-    assert "<table>" in log.hand_over()._repr_html_()
+    assert "<table>" in log.handover()._repr_html_()
 
 
 def walks(episodes: int, seed: int) -> CallLog:
@@ -102,15 +102,15 @@ def test_a_chain_follows_where_calls_end() -> None:
     assert broken.estimate < 0.02
     assert broken.product > 0.2
     assert broken.rates[1:] == (
-        log.hand_over().of("there", "back")[0], log.hand_over().of("on", "there")[0],
+        log.handover().of("there", "back")[0], log.handover().of("on", "there")[0],
     )  # fmt: skip
-    assert broken.calls[2] == log.hand_over().of("on", "there")[1]
+    assert broken.calls[2] == log.handover().of("on", "there")[1]
     sure = log.chain("back", "there", "there", "on")
     assert sure.estimate > 0.98
 
 
-def test_the_broken_hand_over_is_named() -> None:
-    sentences = walks(600, 1).hand_over().weakest()
+def test_the_broken_handover_is_named() -> None:
+    sentences = walks(600, 1).handover().weakest()
     assert any(
         re.match(r"'on' succeeds in 0% of \d+ calls \(.*\) after 'back'; in", s) for s in sentences
     )
@@ -118,11 +118,11 @@ def test_the_broken_hand_over_is_named() -> None:
 
 
 def test_a_skill_that_is_never_done_is_the_weakest() -> None:
-    def never(calls: int, judged: bool = True) -> HandOver:
+    def never(calls: int, judged: bool = True) -> Handover:
         episode = (0, [(A, [1], True, "own"), (B, [2], False, "limit")])
         return replace(
             log_of(["go", "stay"], [episode] * calls), own_success=(True, judged)
-        ).hand_over()
+        ).handover()
 
     assert never(20).weakest() == [
         "'stay' succeeds in 0% of 20 calls (0% to 16%), whatever came before"
@@ -133,14 +133,14 @@ def test_a_skill_that_is_never_done_is_the_weakest() -> None:
 
 
 def test_what_counts_without_a_success_is_said(log: CallLog) -> None:
-    matrix = log.hand_over()
+    matrix = log.handover()
     assert matrix.by_itself == ()
     assert str(matrix).endswith("A call is done if it succeeded.")
     some = replace(log, own_success=(True, False))
-    assert str(some.hand_over()).endswith("without success() (stay) if it ended by itself.")
-    none = replace(log, own_success=(False, False)).hand_over()
+    assert str(some.handover()).endswith("without success() (stay) if it ended by itself.")
+    none = replace(log, own_success=(False, False)).handover()
     assert "<p>No success() is known: a call is" in none._repr_html_()
-    broken = replace(walks(600, 1), own_success=(False,) * 3).hand_over().weakest()
+    broken = replace(walks(600, 1), own_success=(False,) * 3).handover().weakest()
     assert any("ends by itself in" in sentence for sentence in broken)
 
 
@@ -165,10 +165,10 @@ def test_where_calls_end(log: CallLog) -> None:
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
-        (lambda log: log.hand_over({"sty": len}), DeclarationError, "is 'stay' meant"),
-        (lambda log: log.hand_over({"go": 3}), DeclarationError, "done of 'go': 3 is no pred"),
-        (lambda log: log.hand_over(3), DeclarationError, "done is 3; it must be a dict"),
-        (lambda log: log.hand_over().of("go", "x"), DeclarationError, "no skill 'x'"),
+        (lambda log: log.handover({"sty": len}), DeclarationError, "is 'stay' meant"),
+        (lambda log: log.handover({"go": 3}), DeclarationError, "done of 'go': 3 is no pred"),
+        (lambda log: log.handover(3), DeclarationError, "done is 3; it must be a dict"),
+        (lambda log: log.handover().of("go", "x"), DeclarationError, "no skill 'x'"),
         (lambda log: log.chain(), DeclarationError, "needs the names of skills"),
         (lambda log: log.chain("go", "gone"), DeclarationError, "no skill 'gone'"),
         (
@@ -184,7 +184,7 @@ def test_where_calls_end(log: CallLog) -> None:
         ),
     ],
 )
-def test_wrong_arguments_of_hand_over(log: CallLog, make: Any, kind: Any, message: str) -> None:
+def test_wrong_arguments_of_handover(log: CallLog, make: Any, kind: Any, message: str) -> None:
     with pytest.raises(kind, match=message):
         make(log)
 

@@ -1,4 +1,4 @@
-"""The hand-over section of a report: its matrix, the calls that it films, and what is missing."""
+"""The handover section of a report: its matrix, the calls that it films, and what is missing."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from reporting.walkway import Walkway, declare
 
 from skillweave import EnvSpec, Run
 from skillweave.planning import CallLog
-from skillweave.reporting.report import film, hand_over
+from skillweave.reporting.report import film, handover
 from skillweave.reporting.report.film import HOLD
-from skillweave.reporting.report.hand_over import hand_over_section
+from skillweave.reporting.report.handover import handover_section
 from skillweave.reporting.report.page import Section
 from skillweave.runs.directory import CALLS
 
@@ -45,12 +45,12 @@ def log(run: Run) -> CallLog:
 
 def section(log: CallLog, spec: Any = None, filmed: bool = True) -> Section:
     spec = EnvSpec(Ragged) if spec is None else spec
-    return hand_over_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
+    return handover_section(log, spec, {"go": "#111111", "stay": "#222222"}, {}, filmed=filmed)
 
 
 def test_the_matrix_and_the_ends(log: CallLog) -> None:
-    words = section(log, filmed=False).context["hand_over"]
-    matrix = log.hand_over()
+    words = section(log, filmed=False).context["handover"]
+    matrix = log.handover()
     assert words["columns"] == ["go", "stay"]
     assert [row["name"] for row in words["rows"]] == ["start of an episode", "go", "stay"]
     for i, row in enumerate(words["rows"]):
@@ -87,7 +87,7 @@ def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> 
             for row in range(len(log))}  # fmt: skip
     for shot, seen in reached:
         assert seen.tolist() == ends[shot.seed, len(shot.actions)]
-    cells = made.data["hand_over"]["cells"]
+    cells = made.data["handover"]["cells"]
     assert {clip["done"] for cell in cells.values() for clip in cell["clips"]} == {True, False}
     for cell in cells.values():
         for clip in cell["clips"]:
@@ -96,14 +96,14 @@ def test_calls_are_played_again_as_they_were(log: CallLog, monkeypatch: Any) -> 
 
 
 def test_only_calls_whose_episodes_are_whole_are_played_again(log: CallLog) -> None:
-    assert hand_over._playable(log).all()
+    assert handover._playable(log).all()
     without_first = log.take(np.flatnonzero((log.order > 0) | (log.episode > 0)))
-    playable = hand_over._playable(without_first)
+    playable = handover._playable(without_first)
     assert (playable == (without_first.episode > 0)).all()
     unknown = replace(log, seed=np.full(len(log), -1))
     made = section(unknown)
     assert (made.context["hand_film"], made.missing) == (None, [])
-    assert all(cell["clips"] == [] for cell in made.data["hand_over"]["cells"].values())
+    assert all(cell["clips"] == [] for cell in made.data["handover"]["cells"].values())
 
 
 def test_an_environment_that_does_another_thing_is_not_filmed(
@@ -113,7 +113,7 @@ def test_an_environment_that_does_another_thing_is_not_filmed(
     made = section(log)
     assert made.context["hand_film"] is None
     assert "it does not repeat itself" in made.missing[0]
-    assert made.missing[0].startswith("There is no film of hand-overs: ")
+    assert made.missing[0].startswith("There is no film of handovers: ")
 
 
 def test_a_log_from_elsewhere_may_hold_anything(log: CallLog) -> None:
@@ -127,10 +127,10 @@ def test_a_log_from_elsewhere_may_hold_anything(log: CallLog) -> None:
 
 
 def test_few_points_and_a_short_film_of_many_calls(log: CallLog, monkeypatch: Any) -> None:
-    monkeypatch.setattr(hand_over, "MOST_POINTS", 60)
-    monkeypatch.setattr(hand_over, "MOST_FILMED", 6)
-    monkeypatch.setattr(hand_over, "MOST_FRAMES", 4)
-    data = section(log).data["hand_over"]
+    monkeypatch.setattr(handover, "MOST_POINTS", 60)
+    monkeypatch.setattr(handover, "MOST_FILMED", 6)
+    monkeypatch.setattr(handover, "MOST_FRAMES", 4)
+    data = section(log).data["handover"]
     assert max(map(len, data["points"].values())) <= 60 // len(data["points"]) + 1
     assert sum(len(cell["clips"]) for cell in data["cells"].values()) in (1, 2, 3)
     assert data["names"] == ["obs[0]", "obs[1]"]
@@ -141,8 +141,8 @@ def test_a_log_of_images_has_no_chart(log: CallLog) -> None:
             for name in ("start", "next_obs")}  # fmt: skip
     space = gym.spaces.Box(-1, 1, (70,), np.float32)
     data = section(replace(log, observation_space=space, **flat), filmed=False)
-    assert data.data["hand_over"]["names"] == []
-    assert data.context["hand_over"]["where"]["rows"] == []
+    assert data.data["handover"]["names"] == []
+    assert data.context["handover"]["where"]["rows"] == []
 
 
 @pytest.mark.slow
@@ -152,8 +152,8 @@ def test_the_page_has_it_where_the_run_has_a_log(run: Run, log: CallLog) -> None
     text = Path(page["path"]).read_text()
     assert page["missing"] == []
     assert 'id="hand-film"' in text
-    assert "Hand-over: does the next skill work?" in text
+    assert "Handover: does the next skill work?" in text
     (run.path / CALLS).write_bytes(b"damaged")
     page = run.report(episodes=1, films=0, quiet=True)
-    assert "There is no hand-over: " in page["missing"][0]
-    assert 'id="hand-over"' not in Path(page["path"]).read_text()
+    assert "There is no handover: " in page["missing"][0]
+    assert 'id="handover"' not in Path(page["path"]).read_text()

@@ -1,4 +1,4 @@
-"""Hand-over: how often each skill succeeds after each other one, and chains of skills."""
+"""Handover: how often each skill succeeds after each other one, and chains of skills."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.lacking import read_log
 from skillweave.planning.mission import Mission
-from skillweave.planning.neighbours import nearest
+from skillweave.planning.neighbors import nearest
 from skillweave.planning.predicates import as_event
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import weights_of
@@ -28,11 +28,11 @@ START = "start"
 """The row of calls that begin an episode."""
 Z = 1.96
 """Standard deviations of a 95 % interval."""
-NEIGHBOURS = 5
+NEIGHBORS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class HandOver:
+class Handover:
     """Counts of calls and of those that were done, by the skill before.
 
     Attributes:
@@ -84,9 +84,9 @@ class HandOver:
         return float(self.rate[place]), int(self.calls[place])
 
     def weakest(self, least: int = 20) -> list[str]:
-        """Return sentences on the skills that are never done, and on weak hand-overs.
+        """Return sentences on the skills that are never done, and on weak handovers.
 
-        A hand-over is weak where a skill is done much less often after one skill than elsewhere.
+        A handover is weak where a skill is done much less often after one skill than elsewhere.
 
         Args:
             least: the fewest calls that count.
@@ -182,7 +182,7 @@ class Chain:
     estimate: float
     """Along logged calls: from where each call ended, the nearest calls of the next skill."""
     product: float
-    """The product of the rates of the hand-over matrix; NaN where a pair has no call."""
+    """The product of the rates of the handover matrix; NaN where a pair has no call."""
     rates: tuple[float, ...]
     """The factors of the product."""
     calls: tuple[int, ...]
@@ -219,7 +219,7 @@ def before_each(log: CallColumns, won: Array, only_after_done: bool = True) -> A
 
     Args:
         won: (C,) bool, the calls that were done.
-        only_after_done: as for ``CallLog.hand_over``.
+        only_after_done: as for ``CallLog.handover``.
     """
     before = np.full(len(log), -1)
     following = log.followed_by
@@ -310,9 +310,9 @@ class LinkedCalls(CallColumns):
     """Calls, counted by the skill before."""
 
     @checked_names
-    def hand_over(
+    def handover(
         self, done: Mapping[str, Any] | None = None, *, only_after_done: bool = True
-    ) -> HandOver:
+    ) -> Handover:
         """Count how often each skill is done after each other one.
 
         A row counts the calls that follow a call of its skill. Calls that the episode's time limit
@@ -339,7 +339,7 @@ class LinkedCalls(CallColumns):
             for name, judged in zip(self.skills, self.own_success, strict=True)
             if not judged and name not in (done or {})
         )
-        return HandOver(self.skills, calls, did, cut, by_itself)
+        return Handover(self.skills, calls, did, cut, by_itself)
 
     @checked_names
     def chain(
@@ -353,7 +353,7 @@ class LinkedCalls(CallColumns):
 
         Args:
             *skills: names, in their order.
-            done: as for ``hand_over``.
+            done: as for ``handover``.
             features: as for ``Planner``.
 
         Raises:
@@ -380,7 +380,7 @@ class LinkedCalls(CallColumns):
         for i in reversed(range(len(skills) - 1)):
             here = maps[numbers[i + 1]]
             starts, ends = here(self.start[rows[i + 1]]), here(self.end[rows[i]])
-            near, distance = nearest(starts, ends, NEIGHBOURS, rows[i + 1])
+            near, distance = nearest(starts, ends, NEIGHBORS, rows[i + 1])
             follows = (weights_of(distance) * chance[near]).sum(1)
             may = self.may_follow[rows[i]].reshape(len(rows[i]), len(self.skills), -1)
             goes_on = won[rows[i]] & ~self.terminated[rows[i]]
@@ -391,7 +391,7 @@ class LinkedCalls(CallColumns):
                     "done (its initiation() is False there), so this chain cannot be run"
                 )
             chance = np.where(follows_on, follows, 0.0)
-        matrix = self.hand_over(done)
+        matrix = self.handover(done)
         pairs = [matrix.of(b, a) for a, b in zip((START, *skills), skills, strict=False)]
         rates = tuple(rate for rate, _ in pairs)
         return Chain(
