@@ -23,6 +23,7 @@ from skillweave.collecting.learners import Alone, Calling
 from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
+from skillweave.experience import Sample
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -560,3 +561,30 @@ def random_critic(algorithm: Any, state: Any) -> None:
     weight = algorithm.layout.views(state.params)[f"{algorithm.critic_net.head}.weight"]
     drawn = torch.randn(weight.shape[1:], generator=torch.Generator().manual_seed(0))
     weight.copy_(drawn / len(drawn) ** 0.5)
+
+
+def transitions(
+    space: gym.Space[Any],
+    lead: tuple[int, int],
+    width: int = 3,
+    *,
+    masked: bool = False,
+    weighted: bool = True,
+    seed: int = 0,
+) -> Sample:
+    """Random ones, ``lead`` of them: the first of each member ends its episode."""
+    g = torch.Generator().manual_seed(seed)
+    choices = getattr(space, "n", 0)
+    allowed = torch.rand(2, *lead, choices, generator=g) < 0.5
+    allowed[..., 1:2] = True
+    masks = allowed if masked else (None, None)
+    discount = torch.full(lead, 0.9)
+    discount[:, 0] = 0.0
+    forces = torch.rand(*lead, *(space.shape or ()), generator=g) * 2 - 1
+    return Sample(
+        obs=torch.randn(*lead, width, generator=g),
+        action=torch.randint(choices, lead, generator=g) if choices else forces,
+        reward=torch.randn(lead, generator=g), discount=discount,
+        next_obs=torch.randn(*lead, width, generator=g), mask=masks[0], next_mask=masks[1],
+        weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
+    )  # fmt: skip
