@@ -28,15 +28,15 @@ from skillweave.ops.returns import td_target
 from skillweave.seeding import Seeds
 from skillweave.spaces import obs_codec
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 TOGETHER: list[tuple[type, str, object, str]] = [
-    *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN, SAC)),
+    *((kind, "buffer_size", 15, r"at least 16 \(num_envs·\(n_step\+1\)\)") for kind in (DQN,)),
     (TD3, "buffer_size", 31, r"at least 32 \(num_envs·\(n_step\+1\)\)"),
     *((kind, "network", Network(rnn=RNN()), "without rnn: only PPO supports recurrent networks")
-      for kind in (DQN, TD3, SAC)),
-    *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, SAC, PPO)),
+      for kind in (DQN, SAC)),
+    *((kind, "critic", Network(rnn=RNN()), "without rnn") for kind in (TD3, PPO)),
     *((kind, "critic", Network(planes="last"), "without planes: Network.planes of network counts "
-       "for both") for kind in (TD3, SAC, PPO)),
+       "for both") for kind in (SAC, PPO)),
     (DQN, "v_max", -10.0, r"more than v_min \(-10\.0\)"),
     (DQN, "v_max", None, r"a finite number where v_min is one \(-10\.0\)"),
     (DQN, "v_min", None, r"a finite number where v_max is one \(0\.0\)"),
@@ -70,6 +70,7 @@ def test_settings_survive_json(config):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
+        ({"algorithm": "SARSA"}, "'SARSA'.*PPO"),
         ({"momentum": 1}, "SAC has no field momentum"),
         ({"network": {"cnn": {"depth": 3}}}, r"SAC\.network\.cnn has no field depth"),
         ({"network": {"rnn": {"kind": "elman"}}}, r"rnn\.kind is 'elman'; .* lstm, gru"),

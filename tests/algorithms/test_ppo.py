@@ -13,7 +13,6 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalize
@@ -450,26 +449,7 @@ def test_a_small_rollout_needs_no_batch_size_of_its_own():
     assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
 
 
-def test_the_kl_schedule_asks_for_its_target():
-    with pytest.raises(DeclarationError, match=r"PPO\.target_kl is None; .* 'kl'"):
-        PPO(learning_rate_schedule="kl")
-
-
 def test_settings_survive_json():
     config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
     assert config_from_json(config_to_json(config)) == config
     assert config_from_json(config_to_json(PPO())) == PPO()
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"algorithm": "SARSA"}, "'SARSA'.*PPO"),
-        ({"momentum": 1}, "no field momentum"),
-        ({"gamma": 2.0}, r"PPO\.gamma"),
-        ({"network": {"hidden": [8], "depth": 3}}, "depth"),
-    ],
-)
-def test_unknown_settings_in_json_are_named(change, says):
-    with pytest.raises(RunError, match=says):
-        config_from_json({**config_to_json(PPO()), **change})
