@@ -1,7 +1,6 @@
 """Typical mistakes of newcomers, and unusual but legal ways: what comes of each.
 
 A mistake ends in an error of a kind, which names the thing, or in a warning; what is legal works.
-``test_errors_kinds.py`` has mistakes whose words are of no interest.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import torch
 from safetensors.torch import load_file
 
 import skillweave as sw
+from skillweave import recipes
 from skillweave.errors import KINDS, SkillweaveError
 from skillweave.selectors.ready import FunctionSelector
 
@@ -150,6 +150,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         "EnvError",
         "sutton_bartow_reward",
     ),
+    "no success to reach": (
+        lambda: sw.train_agent(
+            "CartPole-v1", SMALL, 256, target_success=0.9, eval_every=128, eval_episodes=2
+        ),
+        "EnvError",
+        "target_success",
+    ),
     # What a skill's methods return
     "reward (N, 1)": (
         lambda: with_skill(reward=lambda _, step: step.next_obs[:, :1]),
@@ -236,6 +243,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         lambda: with_skill(reward=lambda _, step: None),
         "SkillError",
         "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
+    ),
+    "a reflex of floats": (
+        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] + 9.5, 0)]),
+        "SkillError",
+        "yes or no (bool) is needed",
     ),
     "termination is one bool": (
         lambda: with_skill(termination=lambda _, step: False),
@@ -331,6 +343,31 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         lambda: sw.Hierarchy("CartPole-v1", []),
         "DeclarationError",
         "needs at least one skill",
+    ),
+    "a skill without a name": (
+        lambda: declare(skills=[skill(name="")]),
+        "DeclarationError",
+        "set the class attribute 'name'",
+    ),
+    "skills that never end": (
+        lambda: declare(call_steps=None),
+        "DeclarationError",
+        "give it max_steps or termination()",
+    ),
+    "a function as a reflex": (
+        lambda: declare(reflexes=[zeros]),
+        "DeclarationError",
+        "an instance of Reflex",
+    ),
+    "a policy's class": (
+        lambda: declare(skills=[skill(policy=sw.PPO)]),
+        "DeclarationError",
+        "skill 's': policy is the class",
+    ),
+    "an unknown recipe": (
+        lambda: recipes.load("no_such_recipe"),
+        "DeclarationError",
+        "no recipe or Python file 'no_such_recipe'",
     ),
     "misspelt keyword of Hierarchy": (
         lambda: declare(skill_step=5),

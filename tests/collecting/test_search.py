@@ -14,7 +14,7 @@ from toys import alone_in
 from skillweave.collecting.search import Search, Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.policies.core import World
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -124,7 +124,7 @@ def test_where_no_starter_may_start_chance_acts():
 
 def test_without_starters_it_says_that_chance_found_nothing():
     collector = collector_of()
-    with pytest.raises(SkillweaveError, match="steps of random acting"):
+    with pytest.raises(TrainingError, match="steps of random acting"):
         collector.collect(next(requests(6_000)))
 
 

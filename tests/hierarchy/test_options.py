@@ -25,7 +25,7 @@ from skillweave.algorithms.config import PPO
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillError, SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -85,7 +85,7 @@ def test_a_call_that_nothing_ends_is_told_and_not_waited_for(options, monkeypatc
 
     env = options(skill_set(Eternal, call_steps=None), env=endless, num_envs=2)
     env.reset(seed=0)
-    with pytest.raises(SkillweaveError, match="skill 'eternal' has run for 2 steps in environ"):
+    with pytest.raises(SkillError, match="skill 'eternal' has run for 2 steps in environ"):
         env.step(np.zeros(2, np.int64))
 
 
@@ -166,10 +166,6 @@ class Sampler(ScriptedPolicy):
 
 class Die(Skill):
     policy = Sampler(None, Walk.observation_space, Walk.action_space)
-
-
-class Agent(Skill):
-    policy = None
 
 
 def agent(seed: int, observation_space=Walk.observation_space, actions: int = 3) -> AgentPolicy:

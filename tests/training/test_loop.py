@@ -32,7 +32,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
@@ -489,7 +489,7 @@ def test_a_checkpoint_of_other_environments_is_refused():
 @pytest.mark.parametrize("overlap", [True, False])
 def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(on_tick, overlap):
     with pytest.raises(
-        SkillweaveError, match=r"of member 0 is nan at update 1: training has diverged"
+        TrainingError, match=r"of member 0 is nan at update 1: training has diverged"
     ):
         train(Broken(16), 3, replace(CONFIG, overlap=overlap), on_tick=on_tick)
 
