@@ -202,13 +202,6 @@ def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
         collector.collect(next(asked))
 
 
-@pytest.mark.parametrize("method", ["initiation", "termination"])
-def test_a_wrong_shape_names_the_skill_and_the_method(method):
-    wrong = type("Wrong", (Left,), {method: lambda self, x: np.zeros((2, 1), bool)})
-    with pytest.raises(SkillweaveError, match=rf"'wrong'.*{method}\(\).*shape"):
-        collector_of(skill_set(wrong)).collect(next(requests(1)))
-
-
 def test_a_termination_that_is_no_flag_names_the_environment():
     class Half(Left):
         def termination(self, step):

@@ -178,7 +178,6 @@ def learnt(tmp_path_factory):
     [
         ({"acts": (0, 2)}, r"acts was '0:2', and here it is \[0, 2\]"),
         ({"sees": (1, 2)}, r"sees was .*'arm'.*, and here it is .*\[1, 2\]"),
-        ({"sees": sw.Part("arm", scale=2.0)}, r"sees was .*, and here it is .*'scale': 2"),
         ({"policy": sw.Residual(lambda obs: np.zeros((len(obs), 2)))}, "residual was None.* 0.2"),
     ],
 )
