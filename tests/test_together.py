@@ -29,7 +29,6 @@ from small_runs import (
 )
 
 from skillweave import SAC, EnvSpec, Hierarchy, Lengths, Skill, SkillweaveError, Together
-from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.applying import differences
 from skillweave.evolution import Evolution, Mutations
@@ -426,12 +425,6 @@ def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
     assert getattr(stage.config, name) == 0.5
     assert stage.config.epsilon == 0.7
     declare(learn="apart", selector=replace(ON, **{name: 0.5})).stages()
-
-
-@pytest.mark.parametrize("make", [Together, SkillCritic])
-def test_a_floor_falls_over_a_share_of_the_budget(make):
-    with pytest.raises(SkillweaveError, match=r"epsilon_fraction is 1\.5"):
-        make(epsilon_fraction=1.5)
 
 
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():

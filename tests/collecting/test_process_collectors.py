@@ -231,42 +231,6 @@ def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
         Collectors([deciding()(6, 0)]).restore(apart.state())
 
 
-class Always(Mortal):
-    """Kills its process in each third step of an episode."""
-
-    def step(self, action):
-        if self.t == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().step(action)
-
-
-def test_one_that_dies_again_at_the_same_place_is_told(in_processes):
-    collectors = in_processes(stepping(Always))
-    collectors.start(Seeds(0))
-    with pytest.raises(SkillweaveError, match=r"worker 0 \(environments 0 to 2\) died by signal 9"):
-        collectors.collect(next(requests(5)))
-
-
-class Unpicklable(Exception):
-    def __reduce__(self):
-        raise TypeError("cannot be pickled")
-
-
-class Failing(Again):
-    def step(self, action):
-        if self.t == 2:
-            raise Unpicklable("the arm is stuck")
-        return super().step(action)
-
-
-def test_an_error_names_environment_step_and_worker(in_processes):
-    collectors = in_processes(stepping(Failing))
-    collectors.start(Seeds(0))
-    match = r"environment [0-5], step 3.*the arm is stuck.*worker [01]"
-    with pytest.raises(SkillweaveError, match=match):
-        collectors.collect(next(requests(5)))
-
-
 class Stuck(Again):
     def step(self, action):
         time.sleep(60)
@@ -279,14 +243,6 @@ def test_closing_ends_workers_that_are_stuck(in_processes):
     workers = [w.process for w in collectors._workers]
     collectors.close()
     assert not any(w.is_alive() for w in workers)
-
-
-def test_an_environment_that_cannot_be_made_is_told():
-    def broken(num_envs, first):
-        raise SkillweaveError("no such maze")
-
-    with pytest.raises(SkillweaveError, match="no such maze"):
-        ProcessCollectors(broken, 2, 2, 1, "Maze")
 
 
 def test_environments_that_cannot_be_shared_out_equally_are_refused():

@@ -244,9 +244,16 @@ def test_parts_that_are_not_there_are_named(sees, says):
         make_algorithm(PPO(network=Network(sees=sees)), ROBOT, Discrete(2))
 
 
-def test_an_observation_without_parts_has_no_keys():
-    with pytest.raises(DeclarationError, match=r"names 'speed'.*does not exist; it has no parts"):
-        make_algorithm(PPO(network=Network(sees="speed")), Box(-1, 1, (3,)), Discrete(2))
+@pytest.mark.parametrize(
+    ("sees", "space", "says"),
+    [
+        ("speed", Box(-1, 1, (3,)), r"names 'speed'.*does not exist; it has no parts"),
+        ((3, 1), Box(0, 255, (12, 12, 3), np.uint8), "3 .* has no number beside its images"),
+    ],
+)
+def test_an_observation_without_parts_or_numbers_says_so(sees, space, says):
+    with pytest.raises(DeclarationError, match=says):
+        make_algorithm(PPO(network=Network(sees=sees)), space, Discrete(2))
 
 
 def test_images_are_seen_beside_the_numbers():

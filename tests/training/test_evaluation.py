@@ -397,10 +397,9 @@ def test_without_a_limit_the_environments_own_counts_or_the_longest_episode(monk
     ("wrong", "says"),
     [
         ({"episodes": "x"}, "episodes is 'x'; it must be a whole number"),
-        ({"episodes": 1.5}, "episodes is 1.5"),
         ({"seed": None}, "seed is None"),
         ({"seed": -1}, "seed is -1; it must be at least 0"),
-        ({"seed": 1.5}, "seed is 1.5"),
+        ({"seed": 10**30}, r"seed is 10+; it must be below 2\^43"),
         ({"max_steps": 0}, "max_steps is 0; it must be at least 1"),
         ({"num_envs": True}, "num_envs is True"),
     ],
@@ -427,18 +426,6 @@ def test_a_policy_made_for_other_spaces_is_told_both(observation, action, says):
         evaluate(policy, EnvSpec("CartPole-v1"), episodes=1)
 
 
-@pytest.mark.parametrize("episodes", [0, -3])
-def test_at_least_one_episode_is_played(episodes):
-    with pytest.raises(SkillweaveError, match=f"episodes is {episodes}"):
-        evaluate(fixed(0), EnvSpec(Line), episodes=episodes)
-
-
-@pytest.mark.parametrize("num_envs", [0, -1])
-def test_at_least_one_environment_is_needed(num_envs):
-    with pytest.raises(SkillweaveError, match="num_envs"):
-        evaluate(fixed(0), EnvSpec(Line), episodes=2, num_envs=num_envs)
-
-
 def test_evaluation_is_on_gymnasiums_environment_whatever_trains_it():
     pytest.importorskip("envpool")
     policy = agent("CartPole-v1")
@@ -447,14 +434,3 @@ def test_evaluation_is_on_gymnasiums_environment_whatever_trains_it():
         for engine in ("sync", "envpool")
     ]
     assert results[0] == results[1]
-
-
-def test_a_seed_that_fits_into_no_64_bits_is_refused():
-    policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), *_cartpole())
-    with pytest.raises(SkillweaveError, match=r"seed is 10+; it must be below 2\^43"):
-        evaluate(policy, EnvSpec("CartPole-v1"), episodes=1, seed=10**30)
-
-
-def _cartpole():
-    env = EnvSpec("CartPole-v1").make()
-    return env.observation_space, env.action_space
