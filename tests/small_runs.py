@@ -121,6 +121,17 @@ def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
     return found
 
 
+def acts(policy: Any, size: int = 4, steps: int = 40) -> list[Any]:
+    """What a hierarchy does, and which skills act, in 16 environments of so many numbers."""
+    rng, memory, found = np.random.default_rng(0), policy.start(16), []
+    for _ in range(steps):
+        obs = rng.normal(size=(16, size)).astype(np.float32)
+        action, memory = policy.act(memory, obs)
+        found.append((action.tolist(), policy.acting(memory).tolist()))
+        memory["end"][:] = rng.random(16) < 0.5
+    return found
+
+
 def lines(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import pickle
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import Collectors
@@ -24,6 +24,7 @@ from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
 from skillweave.experience import Sample
+from skillweave.networks.stacked import Layout
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
@@ -588,3 +589,35 @@ def transitions(
         next_obs=torch.randn(*lead, width, generator=g), mask=masks[0], next_mask=masks[1],
         weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
     )  # fmt: skip
+
+
+def network_of(
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    seed: int = 0,
+    **settings: Any,
+) -> AgentPolicy:
+    """A fresh network, its weights made large enough to act in more than one way."""
+    config = PPO(num_envs=1, n_steps=1, batch_size=1, **settings)
+    algorithm = make_algorithm(config, observation_space, action_space)
+    state = algorithm.init([Seeds(seed)])
+    with torch.no_grad():
+        state.params[:] = 5 * state.params
+        state.obs_mean[:], state.obs_var[:] = 0.3, 2.0
+    return AgentPolicy.of(algorithm, state)
+
+
+def drawn(net: Any, members: int, *args: Any) -> tuple[Layout, torch.Tensor]:
+    """The layout of a network, and weights of its members (members, size)."""
+    layout = Layout(net.shapes)
+    flat = torch.zeros(members, layout.size)
+    generators = [torch.Generator().manual_seed(m) for m in range(members)]
+    net.init_(layout.views(flat), *args, generators)
+    return layout, flat
+
+
+def members_of(x: Any, rows: slice) -> Any:
+    """The members ``rows`` of a state or a rollout, as a copy."""
+    values = {f.name: getattr(x, f.name) for f in fields(x)}
+    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
+    return type(x)(**{**values, **copied})

@@ -5,7 +5,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch import nn
-from toys import Echo, learn, random_critic, training
+from toys import Echo, learn, members_of, random_critic, training
 
 from skillweave.algorithms.config import (
     PPO,
@@ -37,13 +37,6 @@ def make(action=None, members=1, **settings) -> tuple[PPOAlgorithm, State]:
 
 def rngs(*seeds: int | Seeds) -> list[torch.Generator]:
     return [(s if isinstance(s, Seeds) else Seeds(s)).torch() for s in seeds]
-
-
-def members_of(x, rows: slice):
-    """The members ``rows`` of a State or Rollout, as a copy."""
-    values = {f.name: getattr(x, f.name) for f in fields(x)}
-    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
-    return type(x)(**{**values, **copied})
 
 
 def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool = False) -> Rollout:

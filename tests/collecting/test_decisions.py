@@ -5,22 +5,11 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from calls.cases import SEEN, SkillCase, skill_of
-from reference_calls import (
-    Counter,
-    Left,
-    Right,
-    T,
-    Walk,
-    Zigzag,
-    scripted,
-)
+from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag, scripted
 from toy_acting import Again, Choices, Given, requests
-from toys import alone_in, calling_in
+from toys import alone_in, calling_in, network_of
 
-from skillweave.algorithms.config import PPO
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -28,6 +17,7 @@ from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 
+SPACES = Walk.observation_space, Walk.action_space
 N, ALL = 4, (Left, Right, Zigzag, Counter)
 
 
@@ -217,31 +207,9 @@ def test_a_termination_that_is_no_flag_names_the_environment():
 # Skills that sample ----------------------------------------------------------------------------
 
 
-class Sampler(ScriptedPolicy):
-    """Greedy: 0; else a die."""
-
-    def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
-        n = len(obs)
-        return np.zeros(n, np.int64) if deterministic else rng.integers(3, size=n), memory
-
-
-class Die(Skill):
-    policy = Sampler(None, Walk.observation_space, Walk.action_space)
-
-
-def network():
-    """A fresh network's policy."""
-    config = PPO(num_envs=1, n_steps=1, batch_size=1)
-    algorithm = make_algorithm(config, Walk.observation_space, Walk.action_space)
-    state = algorithm.init([Seeds(0)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-    return AgentPolicy.of(algorithm, state)
-
-
 @pytest.mark.parametrize("kind", ["scripted", "network"])
 def test_what_skills_draw_follows_from_the_requests_seeds(kind):
-    policies = (Die.policy if kind == "scripted" else network(), Zigzag.policy)
+    policies = (Die.policy if kind == "scripted" else network_of(*SPACES), Zigzag.policy)
 
     def play(first, greedy):
         skills = SkillSet((Die(), Zigzag()), policies, call_steps=4, greedy=greedy)

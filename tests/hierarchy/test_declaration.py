@@ -9,7 +9,8 @@ import pytest
 import torch
 from declaring import plainly, skills_with
 from gymnasium.spaces import Box, Dict, Discrete, Text
-from small_runs import stage_entry
+from small_runs import acts, stage_entry
+from toys import network_of
 
 from skillweave import (
     DQN,
@@ -23,7 +24,7 @@ from skillweave import (
     SkillweaveError,
     recipes,
 )
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Run
 from skillweave.cli.overrides import apply_overrides, list_settings
 from skillweave.errors import DeclarationError
@@ -32,7 +33,6 @@ from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.weights import open_weights, read_weights, write_weights
 from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.stage import check_stages
 
@@ -298,14 +298,7 @@ def test_a_ready_policy_has_no_settings_to_list():
 
 
 def agent(seed: int, actions: int = 2, **settings) -> AgentPolicy:
-    config = PPO(num_envs=1, n_steps=1, batch_size=1, network=Network(hidden=(8, 8)), **settings)
-    algorithm = make_algorithm(config, OBS, Discrete(actions))
-    state = algorithm.init([Seeds(seed)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-        state.obs_mean[:] = 0.3
-        state.obs_var[:] = 2.0
-    return AgentPolicy.of(algorithm, state)
+    return network_of(OBS, Discrete(actions), seed, network=Network((8, 8)), **settings)
 
 
 def trained(d: Hierarchy) -> HierarchyPolicy:
@@ -315,16 +308,6 @@ def trained(d: Hierarchy) -> HierarchyPolicy:
 
 def read(d: Hierarchy, path: Path) -> HierarchyPolicy:
     return read_weights(roles_of(d), *open_weights(path), path)[1]
-
-
-def acts(policy, steps: int = 30) -> list:
-    rng, memory, found = np.random.default_rng(0), policy.start(16), []
-    for _ in range(steps):
-        obs = rng.normal(size=(16, 4)).astype(np.float32)
-        action, memory = policy.act(memory, obs)
-        found.append((action.tolist(), policy.acting(memory).tolist()))
-        memory["end"][:] = rng.random(16) < 0.5
-    return found
 
 
 @pytest.mark.parametrize("skills", [(Center, Lean), (Center, Ready, Lean)])

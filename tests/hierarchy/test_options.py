@@ -8,32 +8,20 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from reference_calls import (
-    EPISODE,
-    POSITION,
-    TAG,
-    Counter,
-    Left,
-    Right,
-    T,
-    Walk,
-    Zigzag,
-)
-from toys import cartpole
+from reference_calls import EPISODE, POSITION, TAG, Counter, Die, Left, Right, T, Walk, Zigzag
+from toys import cartpole, network_of
 
-from skillweave.algorithms.config import PPO
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillError, SkillweaveError
 from skillweave.hierarchy.options import OptionsEnv
-from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.types import Step
 
 torch.set_num_threads(1)
 N = 5
+SPACES = Walk.observation_space, Walk.action_space
 ALL = (Left, Right, Zigzag, Counter)
 
 
@@ -146,32 +134,10 @@ def test_a_wrong_shape_names_the_skill_and_the_method(options, method):
 # Stochastic skills ---------------------------------------------------------------------------
 
 
-class Sampler(ScriptedPolicy):
-    """Greedy: 0; else a die."""
-
-    def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
-        n = len(obs)
-        return np.zeros(n, np.int64) if deterministic else rng.integers(3, size=n), memory
-
-
-class Die(Skill):
-    policy = Sampler(None, Walk.observation_space, Walk.action_space)
-
-
-def agent(seed: int, observation_space=Walk.observation_space, actions: int = 3) -> AgentPolicy:
-    """A fresh network's policy."""
-    config = PPO(num_envs=1, n_steps=1, batch_size=1)
-    algorithm = make_algorithm(config, observation_space, gym.spaces.Discrete(actions))
-    state = algorithm.init([Seeds(seed)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-    return AgentPolicy.of(algorithm, state)
-
-
 @pytest.mark.parametrize("kind", ["scripted", "network"])
 def test_skills_that_sample_are_reproduced_by_the_seed(options, walks, kind):
     skills = (Die(), Zigzag())
-    policies = (Die.policy if kind == "scripted" else agent(0), Zigzag.policy)
+    policies = (Die.policy if kind == "scripted" else network_of(*SPACES), Zigzag.policy)
 
     def play(seed: int, greedy: bool) -> list:
         env = options(SkillSet(skills, policies, call_steps=4, greedy=greedy), walks)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from torch.nn import functional as F
+from toys import drawn
 
 from skillweave.algorithms.config import (
     DQN,
@@ -33,9 +34,7 @@ OBS = obs_codec(Box(-1, 1, (5,)))
 
 
 def made(net, *args) -> tuple[Layout, torch.Tensor]:
-    layout = Layout(net.shapes)
-    flat = torch.zeros(P, layout.size)
-    net.init_(layout.views(flat), *args, [torch.Generator().manual_seed(m) for m in range(P)])
+    layout, flat = drawn(net, P, *args)
     flat += 0.1 * torch.randn(flat.shape, generator=torch.Generator().manual_seed(9))
     return layout, flat
 

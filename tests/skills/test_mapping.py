@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
-from skills.mapped_models import ACTION, SPACE, observations, onnx_model, weights
+from skills.mapped_models import ACTION, SPACE, fit, observations, onnx_model, weights
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError
@@ -19,10 +19,6 @@ from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
 from skillweave.spaces import obs_codec, obs_dtype, to_tensor
 from skillweave.types import Array
-
-
-def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
-    return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
 
 
 def seen(sees: Any, space: Any = SPACE, obs: Any = None, **more: Any) -> Array:

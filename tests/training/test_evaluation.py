@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from toys import network_of
 
-from skillweave import PPO, EnvSpec, Skill, SkillweaveError, envpool, evaluate
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave import EnvSpec, Skill, SkillweaveError, envpool, evaluate
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs import checks
 from skillweave.errors import PolicyError
 from skillweave.hierarchy.policy import HierarchyPolicy
-from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED, interquartile_mean
 from skillweave.types import Evaluation
@@ -29,14 +29,8 @@ def spaces(env_id: str) -> tuple:
     return env.observation_space, env.action_space
 
 
-def agent(env_id: str, seed: int = 0) -> AgentPolicy:
-    """A fresh network, its weights made large enough to act in more than one way."""
-    config = PPO(num_envs=1, n_steps=1, batch_size=1)
-    algorithm = make_algorithm(config, *spaces(env_id))
-    state = algorithm.init([Seeds(seed)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-    return AgentPolicy.of(algorithm, state)
+def agent(env_id: str) -> AgentPolicy:
+    return network_of(*spaces(env_id))
 
 
 def lander() -> ScriptedPolicy:
