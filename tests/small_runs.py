@@ -178,6 +178,15 @@ def stopped_again(hierarchy: Hierarchy, path: Path, tick: int) -> RunDirectory:
     return _stopped(hierarchy, RunDirectory.open(path), tick)
 
 
+def goes_on(hierarchy: Callable[[], Hierarchy], folder: Path, tick: int = 3) -> Run:
+    """A whole run: one that is stopped at a tick, and resumed, ends with the same weights."""
+    whole = hierarchy().train(folder / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), folder / "cut", tick)
+    hierarchy().resume(folder / "cut", quiet=True)
+    assert_same(folder / "cut", whole.path)
+    return whole
+
+
 def _stopped(hierarchy: Hierarchy, run: RunDirectory, tick: int) -> RunDirectory:
     try:
         with pytest.raises(Stopped):

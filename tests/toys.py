@@ -621,3 +621,21 @@ def members_of(x: Any, rows: slice) -> Any:
     values = {f.name: getattr(x, f.name) for f in fields(x)}
     copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
     return type(x)(**{**values, **copied})
+
+
+class SideBySide:
+    """Environments as a pool, for tests that play them one by one as well."""
+
+    def __init__(self, envs: list[Any]) -> None:
+        self.envs = envs
+        self.observation_space = envs[0].observation_space
+        self.action_space = envs[0].action_space
+
+    def reset(self, ids: Any) -> Any:
+        return np.stack([self.envs[i].reset()[0] for i in ids]), {}
+
+    def step(self, action: Any, ids: Any) -> Any:
+        told = [self.envs[i].step(a) for i, a in zip(ids, action, strict=True)]
+        obs, reward, terminated, truncated, infos = zip(*told, strict=True)
+        info = {k: np.array([i[k] for i in infos]) for k in infos[0]}
+        return np.stack(obs), *map(np.array, (reward, terminated, truncated)), info

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_runs import assert_same, stopped_run
+from small_runs import goes_on
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
@@ -99,10 +99,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
             [Rest(), go_to(space)], selector=SELECTOR, learn=learn, steps=1500, train_defaults=OFTEN
         )
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(hierarchy, tmp_path)
 
 
 @pytest.mark.parametrize("learn", ["apart", "together"])
@@ -113,12 +110,9 @@ def test_skills_with_goals_inside(learn, tmp_path):
         still = type("Still", (Rest,), {})()
         return declared([inner, still], steps=1500, **how)
 
-    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    run = goes_on(hierarchy, tmp_path, 5)
     assert "inner/go_to" in run.evaluate(3).skills
     assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
-    stopped_run(hierarchy(), tmp_path / "cut", 5)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", run.path)
 
 
 def test_chosen_lengths_and_goals(tmp_path):
@@ -149,11 +143,8 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
         skills = [Sometimes(), go_to(space)]
         return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
-    stopped_run(hierarchy(), tmp_path / "cut", 4)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
     hierarchy("together").train(tmp_path / "together", seed=3, quiet=True)
 
 

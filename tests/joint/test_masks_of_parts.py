@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from reach import ON, SMALL, SPACES, Reach, Whole, reach
-from small_runs import assert_same, reports_every, stopped_run
+from small_runs import goes_on, reports_every
 from torch.distributions import Categorical, Normal
 
 import skillweave as sw
@@ -119,10 +119,7 @@ def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
         settings = sw.TrainDefaults(checkpoint_every=60)
         return reach(skills, env=masked("nested"), algorithm=algorithm, train_defaults=settings)
 
-    whole = declared().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(declared(), tmp_path / "cut", 3)
-    declared().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(declared, tmp_path)
 
 
 def test_choices_of_a_part_may_all_be_forbidden(tmp_path):

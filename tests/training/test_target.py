@@ -26,7 +26,6 @@ from skillweave import (
     TrainDefaults,
     train_agent,
 )
-from skillweave.envs import engine as engines
 from skillweave.evolution import Evolution
 from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
@@ -69,19 +68,6 @@ class Start(Skill):
 
 
 WALK = EnvSpec(Walk, engine="sync")
-
-
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Counts the steps that Gymnasium's engines make."""
-    count, plain = [0], engines.GymnasiumEngine.step
-
-    def step(self: Any, action: Any, ids: Any = None) -> Any:
-        count[0] += len(action)
-        return plain(self, action, ids)
-
-    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
-    return count
 
 
 @pytest.mark.fast_cases(1)
