@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import pickle
 import sys
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +31,9 @@ from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import pack
-from skillweave.training.episodes import Episodes
+from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack
-from skillweave.training.loop import Progress, resume, train
+from skillweave.training.loop import Progress, Saved, resume, train
 from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
 from skillweave.types import Array
 
@@ -555,6 +557,51 @@ def learn(
     made = training(algorithm, env, seeds, members, state=state, shared=shared)
     made.run(budget, **how)
     return algorithm, made.state
+
+
+class Cut(Exception):
+    """What interrupts a training here."""
+
+
+def goes_on(
+    algorithm: Algorithm, make: Callable[[], Toy], budget: int, every: int
+) -> tuple[Training, Saved, Callable[..., Training]]:
+    """What is cut at its second checkpoint, and resumed, learns and tells what a whole run does.
+
+    Returns:
+        The whole run, the second checkpoint, and a function of what is saved beside the state,
+        which resumes from there.
+    """
+    told: list[Tick] = []
+    whole = training(algorithm, make())
+    whole.run(budget, on_tick=told.append)
+    saved: list[Saved] = []
+    ticks: list[Tick] = []
+
+    def cut_at_second(found: Saved) -> None:
+        saved.append(replace(found, at=replace(found.at), states=[copied(found.states[0])]))
+        if len(saved) == 2:
+            raise Cut
+
+    how: dict[str, Any] = {"checkpoint_every": every, "on_tick": ticks.append}
+    with contextlib.suppress(Cut):
+        training(algorithm, make()).run(budget, on_checkpoint=cut_at_second, **how)
+
+    def resumed(extra: dict[str, Any]) -> Training:
+        at, state = saved[1].at, copied(saved[1].states[0])
+        now = Progress(at.update, at.steps)
+        found = training(algorithm, make(), state=state, goes_on_at=at.steps)
+        assert not len(found.resume(extra, now))
+        found.run(budget, resume_from=now, on_checkpoint=lambda saved: None, **how)
+        return found
+
+    state = resumed(saved[1].extra).state
+    for f in fields(state):
+        assert torch.equal(getattr(state, f.name), getattr(whole.state, f.name)), f.name
+        assert getattr(state, f.name).dtype == getattr(whole.state, f.name).dtype, f.name
+    said = [[(t.update, t.steps, t.metrics) for t in each] for each in (ticks, told)]
+    assert said[0] == said[1]
+    return whole, saved[1], resumed
 
 
 def random_critic(algorithm: Any, state: Any) -> None:

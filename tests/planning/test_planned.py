@@ -9,20 +9,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from planning.logs import log_of
-from planning.steps import step_to
+from planning.steps import at, step_to
 
 from skillweave.errors import PolicyError, SkillError
-from skillweave.planning import CallLog, GoalTask, Mission, Planner, Predicate, RewardMachine, held
+from skillweave.planning import CallLog, GoalTask, Mission, Planner, RewardMachine, held
 from skillweave.policies.core import LastCall, Turn, World, flat
 from skillweave.policies.planned import Planned
 from skillweave.skills.goal_spaces import choice_space
 from skillweave.spaces import obs_dtype
 
 LINE: Any = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-
-
-def at(*places: float) -> Predicate:
-    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
 
 
 def line(lengths: tuple[int, ...] = ()) -> CallLog:

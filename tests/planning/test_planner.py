@@ -9,8 +9,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from planning.logs import log_of
-from planning.steps import step_to
-from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
+from planning.steps import at, step_to
+from ready_selectors.chain import (
+    DOOR,
+    KEY,
+    PLACE,
+    SPEC,
+    Corridor,
+    GetKey,
+    Leave,
+    OpenDoor,
+    Wait,
+    has_key,
+)
 
 from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
 from skillweave.collecting.skill_set import SkillSet
@@ -38,10 +49,6 @@ from skillweave.types import Array, HierarchyPolicy
 
 GAMMA = 0.9
 LINE = 10
-
-
-def at(*places: float) -> Predicate:
-    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
 
 
 def moved(place: int, by: int) -> list[int]:
@@ -321,10 +328,6 @@ SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 def skill_set(**how: Any) -> SkillSet:
     return SkillSet(SKILLS, tuple(s.policy for s in SKILLS), **how)
-
-
-def has_key(obs: Array) -> Array:
-    return obs[:, KEY] == 1
 
 
 def open_door(obs: Array) -> Array:

