@@ -640,10 +640,6 @@ def changed(**attributes: Any) -> None:
 
 CHANGED = {
     "learn": ("jointly", "it must be one of"),
-    "call_steps": (0, "it must be a whole number of at least 1"),
-    "algorithm": ("PPO", "it must be the settings of an algorithm"),
-    "selector": (3, "selector is 3"),
-    "steps": (-4, "steps is -4"),
     "apart": ({"skill_steps": 5}, "write Apart(skill_steps=5)"),
     "skills": ([Good], "write Center(), not Center"),
     "reflexes": (None, "each entry an instance of Reflex"),

@@ -345,16 +345,6 @@ WRONG = {
         None,
         r"'left' cannot start with what it learnt in .*it has other networks here",
     ),
-    "activation": (
-        {"algorithm": replace(ON, network=Network((8,), "relu"))},
-        None,
-        r"'left'.*it has other networks here",
-    ),
-    "what it sees": (
-        {"algorithm": replace(ON, network=Network((8,), sees=(0, 1, 2, 3)))},
-        None,
-        r"'left'.*it has other networks here",
-    ),
     "another order": (
         {"skills": (Other, Left, Push)},
         None,

@@ -527,20 +527,6 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     assert found["length"] > 15
 
 
-WRONG = {
-    "learn is 'both'": {"learn": "both"},
-    "it must be a whole number of at least 1, Lengths": {"call_steps": 0},
-    "call_cost is -1": {"call_cost": -1},
-    "interrupt is 3": {"interrupt": 3},
-}
-
-
-@pytest.mark.parametrize("says", WRONG)
-def test_a_wrong_declaration_is_told(says):
-    with pytest.raises(SkillweaveError, match=says):
-        declare(**WRONG[says])
-
-
 @pytest.mark.parametrize("steps", [(), (0, 4), (4, 2), (1, 2.5), (..., 4), (1, ...)])
 def test_wrong_lengths_are_told(steps):
     with pytest.raises(SkillweaveError, match="Lengths"):

@@ -102,6 +102,12 @@ class Rememberer(gym.Env):
         return np.zeros(1, np.float32), change, False, False, {}
 
 
+def skills_of(*skills: Any, **how: Any) -> SkillSet:
+    """These skills, or those of these classes, each with its own policy."""
+    made = tuple(s() if isinstance(s, type) else s for s in skills)
+    return SkillSet(made, tuple(s.policy for s in made), **how)
+
+
 def alone_in(
     engine: Any, acting: Any, skill: Any = None, reflexes: Any = (), *starts: Any, **more: Any
 ) -> Collector:
@@ -287,7 +293,7 @@ class Calls(Toy):
 
     def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
         calls = tuple(Call(i, (1, 10)[i], self.allowed[i]) for i in range(2))
-        return calling_in(self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared)
+        return calling_in(self, acting, skills_of(*calls), shared)
 
     def play(self, action: Array) -> Any:
         reward = np.where(action == 1, 3 * (self.under_way == 0), 1)

@@ -1,5 +1,6 @@
 """What a selector learns from beside its calls, which tests/calls has: γ, success, info, errors."""
 
+import functools
 import itertools
 
 import gymnasium as gym
@@ -8,7 +9,7 @@ import pytest
 from calls.cases import SEEN, SkillCase, skill_of
 from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag, scripted
 from toy_acting import Again, Choices, Given, requests
-from toys import alone_in, calling_in, network_of
+from toys import alone_in, calling_in, network_of, skills_of
 
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
@@ -21,9 +22,7 @@ SPACES = Walk.observation_space, Walk.action_space
 N, ALL = 4, (Left, Right, Zigzag, Counter)
 
 
-def skill_set(*kinds, call_steps=5, **how):
-    skills = tuple(kind() for kind in kinds)
-    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **how)
+skill_set = functools.partial(skills_of, call_steps=5)
 
 
 def collector_of(skills, n=N, keep_rewards=False, env=Walk, acting=None, **spec):

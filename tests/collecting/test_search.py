@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from toy_acting import Choices, requests
-from toys import alone_in
+from toys import alone_in, skills_of
 
 from skillweave.collecting.search import Search, Starts
 from skillweave.collecting.skill_set import SkillSet
@@ -84,8 +84,7 @@ class Anywhere(Skill):
 def collector_of(
     *kinds, env=Corridor, skill=Far, start_calls=0, search_steps=None, episode_calls=1, **more
 ):
-    skills = tuple(kind() for kind in kinds)
-    starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
+    starters = skills_of(*kinds) if kinds else None
     engine = make_engine(EnvSpec(env, engine="sync"), N)
     how = start_calls, search_steps, episode_calls
     found = alone_in(engine, Choices(N, 5), skill(), (), starters, *how, **more)

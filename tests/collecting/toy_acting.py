@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 from reference_calls import EPISODE, Counter, Left, Right, Walk, Zigzag
-from toys import alone_in, calling_in
+from toys import alone_in, calling_in, skills_of
 
 from skillweave.collecting.acting import Acted, Request
 from skillweave.collecting.collector import Collected, Collector
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience import Batch
 from skillweave.seeding import Seeds
@@ -124,8 +123,7 @@ def deciding(env: Any = Again) -> Any:
 
     def make(num_envs: int, first: int) -> Collector:
         engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
-        skills = SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
+        skills = skills_of(Left, Right, Zigzag, Counter, call_steps=5)
         return calling_in(engine, Choices(num_envs, 4), skills)
 
     return make

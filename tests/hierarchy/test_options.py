@@ -1,5 +1,6 @@
 """OptionsEnv is an ordinary Gymnasium vector, and its errors; tests/calls has its calls."""
 
+import functools
 import inspect
 
 import gymnasium as gym
@@ -9,7 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from reference_calls import EPISODE, POSITION, TAG, Counter, Die, Left, Right, T, Walk, Zigzag
-from toys import cartpole, network_of
+from toys import cartpole, network_of, skills_of
 
 from skillweave.collecting.skill_set import SkillSet, hierarchy_of
 from skillweave.envs.make import EnvSpec, make_engine
@@ -25,9 +26,7 @@ SPACES = Walk.observation_space, Walk.action_space
 ALL = (Left, Right, Zigzag, Counter)
 
 
-def skill_set(*kinds, call_steps=4, **more) -> SkillSet:
-    skills = tuple(kind() for kind in kinds)
-    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **more)
+skill_set = functools.partial(skills_of, call_steps=4)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from ready_selectors.chain import (
     Wait,
     has_key,
 )
+from toys import skills_of
 
 from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
 from skillweave.collecting.skill_set import SkillSet
@@ -327,7 +328,7 @@ SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 
 def skill_set(**how: Any) -> SkillSet:
-    return SkillSet(SKILLS, tuple(s.policy for s in SKILLS), **how)
+    return skills_of(*SKILLS, **how)
 
 
 def open_door(obs: Array) -> Array:
@@ -382,7 +383,7 @@ def test_it_chooses_lengths_when_they_are_chosen() -> None:
         policy = GetKey.policy
 
     pair = (Go(), Back())
-    skills = SkillSet(pair, tuple(s.policy for s in pair), call_steps=Lengths(1, 2, 4))
+    skills = skills_of(*pair, call_steps=Lengths(1, 2, 4))
     log = record_calls(SPEC, skills, 1_500, num_envs=4)
     planner = Planner(log, Mission(has_key, at_three), skills=skills)
     memory = planner.among(("go", "back")).start(1)
@@ -621,7 +622,7 @@ def in_places(picture: bool) -> tuple[EnvSpec, SkillSet]:
 
     spec = EnvSpec(lambda: Places(Corridor(), picture), engine="sync")
     skills = (go(0), go(2))
-    return spec, SkillSet(skills, tuple(s.policy for s in skills))
+    return spec, skills_of(*skills)
 
 
 def test_observations_in_a_dict_are_planned_on() -> None:

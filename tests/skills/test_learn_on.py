@@ -289,10 +289,6 @@ class TestRefused:
             torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Linear(4, 2)),
             torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh()),
             torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ELU(5.0), torch.nn.Linear(4, 2)),
-            torch.nn.Sequential(
-                torch.nn.Linear(3, 4), torch.nn.GELU(approximate="tanh"), torch.nn.Linear(4, 2)
-            ),
-            torch.nn.LSTM(3, 2),
         ],
         ids=lambda m: type(m).__name__,
     )
