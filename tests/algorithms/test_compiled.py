@@ -35,6 +35,25 @@ needs_compiler = pytest.mark.skipif(
 )
 
 
+def learnt(config: Any, space: gym.Space[Any], data: list[Any]) -> list[tuple[Any, list[Any]]]:
+    """The state and the metrics after updates by plain steps, then by compiled ones."""
+    found = []
+    for compile in (False, True):
+        algorithm: Any = make_algorithm(replace(config, compile=compile), OBS, space)
+        state, told = algorithm.init([Seeds(m) for m in range(P)]), []
+        for u, each in enumerate(data):
+            generators = [(Seeds(u) / m).torch() for m in range(P)]
+            told.append(algorithm.update(state, each, generators)[1].metrics)
+        found.append((state, told))
+    return found
+
+
+def assert_close(state: Any, other: Any, **how: float) -> None:
+    for f in fields(state):
+        one, two = getattr(state, f.name), getattr(other, f.name)
+        torch.testing.assert_close(one, two, msg=f.name, **how)
+
+
 # A C++ compiler takes most of the time: one algorithm goes all the way, the others as far as torch
 # traces the whole step, its backward pass and its changes in place.
 @pytest.mark.slow
@@ -51,18 +70,10 @@ def test_compiled_steps_equal_plain_ones(
     kind: Any, space: gym.Space[Any], backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    states = []
-    for compile in (False, True):
-        algorithm: Any = make_algorithm(kind(**SMALL, compile=compile), OBS, space)
-        state = algorithm.init([Seeds(m) for m in range(P)])
-        for u in range(5):
-            generators = [(Seeds(u) / m).torch() for m in range(P)]
-            data = transitions(space, (P, B), masked=space is CHOICES, seed=u)
-            algorithm.update(state, replace(data, progress=0.1), generators)
-        states.append(state)
-    for field in fields(states[0]):
-        plain, fused = (getattr(s, field.name) for s in states)
-        torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-6, msg=field.name)
+    drawn = [transitions(space, (P, B), masked=space is CHOICES, seed=u) for u in range(5)]
+    data = [replace(each, progress=0.1) for each in drawn]
+    (plain, _), (fused, _) = learnt(kind(**SMALL), space, data)
+    assert_close(fused, plain, rtol=1e-4, atol=1e-6)
 
 
 def rehearsed(width: int, log_std: torch.Tensor | None = None) -> Rehearsal:
@@ -119,23 +130,14 @@ def test_compiled_steps_of_rollouts_equal_plain_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    states, reports = [], []
     more = {"rehearsal": settings.get("rehearsal")}
     settings = {k: v for k, v in settings.items() if k not in more}
-    for compile in (False, True):
-        config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16, compile=compile)
-        algorithm: Any = make_algorithm(config, OBS, space)
-        state = algorithm.init([Seeds(m) for m in range(P)])
-        for u in range(3):  # each with other numbers of rows
-            generators = [(Seeds(u) / m).torch() for m in range(P)]
-            data = replace(rollout(space, u), **more)
-            _, report = algorithm.update(state, data, generators)
-            reports.append(report.metrics)
-        states.append(state)
-    for field in fields(states[0]):
-        plain, fused = (getattr(s, field.name) for s in states)
-        torch.testing.assert_close(fused, plain, rtol=1e-3, atol=1e-5, msg=field.name)
-    for own, other in zip(reports[:3], reports[3:], strict=True):
+    config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16)
+    # Each rollout has other numbers of rows.
+    data = [replace(rollout(space, u), **more) for u in range(3)]
+    (plain, told), (fused, tells) = learnt(config, space, data)
+    assert_close(fused, plain, rtol=1e-3, atol=1e-5)
+    for own, other in zip(told, tells, strict=True):
         assert own.keys() == other.keys()
         for name in own:
             torch.testing.assert_close(other[name], own[name], rtol=1e-2, atol=1e-4, msg=name)

@@ -13,6 +13,7 @@ from toys import (
     Broken,
     Calls,
     Countdown,
+    Cut,
     Echo,
     Identity,
     Steady,
@@ -40,10 +41,6 @@ SETTINGS: dict[str, Any] = {
     "network": Network((8,)),
 }  # fmt: skip
 CONFIG = DQN(**SETTINGS)
-
-
-class Stop(Exception):
-    pass
 
 
 class Spy(DQNAlgorithm):
@@ -334,9 +331,9 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back():
 
     def stop(tick: Tick) -> None:
         assert torch.get_num_threads() == 2
-        raise Stop
+        raise Cut
 
-    with pytest.raises(Stop):
+    with pytest.raises(Cut):
         learn(replace(CONFIG, threads=2), Identity(4), 80, on_tick=stop)
     assert torch.get_num_threads() == 1
 

@@ -14,6 +14,7 @@ from toys import (
     Calls,
     Clockwork,
     Countdown,
+    Cut,
     Identity,
     Masked,
     Recall,
@@ -406,10 +407,6 @@ def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
 # Checkpoints
 
 
-class Stop(Exception):
-    pass
-
-
 CUTS = {
     "ppo": (CONFIG, Identity),
     "ppo without overlap": (replace(CONFIG, overlap=False), Identity),
@@ -504,8 +501,8 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back(overlap):
     torch.set_num_threads(1)
 
     def stop(tick: Tick) -> None:
-        raise Stop
+        raise Cut
 
-    with pytest.raises(Stop):
+    with pytest.raises(Cut):
         train(Identity(16), 5, replace(CONFIG, threads=2, overlap=overlap), on_tick=stop)
     assert torch.get_num_threads() == 1
