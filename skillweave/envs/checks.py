@@ -17,11 +17,12 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.image_bounds import ImageBounds
-from skillweave.envs.infos import MASK, checked_mask, observes_mask
+from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
+from skillweave.policies.spaces import space_of
 from skillweave.spaces import choice_counts, obs_shape
 from skillweave.spaces.packing import parts
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
@@ -221,7 +222,7 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if mask is None:  # all actions are allowed
             return others
         try:
-            return {**others, MASK: checked_mask(mask, self.env.action_space)}
+            return {**others, MASK: space_of(self.env.action_space).allowed(mask)}
         except ValueError as error:
             raise self._wrong(str(error)) from error
 

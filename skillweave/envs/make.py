@@ -245,9 +245,10 @@ class EnvSpec:
                 function.
         """
         recorded = {}
+        function = self.name if self.name.isidentifier() else "your_function"
+        known = isinstance(self.env, str)
+        call = f"gymnasium.make({self.env!r}, " if known else f"{function}("
         for name, value in self.kwargs.items():
-            known = isinstance(self.env, str)
-            call = f"gymnasium.make({self.env!r}, " if known else f"{self._function_name}("
             recorded[name] = to_json(
                 value,
                 f"{self.name}: kwargs[{name!r}]",
@@ -255,11 +256,6 @@ class EnvSpec:
                 f"{name}=...)",
             )
         return recorded
-
-    @property
-    def _function_name(self) -> str:
-        """Return the name in messages of the function that makes the environment."""
-        return self.name if self.name.isidentifier() else "your_function"
 
     @property
     def is_data(self) -> bool:

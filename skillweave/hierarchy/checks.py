@@ -16,7 +16,7 @@ from skillweave.paths import name_of
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.selectors import Automaton
-from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.skills import Skill, ready_policy
 from skillweave.skills.learnable import learn_on
 from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import target_of
@@ -91,15 +91,6 @@ def _distance(skill: Skill, field: str) -> int:
     """Return the place of a skill's field: 0 on the object, 1 in its class, more in those above."""
     places = [vars(skill), *map(vars, type(skill).__mro__)]
     return next((i for i, names in enumerate(places) if field in names), len(places))
-
-
-def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
-    """Return the reflexes as a tuple.
-
-    Raises:
-        DeclarationError: the argument is no list of reflexes.
-    """
-    return tuple(fitted(Sequence[Reflex], reflexes, "reflexes"))
 
 
 def check_level(level: Level) -> None:

@@ -353,7 +353,13 @@ class Reflex:
         holds = self.holds(obs)
         if holds.any():
             action = action.copy()
-            action[holds] = self._actions(obs[holds], space)
+            if callable(self.action):
+                seen, label = obs[holds], f"{self._label}: action()"
+                given = called(self.action, seen, label)
+                action[holds] = space.actions(given, len(seen), label, SkillError)
+                probe(self.action, seen, label, space)
+            else:
+                action[holds] = self.fixed(space)
         return action, holds
 
     def holds(self, obs: Array) -> Array:
@@ -379,15 +385,6 @@ class Reflex:
     @property
     def _label(self) -> str:
         return f"reflex {self.name!r}"
-
-    def _actions(self, obs: Array, space: Data) -> Array:
-        """Return its actions for observations (n, ...)."""
-        n, label = len(obs), f"{self._label}: action()"
-        if not callable(self.action):
-            return np.repeat(self.fixed(space)[None], n, axis=0)
-        actions = space.actions(called(self.action, obs, label), n, label, SkillError)
-        probe(self.action, obs, label, space)
-        return actions
 
 
 def asked(

@@ -460,18 +460,15 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     elif isinstance(state, list | tuple) and state:
         single = not isinstance(state[0], list | tuple)
         shapes = (tuple(state),) if single else tuple(tuple(shape) for shape in state)
-        if all(_is_shape(shape) for shape in shapes):
+        sizes = [n for shape in shapes for n in shape if n is not None]
+        one_axis = all(shape.count(None) == 1 for shape in shapes)
+        if one_axis and all(_is_whole(n) and n >= 1 for n in sizes):
             return shapes, single
     raise DeclarationError(
         f"state is {short(state)}; it must be a shape with None as the axis of the environments, "
         "(None, 64), or a list of such shapes; of an ONNX file the name of the output that is the "
         "next state by the name of each input: {'h_in': 'h_out'}"
     )
-
-
-def _is_shape(shape: tuple[Any, ...]) -> bool:
-    sizes = [n for n in shape if n is not None]
-    return len(sizes) == len(shape) - 1 and all(_is_whole(n) and n >= 1 for n in sizes)
 
 
 # Files
