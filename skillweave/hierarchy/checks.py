@@ -191,12 +191,15 @@ def _check_start_calls(level: Level) -> None:
 
 
 _ELSEWHERE = {
-    "algorithm": "selector=",
-    "steps": "steps=",
-    "target_return": "selection=Selection(target_return=...)",
-    "target_success": "selection=Selection(target_return=...)",
+    **dict.fromkeys(("sees", "acts"), "it to the skills in the hierarchy"),
+    "algorithm": "the hierarchy selector=",
+    "steps": "the hierarchy steps=",
+    **dict.fromkeys(
+        ("target_return", "target_success"),
+        "the hierarchy selection=Selection(target_return=...)",
+    ),
 }
-"""Attributes of a skill that a hierarchy sets itself, and the argument that sets them."""
+"""Attributes of a skill that one which is a hierarchy does not have, and what to give instead."""
 
 
 def check_nested(roles: Roles) -> None:
@@ -216,17 +219,10 @@ def check_nested(roles: Roles) -> None:
                 f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
                 "attribute"
             )
-        for field in ("sees", "acts"):
+        for field, advice in _ELSEWHERE.items():
             if getattr(skill, field) is not None:
                 raise DeclarationError(
-                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give it to "
-                    "the skills in the hierarchy"
-                )
-        for field, where in _ELSEWHERE.items():
-            if getattr(skill, field) is not None:
-                raise DeclarationError(
-                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give the "
-                    f"hierarchy {where}"
+                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give {advice}"
                 )
 
 
