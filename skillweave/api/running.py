@@ -43,14 +43,13 @@ from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import copy_initial_policies
 from skillweave.runs.manifest import StageEntry, identity
 from skillweave.runs.numbered import make_numbered
-from skillweave.runs.trackers import make_trackers
+from skillweave.runs.trackers import Listener, make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import TrainCallback
 from skillweave.training.plain_agent import Declared
 from skillweave.training.role import Role, agent_role
 from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
-from skillweave.training.stage_log import Listener
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
 """The Python file that is being read for its declaration; None: none is."""

@@ -24,6 +24,7 @@ from skillweave.runs.command_words import repair_words, resume_words
 from skillweave.runs.copies import copy_ready_policy, policy_at_start
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import SkillEntry
+from skillweave.runs.trackers import Listener
 from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import as_recorded, source_of
 from skillweave.skills.goals import goals_of
@@ -35,7 +36,6 @@ from skillweave.training.joint import agents_of
 from skillweave.training.options import CallReports, Reports
 from skillweave.training.plain_agent import Declared, PlainAgent
 from skillweave.training.stage import Policies, Stage
-from skillweave.training.stage_log import Listener
 from skillweave.training.stage_run import MakeLearner
 from skillweave.training.trainer import Course
 from skillweave.types import Policy

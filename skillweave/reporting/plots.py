@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import MissingExtra, RunError
+from skillweave.errors import RunError, needs_extra
 from skillweave.reporting.lineage import (
     Born,
     Lineage,
@@ -37,10 +37,8 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     Raises:
         RunError: nothing was trained yet, or matplotlib is missing.
     """
-    try:
+    with needs_extra("plotting", "plot"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("plotting", "plot") from error
     folder = out or run.path / "plots"
     written = []
     must_be_own(folder)

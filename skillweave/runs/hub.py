@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from skillweave.errors import DeclarationError, MissingExtra, RunError, SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError, needs_extra
 from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import CALLS, RunDirectory
@@ -43,10 +43,8 @@ def hub() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
+    with needs_extra("sharing runs", "hub"):
         return importlib.import_module("huggingface_hub")
-    except ImportError as error:
-        raise MissingExtra("sharing runs", "hub") from error
 
 
 def hub_api() -> Any:

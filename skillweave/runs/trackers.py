@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import error_text, suggest
@@ -34,35 +34,33 @@ MLFLOW_LONGEST_SETTING = 500
 """The most characters of a setting's value in MLflow."""
 
 
-class Tracker(Protocol):
-    """A listener of training that sends its events to another program."""
+class Listener:
+    """Receiver of training's events, which it ignores where a subclass does not define a method."""
 
     def stage(self, name: str, budget: int) -> None:
-        """Report that a stage begins or continues."""
-        ...
+        """Handle the start of a stage, or its continuation."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Report an update."""
-        ...
+        """Handle the report of an update."""
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Report the end of a stage."""
-        ...
+        """Handle the end of a stage."""
 
     def message(self, text: str) -> None:
-        """Report a message for users."""
-        ...
+        """Show a message to people."""
+
+
+class Tracker(Listener):
+    """A listener of training that sends its events to another program."""
 
     def film(self, path: Path, steps: int) -> None:
         """Report a film, a GIF or an MP4, after ``steps`` of training."""
-        ...
 
     def close(self) -> None:
         """Release the tracker after the last event."""
-        ...
 
 
-class TensorBoard:
+class TensorBoard(Tracker):
     """A tracker of scalars by environment step, in ``<run>/tensorboard/<stage>``.
 
     Each stage has a folder, because it counts its steps from 0, and a resumed run purges later
@@ -74,9 +72,6 @@ class TensorBoard:
 
         self._path = run.path / "tensorboard"
         self._writers: dict[str, Any] = {}
-
-    def stage(self, name: str, budget: int) -> None:
-        """Do nothing."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write every metric; a resumed stage's first step replaces all entries from there on."""
@@ -91,9 +86,6 @@ class TensorBoard:
         """Flush the stage's file."""
         if name in self._writers:
             self._writers[name].flush()
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
         """Write a GIF unchanged; skip an MP4, which TensorBoard cannot show."""
@@ -115,7 +107,7 @@ class TensorBoard:
             writer.close()
 
 
-class WandB:
+class WandB(Tracker):
     """A tracker of one Weights & Biases run; offline without a login, for which it never asks.
 
     A resumed run continues it: its id follows from the run's path and time of creation.
@@ -143,12 +135,6 @@ class WandB:
         """Log every metric."""
         self._run.log({f"{name}/{k}": v for k, v in (metrics | {"steps": steps}).items()})
 
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Do nothing."""
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
-
     def film(self, path: Path, steps: int) -> None:
         """Log the film, of which Weights & Biases stores a copy."""
         import wandb
@@ -160,7 +146,7 @@ class WandB:
         self._run.finish()
 
 
-class MLflow:
+class MLflow(Tracker):
     """One MLflow run, at MLFLOW_TRACKING_URI or in MLflow's default store.
 
     A resumed run continues it, and does not send its earlier metrics again.
@@ -220,9 +206,6 @@ class MLflow:
             self._client.log_batch(created.info.run_id, params=params[i : i + MLFLOW_MOST_SETTINGS])
         return created
 
-    def stage(self, name: str, budget: int) -> None:
-        """Do nothing."""
-
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Store every metric, to be sent after about a second."""
         if steps <= self._sent_steps.get(name, -1.0):
@@ -239,9 +222,6 @@ class MLflow:
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Send waiting metrics."""
         self._send()
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
         """Upload the film as an artifact."""

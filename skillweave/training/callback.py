@@ -15,6 +15,7 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import Listener
 from skillweave.tracebacks import place
 
 
@@ -48,7 +49,7 @@ Callback = Callable[[TrainEvent], Any]
 """A function of one event; where it returns False, the stage ends."""
 
 
-class TrainCallback:
+class TrainCallback(Listener):
     """The listener that calls a user's function.
 
     Args:
@@ -73,12 +74,6 @@ class TrainCallback:
     def checkpoint(self, name: str, steps: int, metrics: Mapping[str, float | None]) -> None:
         """Call the function with a checkpoint."""
         self._call("checkpoint", name, steps, metrics)
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Do nothing: the end of a stage is no event."""
-
-    def message(self, text: str) -> None:
-        """Do nothing: a message is no event."""
 
     def _call(
         self,

@@ -23,6 +23,7 @@ from skillweave.ops.device import resolve_device
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
 from skillweave.runs.manifest import Checkpoint, StageEntry
+from skillweave.runs.trackers import Listener
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.eval_envs import episodes_of
@@ -34,7 +35,7 @@ from skillweave.training.periodic import PeriodicEvaluation
 from skillweave.training.rehearsal import rehearse, remove_rehearsal
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
-from skillweave.training.stage_log import Listener, StageLog, resumed
+from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, prefixed, unprefixed
 

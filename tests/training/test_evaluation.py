@@ -451,7 +451,7 @@ def test_evaluation_is_on_gymnasiums_environment_whatever_trains_it():
 
 def test_a_seed_that_fits_into_no_64_bits_is_refused():
     policy = ScriptedPolicy(lambda obs: np.zeros(len(obs), np.int64), *_cartpole())
-    with pytest.raises(SkillweaveError, match=r"seed is 10+; it must be below 2\^43"):
+    with pytest.raises(SkillweaveError, match=r"seed is 10+; it must be below 2\^63"):
         evaluate(policy, EnvSpec("CartPole-v1"), episodes=1, seed=10**30)
 
 

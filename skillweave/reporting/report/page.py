@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import MissingExtra
+from skillweave.errors import needs_extra
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"
@@ -86,7 +86,5 @@ def need(module: str) -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
+    with needs_extra("a report", "report"):
         return importlib.import_module(module)
-    except ImportError as error:
-        raise MissingExtra("a report", "report") from error
