@@ -3,42 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from skillweave.paths import join
-from skillweave.planning.columns import ENDS, GOAL
-from skillweave.planning.recorder import Recorder
-from skillweave.policies.core import CallEnd
+from skillweave.planning.columns import GOAL, OF_CALL
+from skillweave.planning.recorder import SUMS, Recorder
 from skillweave.skills import Skill
-from skillweave.skills.base import RecordedSkill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.types import Array
-
-
-@dataclass(frozen=True)
-class Call:
-    """One call of a skill; the whole episode for a plain agent."""
-
-    skill: int
-    """A row of ``PlayedEpisodes.labels``."""
-    start: int
-    """Steps of the episode before it."""
-    obs: Array
-    """The observation of the selector's decision, (*obs_shape)."""
-    steps: int
-    why: str
-    """``own``, ``limit``, ``interrupted`` or ``episode``, as in ``ENDS``."""
-    reward: float
-    """Sum of the environment's reward, not discounted."""
-    own: float | None
-    """Sum of the skill's own reward; None: unknown."""
-    succeeded: bool | None
-    """Result of the skill's ``success`` for the last step; None: it defines none."""
-    goal: str = ""
-    """Its goal in words; empty: it has none."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +23,8 @@ class Episode:
     seed: int
     actions: Array  # (T, *action_shape)
     rewards: Array  # (T,) float32, the environment's
-    calls: list[Call] = field(default_factory=list)
-    """In the order of their starts."""
+    calls: Array
+    """(C,) rows in the order of their starts; see ``PlayedEpisodes``."""
     cut: bool = False
     """True if it was cut at the step limit without an end."""
 
@@ -62,6 +37,10 @@ class Episode:
 class PlayedEpisodes:
     """Episodes that were played, call by call: those of the skills that are no hierarchies.
 
+    A call is a row of its recorder, with ``skill``, a row of ``labels``, and ``goal``, its goal in
+    words, empty where it has none; without the numbers of goals and ``may_follow``. The whole
+    episode of a plain agent is a call.
+
     Args:
         played: with the skills' own rewards.
         seeds: of the episodes, in order.
@@ -72,49 +51,38 @@ class PlayedEpisodes:
         leaves = dict(_leaves(recorders))
         self.labels = tuple(leaves)
         self.skills = tuple(leaves.values()) if played.declared else ()
+        self.judged = tuple(skill.defines("success") for skill in leaves.values())
+        """Of each label, whether its skill defines ``success``."""
         log = recorders[""].log()
         episode = log.episode[log.owner]
         rows = np.lexsort((log.age[log.owner] + log.elapsed, episode))
-        first = np.searchsorted(episode[rows], np.arange(len(seeds) + 1))
+        numbers = np.arange(1, len(seeds))
+        steps = np.split(rows, np.searchsorted(episode[rows], numbers))
+        calls = np.concatenate([_calls(*level, self.labels) for level in recorders.items()])
+        calls = calls[np.lexsort((calls["age"], calls["episode"]))]
+        split = np.split(calls, np.searchsorted(calls["episode"], numbers))
         self.episodes = [
-            Episode(
-                seed,
-                log.action[rows[first[i] : first[i + 1]]],
-                log.reward[rows[first[i] : first[i + 1]]],
-                cut=i in played.cut,
-            )
-            for i, seed in enumerate(seeds)
+            Episode(seed, log.action[of], log.reward[of], split[i], i in played.cut)
+            for i, (seed, of) in enumerate(zip(seeds, steps, strict=True))
         ]
-        for path, recorder in recorders.items():
-            self._add(path, recorder, leaves)
-        for shown in self.episodes:
-            shown.calls.sort(key=lambda call: call.start)
 
-    def _add(self, path: str, recorder: Recorder, leaves: Mapping[str, Skill]) -> None:
-        """Add the calls of one level."""
-        skills, numbers = recorder.skills, list(leaves)
-        for row in recorder.rows():
-            skill = skills.skills[row["choice"] // max(1, len(skills.lengths))]
-            if (name := join(path, skill.name)) not in leaves:
-                continue
-            judged = bool(self.skills) and not isinstance(skill, RecordedSkill)
-            episode, start = self.episodes[row["episode"]], int(row["age"])
-            goal = ""
+
+def _calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
+    """Return the calls of one level, as in ``PlayedEpisodes``."""
+    rows = recorder.rows()
+    kept = [(name, rows.dtype[name]) for name in (*dict((*SUMS, *OF_CALL)), "start")]
+    calls = np.zeros(len(rows), [*kept, ("skill", np.int64), ("goal", object)])
+    for name, _ in kept:
+        calls[name] = rows[name]
+    calls["skill"], calls["goal"] = -1, ""
+    for i, skill in enumerate(recorder.skills.skills):
+        if (name := join(path, skill.name)) in labels:
+            mine = np.flatnonzero(recorder.skills.hierarchy.skill_of(rows["choice"]) == i)
+            calls["skill"][mine] = labels.index(name)
             if (goals := recorder.goals.get(skill.name)) is not None:
-                goal = shown_goal(goals.space.of_numbers(row[GOAL + skill.name][None])[0])
-            steps = int(row["steps"])
-            call = Call(
-                numbers.index(name),
-                start,
-                row["start"],
-                steps,
-                ENDS[CallEnd(int(row["end_reason"]))],
-                float(episode.rewards[start : start + steps].sum(dtype=np.float64)),
-                float(row["own_return"]) if judged else None,
-                bool(row["succeeded"]) if skill.defines("success") else None,
-                goal,
-            )
-            episode.calls.append(call)
+                numbers = rows[GOAL + skill.name][mine]
+                calls["goal"][mine] = [*map(shown_goal, goals.space.of_numbers(numbers))]
+    return calls[calls["skill"] >= 0]
 
 
 def _leaves(recorders: Mapping[str, Recorder], path: str = "") -> Iterator[tuple[str, Skill]]:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare
+from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, told
 from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
@@ -242,7 +242,7 @@ def test_named_observations_name_axes_and_what_each_call_saw(tmp_path: Path) -> 
     assert calls.seen(log.episodes[0].calls, names)[0] == names
     (shown,), _ = calls.episode_data(log, None)
     assert "seen" not in shown
-    assert shown["calls"] == [list(call) for call in CALLS]
+    assert told(shown["calls"]) == CALLS
 
 
 def test_names_that_do_not_fit_are_said_and_not_used(tmp_path: Path) -> None:

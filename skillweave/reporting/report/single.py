@@ -12,6 +12,7 @@ from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
 from skillweave.paths import AGENT, join
+from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
@@ -143,7 +144,7 @@ def _section(
             "Of the calls, neither the skills' own rewards nor their successes are known, as the "
             "run was loaded without the code of its skills: --recipe FILE.py gives it."
         )
-    if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
+    if misfit := names_misfit(log.episodes[0].calls["start"][:1], named):
         missing.append(misfit)
     shown, left_out = episode_data(log, film, named)
     missing += left_out
@@ -158,13 +159,14 @@ def _section(
         "goals": [],
     }
     data: dict[str, Any] = {"labels": labels, "colors": hues, "inks": inks, "episodes": shown}
+    data["judged"] = log.judged
     data["seen"], _ = seen(log.episodes[0].calls[:1], named)
     if film is not None:
         data["film"] = {"fps": film.fps, "every": film.every}
     if context["has_skills"]:
         decisions = decision_data(log, named)
-        used = sorted({row[-2] for row in decisions["rows"]})
-        goals = any(decisions["goals"])
+        used = sorted({*decisions["calls"]["skill"]}) if decisions["rows"] else []
+        goals = any(decisions["calls"]["goal"])
         spec = charts.choices([labels[i] for i in used], [hues[i] for i in used], goals=goals)
         data["decisions"] = decisions | {"spec": spec}
     return Section(context, data, missing)
@@ -237,7 +239,8 @@ def write_report(
         if played is not None:
             pictures = goal_pictures({"": log}, with_goals, "of the run’s log")
             played.section.context["goals"] += pictures
-    data: dict[str, Any] = {"curves": _curves(all_curves, colors), "why": WHY}
+    data: dict[str, Any] = {"curves": _curves(all_curves, colors)}
+    data["why"] = {end: WHY[name] for end, name in ENDS.items()}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": metrics_of(all_curves)}
