@@ -177,7 +177,7 @@ class CallGraph:
             aims: of each skill, the standardised goals of all calls; None: it has none.
         """
         for choice in range(self.log.choices):
-            skill = choice // max(1, len(self.log.lengths))
+            skill = self.log.skill_of(choice)
             own, rows = aims[skill], np.flatnonzero(self.pieces.choice == choice)
             call = self.pieces.call[rows]
             features = self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)

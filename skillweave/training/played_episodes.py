@@ -77,7 +77,7 @@ def _calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
     calls["skill"], calls["goal"] = -1, ""
     for i, skill in enumerate(recorder.skills.skills):
         if (name := join(path, skill.name)) in labels:
-            mine = np.flatnonzero(recorder.skills.hierarchy.skill_of(rows["choice"]) == i)
+            mine = np.flatnonzero(recorder.skills.skill_of(rows["choice"]) == i)
             calls["skill"][mine] = labels.index(name)
             if (goals := recorder.goals.get(skill.name)) is not None:
                 numbers = rows[GOAL + skill.name][mine]

@@ -173,7 +173,7 @@ def _with_before(recorder: Recorder) -> tuple[Array, Array, Array]:
     """
     rows = recorder.rows()
     rows = rows[np.lexsort((rows["order"], rows["episode"]))]
-    skill = rows["choice"] // max(1, len(recorder.skills.lengths))
+    skill = recorder.skills.skill_of(rows["choice"])
     goes_on = rows["episode"] == np.roll(rows["episode"], 1)
     goes_on[:1] = False
     return rows, skill, np.where(goes_on, np.roll(skill, 1) + 1, 0)
