@@ -46,8 +46,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError, RunError
-from skillweave.messages import short, suggest
+from skillweave.messages import aligned, short, suggest
 from skillweave.notebooks import table
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.compared import feature_maps
@@ -162,13 +162,7 @@ class Handover:
 
     def __str__(self) -> str:
         """Return the matrix as a table of text: rates, calls, intervals, what is done."""
-        cells = [["after", *self.skills], *self.rows()]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = [
-            "  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-            for row in cells
-        ]
-        return "\n".join([*lines, self.meaning])
+        return f"{aligned([('after', *self.skills), *self.rows()])}\n{self.meaning}"
 
     def _repr_html_(self) -> str:
         return table(["after", *self.skills], self.rows()) + f"<p>{escape(self.meaning)}</p>"

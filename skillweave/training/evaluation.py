@@ -34,12 +34,18 @@ from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (
+    TITLES,
     SkillReport,
     all_steps,
+    call_line,
+    cells_of,
+    hints,
+    reflex_lines,
     skill_reports,
+    skill_rows,
+    skill_table,
     weak_handovers,
 )
-from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
 
 FIRST_SEED = 1_000_000
@@ -206,8 +212,8 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         """Return the same as ``for_people``, for notebooks."""
-        head, *rows = skill_rows(self.skills)
-        tables = [table(head, rows)] if rows else []
+        rows = [*map(cells_of, skill_rows(self.skills))]
+        tables = [table(TITLES, rows)] if rows else []
         lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *self._hints()]
         return joined([paragraph(self), *tables, *map(paragraph, lines)])
 

@@ -24,8 +24,7 @@ from skillweave.reporting.report.film import HOLD, episode_shot, make_film
 from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import Episode, PlayedEpisodes
+from skillweave.training.played_calls import Episode, PlayedCalls, PlayedEpisodes
 
 
 def test_transitions_by_hand(tmp_path: Path) -> None:

@@ -22,8 +22,7 @@ from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import save_evaluation
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.types import Array
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
 from skillweave.reporting.report.film import Film
-from skillweave.training.played_episodes import Episode, PlayedEpisodes
+from skillweave.training.played_calls import Episode, PlayedEpisodes
 from skillweave.types import Array
 
 MOST_COORDINATES = 16

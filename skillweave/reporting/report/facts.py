@@ -15,7 +15,7 @@ from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import as_json
 from skillweave.skills import Skill
-from skillweave.training.skill_report import SkillReport, all_steps
+from skillweave.training.skill_report import SkillReport, Words
 
 DIGITS = 3
 """Significant digits."""
@@ -229,37 +229,8 @@ WHY = {
     "episode": "with the episode",
 }
 """Ends of calls in the page's words."""
-
-
-def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
-    """Return a row for each skill."""
-    total = all_steps(reports)
-    longest = max(scale_of(report.length_mean for report in reports.values()), 10)
-    rows = []
-    for name, report in reports.items():
-        calls = report.calls
-        known = bool(report.ended and calls)
-        rows.append(
-            {
-                "name": name,
-                "share": report.steps / total if total else 0.0,
-                "percent": percent(report.steps / total if total else 0.0),
-                "calls": f"{calls:,}",
-                "length": number(report.length_mean, longest),
-                "ends": end_cells(report.ended, report.own_with_episode, calls if known else 0),
-                "success": percent(report.success_rate),
-                "return": number(report.return_mean),
-            }
-        )
-    return rows
-
-
-def end_cells(reasons: Mapping[str, int], own_with_episode: int, calls: int) -> list[str]:
-    """Return the shares of the ends of calls; 0 ``calls``: unknown."""
-    cells = [percent(reasons[why] / calls if calls else None) for why in WHY]
-    if own_with_episode:
-        cells[0] += f" ({percent(own_with_episode / calls)} in the last step)"
-    return cells
+WORDS: Words = (percent, number, "in the last step")
+"""How the page writes the rows of skills."""
 
 
 def about(skill: Skill) -> str:

@@ -23,7 +23,7 @@ from skillweave.reporting.report.calls import (
     rounded,
     varying,
 )
-from skillweave.reporting.report.facts import WHY, end_cells, number, percent, scale_of
+from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
 from skillweave.reporting.report.page import Section
 from skillweave.seeding import Seeds, global_generators
@@ -31,6 +31,7 @@ from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
 from skillweave.spaces import env_form
+from skillweave.training.skill_report import end_cells
 from skillweave.types import Array
 
 MOST_FRAMES = 1_200
@@ -171,7 +172,7 @@ def _end_rows(log: CallLog) -> list[dict[str, Any]]:
                 "name": name,
                 "calls": f"{ends.calls:,}",
                 "length": number(ends.steps, max(ends.steps, 10)),
-                "ends": end_cells(ends.reasons, ends.own_with_episode, ends.calls),
+                "ends": end_cells(ends.reasons, ends.own_with_episode, ends.calls, WORDS),
                 "done": percent(ends.succeeded),
             }
         )
@@ -225,7 +226,7 @@ def _cell(
 ) -> dict[str, Any]:
     """Return a cell for the page's script."""
     calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-    reasons = dict.fromkeys(WHY, 0) | log.take(cell.rows).call_ends(matrix.skills[j]).reasons
+    reasons = log.take(cell.rows).reasons
     return {
         "skill": matrix.skills[j],
         "before": matrix.before[i] if i else "",

@@ -36,12 +36,12 @@ from skillweave.reporting.report.curves import (
 )
 from skillweave.reporting.report.facts import (
     WHY,
+    WORDS,
     about,
     number,
     percent,
     reflex_rows,
     scale_of,
-    skill_rows,
     transition_rows,
     transitions,
 )
@@ -59,9 +59,8 @@ from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.play import Played as PlayedStep
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
-from skillweave.training.skill_report import levels_of
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
+from skillweave.training.skill_report import levels_of, skill_rows
 from skillweave.types import Policy
 
 EPISODES = 20
@@ -332,7 +331,7 @@ def _scores(
         "binary": is_binary(score.returns),
         "score": score_words(score) | {"of": of},
         "skill_table": [
-            row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills)
+            row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills, WORDS)
         ],
         "reflexes": reflex_rows(score.reflexes, sum(score.lengths)),
         "transitions": [
