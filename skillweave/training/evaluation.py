@@ -55,6 +55,9 @@ USUAL_ENVS = 16
 SEEMS_ENDLESS = 1_000
 """Steps of an episode without a known limit after which an evaluation says where it will be cut."""
 
+NOT_LOGGED = "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
+SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -93,7 +96,8 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        return self._logged()[""]
+        calls: CallLog = self._kept("logs", NOT_LOGGED)[""]
+        return calls
 
     @property
     def inner_calls(self) -> dict[str, CallLog]:
@@ -102,7 +106,7 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        return {path: log for path, log in self._logged().items() if path}
+        return {path: log for path, log in self._kept("logs", NOT_LOGGED).items() if path}
 
     @property
     def goals(self) -> Array:
@@ -111,7 +115,9 @@ class Evaluation:
         Raises:
             DeclarationError: no skill with goals acted alone.
         """
-        return self._of_alone("goals", "no skill with goals acted alone in this evaluation")
+        missing = "no skill with goals acted alone in this evaluation"
+        goals: Array = self._kept("goals", f"{missing}: {SCORE_ALONE}")
+        return goals
 
     @property
     def reached(self) -> Array:
@@ -122,21 +128,15 @@ class Evaluation:
         Raises:
             DeclarationError: no skill that defines success acted alone.
         """
-        return self._of_alone("reached", "no skill that defines success acted alone")
+        missing = "no skill that defines success acted alone"
+        reached: Array = self._kept("reached", f"{missing}: {SCORE_ALONE}")
+        return reached
 
-    def _of_alone(self, name: str, missing: str) -> Array:
-        found: Array | None = vars(self).get(f"_{name}")
-        if found is None:
-            raise DeclarationError(f'{missing}: evaluate(skill="go_to") scores a skill alone')
-        return found
-
-    def _logged(self) -> dict[str, CallLog]:
-        logs: dict[str, CallLog] | None = vars(self).get("_logs")
-        if logs is None:
-            raise DeclarationError(
-                "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
-            )
-        return logs
+    def _kept(self, name: str, missing: str) -> Any:
+        """Return what is not saved with the scores; where it is ``missing``, raise an error."""
+        if (kept := vars(self).get(f"_{name}")) is None:
+            raise DeclarationError(missing)
+        return kept
 
     @property
     def mean(self) -> float:

@@ -51,13 +51,11 @@ class PeriodicEvaluation:
         self.after = 0.0
         """Seconds of the training before it."""
         self._arena: Collector | None = None
-        if every is not None:
-            self._arena = self._make_arena(learning_task, min(episodes, num_envs))
-
-    @staticmethod
-    def _make_arena(learning_task: LearningTask, num_envs: int) -> Collector:
+        if every is None:
+            return
+        num_envs = min(episodes, num_envs)
         try:
-            return learning_task.collector(num_envs, None)
+            self._arena = learning_task.collector(num_envs, None)
         except SkillweaveError as error:
             raise reworded(
                 error,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -107,6 +107,14 @@ class PlayedCalls:
             for calls in levels.values():
                 calls["start"] = starts | (calls["elapsed"] == 1)
         self._feed.add(played.rows, step, levels)
+
+    def skills(self, path: str = "") -> dict[str, Skill]:
+        """Return the skills of a level and of those below it, by path: each before its own."""
+        found = {}
+        for skill in self._levels[path][0].skills:
+            found[name := join(path, skill.name)] = skill
+            found |= self.skills(name) if name in self._levels else {}
+        return found
 
     def recorders(self) -> dict[str, Recorder]:
         """Return the recorder of each level, by its path; all steps so far are recorded."""
@@ -234,7 +242,7 @@ class PlayedEpisodes:
 
     def __init__(self, played: PlayedCalls, seeds: Sequence[int]) -> None:
         recorders = played.recorders()
-        leaves = dict(_leaves(recorders))
+        leaves = {k: skill for k, skill in played.skills().items() if k not in recorders}
         self.labels = tuple(leaves)
         self.skills = tuple(leaves.values()) if played.declared else ()
         self.judged = tuple(skill.defines("success") for skill in leaves.values())
@@ -269,13 +277,3 @@ def _calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
                 numbers = rows[GOAL + skill.name][mine]
                 calls["goal"][mine] = [*map(shown_goal, goals.space.of_numbers(numbers))]
     return calls[calls["skill"] >= 0]
-
-
-def _leaves(recorders: Mapping[str, Recorder], path: str = "") -> Iterator[tuple[str, Skill]]:
-    """Yield the skills that are no hierarchies, by their paths."""
-    for skill in recorders[path].skills.skills:
-        name = join(path, skill.name)
-        if name in recorders:
-            yield from _leaves(recorders, name)
-        else:
-            yield name, skill

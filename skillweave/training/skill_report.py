@@ -100,11 +100,8 @@ def skill_reports(calls: PlayedCalls) -> dict[str, SkillReport]:
     """
     found: dict[str, SkillReport] = {}
     for recorder in calls.recorders().values():
-        reports = _level_reports(calls, recorder)
-        place = [*found].index(join(calls.prefix, recorder.path)) + 1 if recorder.path else 0
-        items = [*found.items()]
-        found = dict([*items[:place], *reports.items(), *items[place:]])
-    return found
+        found |= _level_reports(calls, recorder)
+    return {name: found[name] for path in calls.skills() if (name := join(calls.prefix, path))}
 
 
 def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillReport]:

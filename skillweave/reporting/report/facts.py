@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.policies.core import flat
@@ -62,6 +62,11 @@ def percent(value: float | None) -> str:
     if 0.995 <= value < 1:
         return ">99 %"
     return f"{100 * value:.0f} %"
+
+
+def span(bounds: Iterable[Any], say: Callable[[float], str] = percent) -> str:
+    """Return the bounds of an interval in words."""
+    return " to ".join(say(float(bound)) for bound in bounds)
 
 
 # Runs and stages

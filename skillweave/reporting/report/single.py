@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
-from skillweave.paths import AGENT, join
+from skillweave.paths import AGENT
 from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
@@ -42,6 +43,7 @@ from skillweave.reporting.report.facts import (
     percent,
     reflex_rows,
     scale_of,
+    span,
     transition_rows,
     transitions,
 )
@@ -117,12 +119,7 @@ def play_episodes(
             missing.append(f"There is no film: {_sentence(error)}")
     wanted = [skill.color for skill in log.skills] or [None] * len(log.labels)
     colors = {k: color_of(i, wanted[i]) for i, k in enumerate(log.labels)}
-    with_goals = {
-        join(path, skill.name): skill
-        for path, recorder in calls.recorders().items()
-        for skill in recorder.skills.skills
-        if skill.goal_space is not None
-    }
+    with_goals = {k: skill for k, skill in calls.skills().items() if skill.goal_space is not None}
     section = _section(log, film, spec.observation_names(), colors, missing)
     if with_goals:
         pictures = goal_pictures(calls.logs(seeds), with_goals, "in the played episodes")
@@ -345,14 +342,13 @@ def _scores(
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
     score_json = score.to_json()
-    scale = scale_of(score.returns)
-    low, high = (number(value, scale) for value in score_json["ci95"])
+    say = partial(number, scale=scale_of(score.returns))
     count = solved(score)
     words: dict[str, Any] = {
-        "mean": number(score_json["mean"], scale),
-        "interval": None if len(score.returns) == 1 else f"{low} to {high}",
-        "iqm": number(score_json["iqm"], scale),
-        "range": f"{number(score_json['min'], scale)} to {number(score_json['max'], scale)}",
+        "mean": say(score_json["mean"]),
+        "interval": None if len(score.returns) == 1 else span(score_json["ci95"], say),
+        "iqm": say(score_json["iqm"]),
+        "range": span((score_json["min"], score_json["max"]), say),
         "reached": percent(score_json["solved_fraction"]),
         "threshold": None if score.threshold is None else f"{score.threshold:g}",
         "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
@@ -362,9 +358,8 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     }
     if count is None:
         return words
-    low, high = (percent(float(bound)) for bound in wilson(count, len(score.returns)))
-    share = percent(count / len(score.returns))
-    return words | {"solved": share, "solved_interval": f"{low} to {high}"}
+    interval = span(wilson(count, len(score.returns)))
+    return words | {"solved": percent(count / len(score.returns)), "solved_interval": interval}
 
 
 def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
