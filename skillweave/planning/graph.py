@@ -24,7 +24,7 @@ from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import Standard, tie_order
+from skillweave.planning.neighbors import Standard, evenly, tie_order
 from skillweave.planning.states import exact_states
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import Levels, Near, OptionGroup, Options, Readings
@@ -119,7 +119,7 @@ class CallGraph:
                 f"the log has {len(log):,} calls; the plan uses {MOST_CALLS:,} of them, at equal "
                 "distances"
             )
-            log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
+            log = log.take(evenly(np.arange(len(log)), MOST_CALLS))
         self.log, self.neighbors, self.skills = log, neighbors, skills
         self.pieces = pieces = _pieces(log, skills)
         self.maps = feature_maps(log, features, np.concatenate([log.start, log.end]), task)
@@ -194,8 +194,8 @@ class CallGraph:
                 group = OptionGroup(
                     choice, count, rows[mine], features[mine], call[mine], goals, float("inf")
                 )
-                if n := len(alike):
-                    some = alike[np.linspace(0, n - 1, min(n, SAMPLED)).astype(np.int64)]
+                if len(alike):
+                    some = evenly(alike, SAMPLED)
                     far = group.near(features[some], self.neighbors, own, call[some])[1]
                     group.usual = float(np.median(far[:, :, -1]))
                 yield group

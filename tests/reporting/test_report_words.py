@@ -173,7 +173,7 @@ def test_reflexes_are_counted_by_hand(tmp_path: Path) -> None:
     assert found.reflexes == {"hurry": 0, "later": 3, "never": 0}
     assert "reflex later acted in 3 of 24 steps (12.5%)" in found.for_people()
     rows = reflex_rows(found.reflexes, sum(found.lengths))
-    assert [(r["name"], r["steps"], r["percent"]) for r in rows][1] == ("later", "3", "12 %")
+    assert (rows[1]["name"], rows[1]["steps"], rows[1]["share"]) == ("later", "3", 0.125)
     assert found.to_json()["reflexes"]["later"] == {"steps": 3, "share": 3 / 24}
     # A skill alone is overridden, too.
     assert run.evaluate(1, skill="go").reflexes["later"] == 1

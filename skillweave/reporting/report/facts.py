@@ -249,12 +249,7 @@ def about(skill: Skill) -> str:
 def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
     """Return a row for each reflex: in how many of ``total`` steps it acted."""
     return [
-        {
-            "name": name,
-            "steps": f"{steps:,}",
-            "share": steps / total,
-            "percent": percent(steps / total),
-        }
+        {"name": name, "steps": f"{steps:,}", "share": steps / total}
         for name, steps in reflexes.items()
     ]
 
@@ -281,10 +276,6 @@ def transition_rows(
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)
-        shares = [n / total if total else 0.0 for n in row]
-        cells = [
-            {"count": f"{n:,.0f}", "share": share, "percent": percent(share)}
-            for n, share in zip(row, shares, strict=True)
-        ]
+        cells = [{"count": f"{n:,.0f}", "share": n / total if total else 0.0} for n in row]
         rows.append({"name": name, "total": total, "cells": cells})
     return rows

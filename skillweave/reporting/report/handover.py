@@ -16,6 +16,7 @@ from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import short
 from skillweave.planning import CallLog, Handover
 from skillweave.planning.handover import before_each
+from skillweave.planning.neighbors import evenly
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
     coordinates,
@@ -99,18 +100,19 @@ def handover_section(
     named = None if names_misfit(log.start[:1], named) else named
     points = _points(log, cells, named)
     done = ("done", "not done")
+    shown = {
+        (i, j): _cell(matrix, i, j, log.take(rows).reasons)
+        | {
+            "clips": [
+                _shown(log, clip, film, with_goals)
+                for clip in clips
+                if film is not None and clip.row in rows
+            ]
+        }
+        for (i, j), rows in cells.items()
+    }
     data = {
-        "cells": {
-            f"{i}-{j}": _cell(matrix, i, j, log.take(rows).reasons)
-            | {
-                "clips": [
-                    _shown(log, clip, film, with_goals)
-                    for clip in clips
-                    if film and clip.row in rows
-                ]
-            }
-            for (i, j), rows in cells.items()
-        },
+        "cells": {cell["id"]: cell for cell in shown.values()},
         "colors": dict(colors),
         "words": list(done),
         "spec": charts.handover(done),
@@ -118,31 +120,31 @@ def handover_section(
     }
     if film is not None:
         data["film"] = {"fps": film.fps}
-    context = {"handover": _words(log, matrix, named), "hand_film": film}
+    context = {"handover": _words(log, matrix, shown, named), "hand_film": film}
     return Section(context, {"handover": data}, missing)
 
 
-def _words(log: CallLog, matrix: Handover, named: ObsNames | None) -> dict[str, Any]:
-    weak = set(matrix.weak())
-    rows = []
-    for i, name in enumerate(matrix.before):
-        cells: list[dict[str, Any] | None] = []
-        for j in range(len(matrix.skills)):
-            calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-            if not calls:
-                cells.append(None)
-                continue
-            cell = {"id": f"{i}-{j}", "share": done / calls, "percent": percent(done / calls)}
-            cell |= {"count": f"{done:,} of {calls:,}", "weak": (i, j) in weak}
-            cells.append(cell | {"words": span(bound[i, j] for bound in matrix.interval)})
-        rows.append({"name": name if i else "start of an episode", "cells": cells})
+def _words(
+    log: CallLog,
+    matrix: Handover,
+    shown: Mapping[tuple[int, int], Mapping[str, Any]],
+    named: ObsNames | None,
+) -> dict[str, Any]:
+    """Return what the section's words are made of; ``shown``: of each cell."""
+    rows = [
+        {
+            "name": name if i else "start of an episode",
+            "cells": [shown.get((i, j)) for j in range(len(matrix.skills))],
+        }
+        for i, name in enumerate(matrix.before)
+    ]
     # Names between backticks, and percents as the page writes them.
     prose = [re.sub(r"'([^']+)'", r"`\1`", sentence) for sentence in matrix.weakest()]
     return {
         "columns": list(matrix.skills),
         "rows": rows,
         "weakest": [re.sub(r"(\d)%", r"\1 %", sentence) + "." for sentence in prose],
-        "weak": bool(weak),
+        "weak": any(cell["weak"] for cell in shown.values()),
         "meaning": matrix.meaning,
         "calls": f"{len(log):,}",
         "steps": f"{log.steps:,}",
@@ -200,7 +202,7 @@ def _points(log: CallLog, cells: Cells, named: ObsNames | None) -> dict[str, Any
     most = max(10, MOST_POINTS // max(1, len(cells)))
     points = {}
     for (i, j), rows in cells.items():
-        some = rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+        some = evenly(rows, most)
         points[f"{i}-{j}"] = [
             [*(rounded(both[when][k][c]) for when in both for k in names), int(log.succeeded[c])]
             for c in some
@@ -209,12 +211,17 @@ def _points(log: CallLog, cells: Cells, named: ObsNames | None) -> dict[str, Any
 
 
 def _cell(matrix: Handover, i: int, j: int, reasons: Mapping[str, int]) -> dict[str, Any]:
-    """Return a cell for the page's script; ``reasons``: its calls by their ends."""
+    """Return a cell for the page and its script; ``reasons``: its calls by their ends."""
     calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
+    count = f"{done:,} of {calls:,}"
     return {
+        "id": f"{i}-{j}",
         "skill": matrix.skills[j],
         "before": matrix.before[i] if i else "",
-        "done": f"{done:,} of {calls:,} calls ({percent(done / calls)})",
+        "share": done / calls,
+        "count": count,
+        "done": f"{count} calls ({percent(done / calls)})",
+        "weak": (i, j) in matrix.weak(),
         "interval": span(bound[i, j] for bound in matrix.interval),
         "ends": ", ".join(f"{WHY[why]} {n:,}" for why, n in reasons.items() if n),
     }
