@@ -584,12 +584,10 @@ class LinkedCalls(CallColumns):
             RunError: the log has no call of the second skill after the first one.
         """
         number = self.number(skill)
-        if after != START:
-            self.number(after)
+        wanted = 0 if after == START else self.number(after) + 1
         won = calls_done(self, done)
         counts = self.skill == number
         before = before_each(self, won)
-        wanted = 0 if after == START else self.number(after) + 1
         rows = np.flatnonzero(counts & (before == wanted))
         if not len(rows):
             raise RunError(

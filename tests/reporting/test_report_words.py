@@ -16,7 +16,7 @@ from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
 from skillweave.reporting.report import calls
 from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.facts import about, number, percent, reflex_rows
+from skillweave.reporting.report.facts import about, number, percent
 from skillweave.reporting.report.single import score_words
 from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
@@ -172,8 +172,6 @@ def test_reflexes_are_counted_by_hand(tmp_path: Path) -> None:
     assert found.lengths == (8, 8, 8)
     assert found.reflexes == {"hurry": 0, "later": 3, "never": 0}
     assert "reflex later acted in 3 of 24 steps (12.5%)" in found.for_people()
-    rows = reflex_rows(found.reflexes, sum(found.lengths))
-    assert (rows[1]["name"], rows[1]["steps"], rows[1]["share"]) == ("later", "3", 0.125)
     assert found.to_json()["reflexes"]["later"] == {"steps": 3, "share": 3 / 24}
     # A skill alone is overridden, too.
     assert run.evaluate(1, skill="go").reflexes["later"] == 1

@@ -246,14 +246,6 @@ def about(skill: Skill) -> str:
     return ""
 
 
-def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
-    """Return a row for each reflex: in how many of ``total`` steps it acted."""
-    return [
-        {"name": name, "steps": f"{steps:,}", "share": steps / total}
-        for name, steps in reflexes.items()
-    ]
-
-
 def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
     """Return how often each skill followed another: (1 + S, S + 1); None: not known.
 

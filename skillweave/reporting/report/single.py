@@ -41,7 +41,6 @@ from skillweave.reporting.report.facts import (
     about,
     number,
     percent,
-    reflex_rows,
     scale_of,
     span,
     transition_rows,
@@ -98,15 +97,21 @@ def play_episodes(
     """Play episodes with seeds that training never used, and film some of them."""
     spaces = policy.observation_space, policy.action_space
     calls = PlayedCalls(policy, spaces, own_rewards=True, inside=False)
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "num_envs": num_envs}
-    how["deterministic"] = deterministic
     with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
 
         def watch(played: PlayedStep) -> None:
             calls.add(played)
             progress.watch(played)
 
-        score = evaluate(policy, spec, watch=watch, **how)
+        score = evaluate(
+            policy,
+            spec,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            num_envs=num_envs,
+            watch=watch,
+        )
     seeds = episode_seeds(seed, episodes)
     log = PlayedEpisodes(calls, seeds)
     film = None
@@ -330,7 +335,7 @@ def _scores(
         "skill_table": [
             row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills, WORDS)
         ],
-        "reflexes": reflex_rows(score.reflexes, sum(score.lengths)),
+        "reflexes": score.to_json()["reflexes"],
         "transitions": [
             (path, transition_rows(list(reports), counts))
             for path, reports in levels_of(score.skills).items()
