@@ -252,7 +252,7 @@ class PlayedEpisodes:
         rows = np.lexsort((log.age[log.owner] + log.elapsed, episode))
         numbers = np.arange(1, len(seeds))
         steps = np.split(rows, np.searchsorted(episode[rows], numbers))
-        calls = np.concatenate([_calls(*level, self.labels) for level in recorders.items()])
+        calls = np.concatenate([_level_calls(*level, self.labels) for level in recorders.items()])
         calls = calls[np.lexsort((calls["age"], calls["episode"]))]
         split = np.split(calls, np.searchsorted(calls["episode"], numbers))
         self.episodes = [
@@ -261,7 +261,7 @@ class PlayedEpisodes:
         ]
 
 
-def _calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
+def _level_calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
     """Return the calls of one level, as in ``PlayedEpisodes``."""
     rows = recorder.rows()
     kept = [(name, rows.dtype[name]) for name in (*dict((*SUMS, *OF_CALL)), "start")]
