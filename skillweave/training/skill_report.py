@@ -219,7 +219,7 @@ def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> lis
     """Return a row for each skill, in words but for ``share``, a number."""
     percent, number, _ = words
     total = all_steps(skills)
-    longest = max(10, 0, *(report.length_mean or 0 for report in skills.values()))
+    longest = max([10, *(report.length_mean or 0 for report in skills.values())])
     return [
         {
             "name": name,
