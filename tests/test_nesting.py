@@ -40,13 +40,13 @@ from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
+from skillweave.planning.columns import ENDS
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -309,17 +309,17 @@ def test_calls_are_logged_by_the_paths_of_who_acts(whole):
     log = PlayedEpisodes(played, episode_seeds(0, 4))
     assert log.labels == ("left", "inner/balance", "inner/right", "push")
     for i, name in enumerate(log.labels):
-        own = [c for e in log.episodes for c in e.calls if c.skill == i]
+        own = np.concatenate([e.calls[e.calls["skill"] == i] for e in log.episodes])
         told = score.skills[name]
-        assert (len(own), sum(c.steps for c in own)) == (told.calls, told.steps)
-        ends = {end: sum(c.why == end for c in own) for end in told.ended}
+        assert (len(own), own["steps"].sum()) == (told.calls, told.steps)
+        ends = {name: int((own["end_reason"] == end).sum()) for end, name in ENDS.items()}
         assert ends == told.ended
-        own_sum = sum(c.own for c in own)
+        own_sum = own["own_return"].sum()
         assert own_sum == pytest.approx(told.return_sum, rel=1e-5, abs=1e-5)
     assert [len(e.rewards) for e in log.episodes] == list(score.lengths)
     for i, calls in enumerate(e.calls for e in log.episodes):
-        ends = np.cumsum([c.steps for c in calls])
-        assert [c.start for c in calls] == [0, *ends[:-1]]
+        ends = np.cumsum(calls["steps"])
+        assert calls["age"].tolist() == [0, *ends[:-1]]
         assert ends[-1] == score.lengths[i]
 
 

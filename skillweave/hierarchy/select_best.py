@@ -19,7 +19,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry
 from skillweave.training.episodes import standard_error
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.training.skill_text import stuck_selector, useless_skills
+from skillweave.training.skill_report import stuck_selector, useless_skills
 from skillweave.training.stage import TOGETHER, Policies
 from skillweave.training.trainer import Course
 

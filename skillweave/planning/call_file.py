@@ -72,9 +72,9 @@ class CallsHeader(TypedDict):
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     info: list[str]
-    goals: NotRequired[list[str]]
+    goals: list[str]
     """The skills that have goals."""
-    code: NotRequired[Texts]
+    code: Texts
     run: NotRequired[LoggedRun]
 
 
@@ -133,10 +133,9 @@ def _fields(
     places = obs_codec(spaces["observation_space"]).size
     if any(place >= places for seen in header["sees"] for place in seen or ()):
         raise ValueError(f"'sees' has places beyond the {places} of an observation")
-    goals = tuple(header.get("goals", ()))
-    if not set(goals) <= set(skills):
+    if not set(header["goals"]) <= set(skills):
         raise ValueError("it has goals of other skills")
-    columns = _columns(tensors, header | {"goals": goals}, spaces)
+    columns = _columns(tensors, header, spaces)
     offset = columns["offset"]
     if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
         raise ValueError("'offset' is out of range")
@@ -146,8 +145,8 @@ def _fields(
         **{name: tuple(header[name]) for name in ("skills", "lengths", *PLAIN)},
         "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
         "info": {key: columns[INFO + key] for key in header["info"]},
-        "goals": {name: columns[GOAL + name] for name in goals},
-        "code": header.get("code", {}),
+        "goals": {name: columns[GOAL + name] for name in header["goals"]},
+        "code": header["code"],
     }
 
 

@@ -12,10 +12,11 @@ from urllib.parse import quote
 
 from skillweave.planning.run_log import handover_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import WHY, facts, plain, settings, skill_rows, stage_rows
+from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, settings, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
+from skillweave.training.skill_report import cells_of, skill_rows
 
 
 def write_card(
@@ -118,14 +119,9 @@ def _measured(saved: SavedEvaluation | None) -> str:
     if score.skills:
         ends = (f"ends {w}" for w in WHY.values())
         head = ("skill", "of all steps", "calls", "steps of a call", *ends, "success")
-        rows = [
-            [
-                *(row["name"], row["percent"], row["calls"], row["length"], *row["ends"]),
-                *(row["success"], row["return"]),
-            ]
-            for row in skill_rows(score.skills)
-        ]
-        lines += ["", "What each skill did:", "", *_table((*head, "own return of a call"), rows)]
+        head = (*head, "own return of a call")
+        rows = map(cells_of, skill_rows(score.skills, WORDS))
+        lines += ["", "What each skill did:", "", *_table(head, rows)]
     return "\n".join(lines)
 
 

@@ -47,7 +47,7 @@ class SavedEvaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary as plain JSON, with time, seed and kind of the evaluation."""
-        header = {"made": self.made, "seed": self.seed, "deterministic": self.deterministic}
+        header = {k: value for k, value in vars(self).items() if k != "evaluation"}
         return header | self.evaluation.to_json()
 
 
@@ -63,16 +63,11 @@ def save_evaluation(
             the run is one of ``from_hub``.
     """
     must_be_own(run.path)
-    content = EvaluationFile(
-        made=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        seed=seed,
-        deterministic=deterministic,
-        evaluation=evaluation,
-    )
+    made = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    content = asdict(SavedEvaluation(made, seed, deterministic, evaluation))
     if "id" in run.manifest:
         content["run"] = run.manifest["id"]
-    plain = {**content, "evaluation": asdict(evaluation)}
-    write_json(run.path / _name(deterministic), plain, make_directories=False)
+    write_json(run.path / _name(deterministic), content, make_directories=False)
     _track(run, evaluation)
 
 

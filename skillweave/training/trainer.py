@@ -19,19 +19,21 @@ from skillweave.collecting.group import MakeCollector
 from skillweave.collecting.interrupts import deferred
 from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
+from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
+from skillweave.paths import names_in
+from skillweave.planning.recorder import Recorder
+from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
 from skillweave.runs.manifest import Checkpoint, StageEntry
 from skillweave.runs.trackers import Listener
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.eval_envs import episodes_of
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.logged_calls import begin_calls, save_logged
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
-from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse, remove_rehearsal
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
@@ -345,3 +347,43 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     if recorder is not None:
         save_logged(run, entry, recorder, policies)
     return policies
+
+
+def begin_calls(
+    run: RunDirectory, entry: StageEntry, learning_task: LearningTask
+) -> tuple[LearningTask, Recorder | None]:
+    """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
+    steps, called = run.manifest.get("log_calls"), learning_task.called
+    if steps is None or called is None:
+        return learning_task, None
+    info, num_envs = tuple(run.manifest["log_calls_info"]), entry.num_envs
+    spaces = called.spec.spaces.observation, called.spec.spaces.action
+    recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps, spec=called.spec)
+    return replace(learning_task, log_calls=info), recorder
+
+
+def save_logged(
+    run: RunDirectory, entry: StageEntry, recorder: Recorder, policies: Mapping[str, Policy]
+) -> None:
+    """Write the calls of a finished stage into its run.
+
+    Args:
+        policies: that the stage has trained, by path.
+    """
+    skills = recorder.skills
+    learning = {names_in(path)[0] for path in entry.learns} & {s.name for s in skills.skills}
+    recorder.skills = replace(
+        skills,
+        policies=tuple(
+            policies.get(skill.name, policy)
+            for skill, policy in zip(skills.skills, skills.policies, strict=True)
+        ),
+    )
+    log = recorder.log(learning)
+    if len(log):
+        save_calls(run, log)
+    else:
+        notice(
+            f"stage {entry.name!r}: no whole call was recorded in the latest "
+            f"{recorder.latest:,} steps (log_calls), so the run has no log of them"
+        )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.policies.core import flat
@@ -15,7 +15,7 @@ from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import as_json
 from skillweave.skills import Skill
-from skillweave.training.skill_report import SkillReport, all_steps
+from skillweave.training.skill_report import SkillReport, Words
 
 DIGITS = 3
 """Significant digits."""
@@ -62,6 +62,11 @@ def percent(value: float | None) -> str:
     if 0.995 <= value < 1:
         return ">99 %"
     return f"{100 * value:.0f} %"
+
+
+def span(bounds: Iterable[Any], say: Callable[[float], str] = percent) -> str:
+    """Return the bounds of an interval in words."""
+    return " to ".join(say(float(bound)) for bound in bounds)
 
 
 # Runs and stages
@@ -229,37 +234,8 @@ WHY = {
     "episode": "with the episode",
 }
 """Ends of calls in the page's words."""
-
-
-def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
-    """Return a row for each skill."""
-    total = all_steps(reports)
-    longest = max(scale_of(report.length_mean for report in reports.values()), 10)
-    rows = []
-    for name, report in reports.items():
-        calls = report.calls
-        known = bool(report.ended and calls)
-        rows.append(
-            {
-                "name": name,
-                "share": report.steps / total if total else 0.0,
-                "percent": percent(report.steps / total if total else 0.0),
-                "calls": f"{calls:,}",
-                "length": number(report.length_mean, longest),
-                "ends": end_cells(report.ended, report.own_with_episode, calls if known else 0),
-                "success": percent(report.success_rate),
-                "return": number(report.return_mean),
-            }
-        )
-    return rows
-
-
-def end_cells(reasons: Mapping[str, int], own_with_episode: int, calls: int) -> list[str]:
-    """Return the shares of the ends of calls; 0 ``calls``: unknown."""
-    cells = [percent(reasons[why] / calls if calls else None) for why in WHY]
-    if own_with_episode:
-        cells[0] += f" ({percent(own_with_episode / calls)} in the last step)"
-    return cells
+WORDS: Words = (percent, number, "in the last step")
+"""How the page writes the rows of skills."""
 
 
 def about(skill: Skill) -> str:
@@ -268,19 +244,6 @@ def about(skill: Skill) -> str:
         if text := inspect.cleandoc(kind.__doc__ or ""):
             return " ".join(text.split("\n\n")[0].split()).replace("``", "`")
     return ""
-
-
-def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
-    """Return a row for each reflex: in how many of ``total`` steps it acted."""
-    return [
-        {
-            "name": name,
-            "steps": f"{steps:,}",
-            "share": steps / total,
-            "percent": percent(steps / total),
-        }
-        for name, steps in reflexes.items()
-    ]
 
 
 def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
@@ -305,10 +268,6 @@ def transition_rows(
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)
-        shares = [n / total if total else 0.0 for n in row]
-        cells = [
-            {"count": f"{n:,.0f}", "share": share, "percent": percent(share)}
-            for n, share in zip(row, shares, strict=True)
-        ]
+        cells = [{"count": f"{n:,.0f}", "share": n / total if total else 0.0} for n in row]
         rows.append({"name": name, "total": total, "cells": cells})
     return rows

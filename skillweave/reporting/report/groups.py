@@ -120,7 +120,7 @@ class OverSeeds:
         """Return a single number's interval in words; empty: it has none."""
         if self.low is None or self.high is None:
             return ""
-        return f"{say(float(self.low))} to {say(float(self.high))}"
+        return facts.span((self.low, self.high), say)
 
 
 def over_seeds(values: Array | Sequence[float]) -> OverSeeds:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from skillweave.errors import needs_extra
+from skillweave.reporting.report.facts import percent
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"
@@ -54,6 +55,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["percent"] = percent
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     parts = {
         "style": (LOCAL / "style.css").read_text("utf-8"),
