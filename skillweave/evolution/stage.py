@@ -258,8 +258,10 @@ class EvolvingPopulation:
         store = self.population.part.store
         if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
             tensors |= prefixed("store", store.state())
-        best = self.best
-        weights, about = ({}, {}) if best is None else best.policy.to_file()
+        best, entry, weights = self.best, None, dict[str, Tensor]()
+        if best is not None:
+            weights, header = best.policy.to_file()
+            entry = BestEntry(best.fitness, best.number, best.generation, header)
         self.log.at.population = Generation(
             self.fitness_steps,
             self.done,
@@ -269,7 +271,7 @@ class EvolvingPopulation:
                 MemberEntry(m.number, m.steps, config_to_json(m.config), m.origin)
                 for m in self.population.members
             ],
-            None if best is None else BestEntry(best.fitness, best.number, best.generation, about),
+            entry,
         )
         self.log.save(None, tensors | prefixed("best", weights))
 

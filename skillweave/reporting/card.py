@@ -42,15 +42,15 @@ def write_card(
         _training(run),
         *(_shown(path) for path in figures),
         _folded("All settings", ("setting", "value"), settings(run.manifest)),
-        _folded("Versions", ("of", "version"), run.manifest["versions"]),
+        _folded("Versions", ("of", "version"), run.manifest.versions),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
     """Return the YAML that the hub reads; every value is written as JSON, which is YAML too."""
-    env = run.manifest["env"]
-    kind = "hierarchical-" if run.manifest["kind"] == "hierarchy" else ""
+    env = run.manifest.env
+    kind = "hierarchical-" if run.manifest.hierarchy else ""
     header: dict[str, Any] = {
         "library_name": "skillweave",
         "pipeline_tag": "reinforcement-learning",
@@ -68,7 +68,7 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
 
 
 def _about(run: RunDirectory) -> str:
-    what = "hierarchy of skills" if run.manifest["kind"] == "hierarchy" else "plain agent"
+    what = "hierarchy of skills" if run.manifest.hierarchy else "plain agent"
     _, _, *rows = _table(("", ""), facts(run))
     return "\n".join([f"A {what}, trained with Skillweave.", "", "| | |", "|---|---|", *rows])
 
@@ -80,7 +80,7 @@ def _shown(path: str) -> str:
 
 
 def _use(run: RunDirectory, name: str) -> str:
-    code = run.manifest.get("needs_recipe", True)
+    code = run.manifest.needs_recipe
     given = ", hierarchy" if code else ""
     lines = ["## Use", ""]
     if code:
@@ -100,8 +100,8 @@ def _use(run: RunDirectory, name: str) -> str:
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
     ]
-    skills = run.manifest.get("skills", ())
-    if stays := [s for s in skills if s.policy and s.policy["kind"] == "onnx"]:
+    skills = run.manifest.skills
+    if stays := [s for s in skills if s.policy is not None and s.policy.kind == "onnx"]:
         names = ", ".join(text(s.name) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)

@@ -45,7 +45,7 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     written = []
     must_be_own(folder)
     metrics = list(run.metrics())
-    for i, stage in enumerate(run.manifest["stages"]):
+    for i, stage in enumerate(run.manifest.stages):
         name = stage.name
         color = hex_of(color_of(i + 1))
         if lineage := read_lineage(run, name):

@@ -19,10 +19,10 @@ def begin_calls(
     run: RunDirectory, entry: StageEntry, learning_task: LearningTask
 ) -> tuple[LearningTask, Recorder | None]:
     """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
-    steps, called = run.manifest.get("log_calls"), learning_task.called
+    steps, called = run.manifest.log_calls, learning_task.called
     if steps is None or called is None:
         return learning_task, None
-    info, num_envs = tuple(run.manifest["log_calls_info"]), entry.num_envs
+    info, num_envs = run.manifest.log_calls_info, entry.num_envs
     spaces = called.spec.spaces.observation, called.spec.spaces.action
     recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps, spec=called.spec)
     return replace(learning_task, log_calls=info), recorder
