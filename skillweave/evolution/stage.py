@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
-from skillweave.runs.manifest import BestEntry, Generation, MemberEntry, Winner
+from skillweave.runs.manifest import BestEntry, Generation, LineageLine, MemberEntry, Winner
 from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
@@ -325,20 +325,20 @@ def lineage_of(
     fitness: Array,
     evolution: Evolution,
     best: int | None,
-) -> list[dict[str, Any]]:
+) -> list[LineageLine]:
     """Return a generation's lines; ``best``: the best member's number, if it is among them."""
     return [
-        {
-            "stage": stage,
-            "generation": generation,
-            "member": member.number,
-            **asdict(member.origin),
-            "fitness": float(value) if np.isfinite(value) else None,
-            "diverged": not np.isfinite(value),
-            "best": member.number == best,
-            "steps": member.steps,
-            "settings": settings_of(member.config, evolution),
-        }
+        LineageLine(
+            stage=stage,
+            generation=generation,
+            member=member.number,
+            **vars(member.origin),
+            fitness=float(value) if np.isfinite(value) else None,
+            diverged=not np.isfinite(value),
+            best=member.number == best,
+            steps=member.steps,
+            settings=settings_of(member.config, evolution),
+        )
         for member, value in zip(members, fitness, strict=True)
     ]
 

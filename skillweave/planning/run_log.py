@@ -190,9 +190,9 @@ def _misfit(run: RunDirectory) -> str | None:
     if "run" not in header:
         return "was not written by this run"
     of: LoggedRun = fit(LoggedRun, header["run"], str(path), "run")
-    if of["id"] != run.manifest.id:
+    if of.id != run.manifest.id:
         return "belongs to another run"
-    if of["skills"] != _weights(run):
+    if of.skills != _weights(run):
         return "is of the skills before they learnt on"
     return None
 

@@ -57,8 +57,8 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
         "tags": [f"{kind}reinforcement-learning", "skillweave", env],
     }
     if saved is not None:
-        score = saved.evaluation.to_json()
-        value = f"{score['mean']:.2f} +/- {score['std']:.2f}"
+        score = saved.evaluation
+        value = f"{score.mean:.2f} +/- {score.to_json()['std']:.2f}"
         task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
         metric = {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
         result = {"task": task, "dataset": {"name": env, "type": env}, "metrics": [metric]}

@@ -428,17 +428,22 @@ class BestEntry:
     policy: AgentHeader
 
 
-class LineageLine(TypedDict):
+@dataclass(frozen=True)
+class LineageLine:
     """A line of ``lineage.jsonl``: a member in a generation."""
 
     stage: NodePath
     generation: Count
     member: Count
     parent: Count | None
+    """Its number in the generation before; its own where it continued."""
     mutation: str
     changes: dict[str, tuple[Any, Any]]
     fitness: float | None
+    diverged: bool
     best: bool
+    """It was the best so far."""
+    steps: Count
     settings: dict[str, Any]
 
 

@@ -215,11 +215,11 @@ def _run_row(
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.steps or 0 for s in stages):,}",
         "seconds": f"{sum(s.seconds or 0.0 for s in stages):,.0f}",
-        "mean": say(None if score is None else score["mean"]),
+        "mean": say(None if saved is None else saved.evaluation.mean),
         "iqm": say(None if score is None else score["iqm"]),
         "solved": percent(None if saved is None else solved_share(saved.evaluation)),
         "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
-        "episodes": NOTHING if score is None else str(score["episodes"]),
+        "episodes": NOTHING if saved is None else str(len(saved.evaluation.returns)),
     }
 
 

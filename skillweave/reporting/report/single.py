@@ -347,14 +347,14 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     low, high = (number(value, scale) for value in score_json["ci95"])
     count = solved(score)
     words: dict[str, Any] = {
-        "mean": number(score_json["mean"], scale),
+        "mean": number(score.mean, scale),
         "interval": None if len(score.returns) == 1 else f"{low} to {high}",
         "iqm": number(score_json["iqm"], scale),
-        "range": f"{number(score_json['min'], scale)} to {number(score_json['max'], scale)}",
-        "reached": percent(score_json["solved_fraction"]),
+        "range": f"{number(min(score.returns), scale)} to {number(max(score.returns), scale)}",
+        "reached": percent(score.solved_fraction),
         "threshold": None if score.threshold is None else f"{score.threshold:g}",
         "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
-        "cut": score_json["cut"],
+        "cut": score.cut,
         "binary": is_binary(score.returns),
         "solved": None,
     }
