@@ -24,7 +24,6 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     options_of,
     record_initial_policies,
-    recorded_part,
     same_shapes,
 )
 from skillweave.runs.manifest import Manifest, StageEntry
@@ -263,13 +262,14 @@ def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Le
     cannot = f"start_from: {role.path!r} cannot start with what it learnt in {learnt.where}: "
     if what:
         raise RunError(cannot + what)
-    now = recorded_part(content, role.path) or {}
-    then = learnt.part or now
-    for field in now:
-        if now[field] != then[field]:
+    here = content.by_path.get(role.path)
+    there = learnt.entry or here
+    for field in ("sees", "acts", "residual"):
+        then, now = getattr(there, field, None), getattr(here, field, None)
+        if here is not None and then != now:
             raise RunError(
-                f"{cannot}there its {field} was {shown(then[field])}, and here it is "
-                f"{shown(now[field])}. Declare it as it was, or name the other learners alone, "
+                f"{cannot}there its {field} was {shown(then)}, and here it is "
+                f"{shown(now)}. Declare it as it was, or name the other learners alone, "
                 f"start_from={{name: run}}, and {role.path!r} begins new"
             )
 

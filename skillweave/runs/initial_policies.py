@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentHeader, AgentPolicy
@@ -26,7 +25,7 @@ from skillweave.runs.files import (
     remove,
     write_tensors,
 )
-from skillweave.runs.manifest import Manifest, StageEntry, Start
+from skillweave.runs.manifest import Manifest, SkillEntry, StageEntry, Start
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,8 @@ class Learnt:
     """The other run's ``id``."""
     chooses: Chooses
     """The options that it chooses among, if it is a selector or a critic of skills."""
-    part: Mapping[str, Any] | None = None
-    """Of a skill of a run: its ``recorded_part``; else None."""
+    entry: SkillEntry | None = None
+    """The entry of a skill of a run; else None."""
     code: dict[str, str] = field(default_factory=dict)
     """The other run's texts of its environment and skills."""
 
@@ -75,18 +74,10 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
         for name, policy in run.load_policies(entry.name).items():
             sha256 = sums[name]
             steps = (entry.steps or 0) + (learnt[name].steps if name in learnt else 0)
-            chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
-            of_run = run.manifest.id, chooses, part, run.manifest.code
+            chooses, skill = options_of(run.manifest, name), run.manifest.by_path.get(name)
+            of_run = run.manifest.id, chooses, skill, run.manifest.code
             learnt[name] = Learnt(policy, sha256, steps, str(path), *of_run)
     return learnt
-
-
-def recorded_part(manifest: Manifest, name: str) -> Mapping[str, Any] | None:
-    """Return what a skill sees, what it acts on and its correction; None: of no skill."""
-    skill = manifest.by_path.get(name)
-    if skill is None:
-        return None
-    return {key: getattr(skill, key) for key in ("sees", "acts", "residual")}
 
 
 def options_of(manifest: Manifest, name: str) -> Chooses:
