@@ -48,6 +48,7 @@ from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.repair import Repair, repairs_of
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.weights import (
@@ -277,7 +278,7 @@ class Hierarchy(Declaration):
         cls, spec: EnvSpec, entry: LevelEntry, skills: list[Skill], rest: Any
     ) -> Hierarchy:
         """Return a run's hierarchy, or one below it, from its entry and its skills."""
-        hierarchy = cls(spec, skills, call_steps=entry.calls, rest=rest)
+        hierarchy = cls(spec, skills, call_steps=calls_of(entry), rest=rest)
         hierarchy.recorded = True
         return hierarchy
 

@@ -23,6 +23,7 @@ from skillweave.cli.sweep import sweep
 from skillweave.cli.training import resume, train
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
+from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.weights import HierarchyHeader, open_weights
 from skillweave.notices import notice
 from skillweave.planning import Explorer, Handover, as_task
@@ -273,7 +274,7 @@ def run_lines(
     lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
     calls = ""
     if level is not None:
-        calls = f", call_steps {level.calls}"
+        calls = f", call_steps {calls_of(level)}"
         calls += f", ready selector: {level.selector.kind}" if level.selector else ""
         calls += f", guide: {level.guide.source.kind}" if level.guide else ""
     lines += [f"  recipe: {one_line(manifest.recipe or '(declared in Python)')}{calls}"]

@@ -73,6 +73,11 @@ def level_entry(roles: Roles, level: Level) -> LevelEntry:
     )
 
 
+def calls_of(entry: LevelEntry) -> int | Lengths | None:
+    """Return the limit of calls that a level's entry records."""
+    return Lengths(*entry.call_lengths) if entry.call_lengths else entry.call_steps
+
+
 def with_entry(level: Level, entry: LevelEntry) -> Level:
     """Return a level with the settings that a file records."""
     guide, margin = level.guide, entry.interrupt
@@ -81,7 +86,7 @@ def with_entry(level: Level, entry: LevelEntry) -> Level:
     return replace(
         level,
         learn=entry.learn,
-        call_steps=entry.calls,
+        call_steps=calls_of(entry),
         together=replace(
             level.together,
             interrupt=margin is not None,

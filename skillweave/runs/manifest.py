@@ -16,7 +16,6 @@ from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from skillweave.algorithms.config import config_from_json
 from skillweave.algorithms.policy import AgentHeader
-from skillweave.collecting.lengths import Lengths
 from skillweave.errors import EnvError, RunError
 from skillweave.paths import names_in
 from skillweave.policies.files import shown
@@ -71,11 +70,6 @@ class LevelEntry:
     """The source of a ready selector; None: it is trained."""
     guide: GuideEntry | None = None
     """The ready selector that guides a trained one."""
-
-    @property
-    def calls(self) -> int | Lengths | None:
-        """The limit of its calls."""
-        return Lengths(*self.call_lengths) if self.call_lengths else self.call_steps
 
 
 @dataclass(frozen=True)
