@@ -431,6 +431,20 @@ def to_json(value: Any, where: str, advice: str) -> Any:
     )
 
 
+def as_json(value: Any) -> Any:
+    """Return a record of a file as plain JSON, without fields that are None or empty by default."""
+    if is_dataclass(value):
+        return {
+            f.name: as_json(content)
+            for f in fields(value)
+            if (content := getattr(value, f.name)) not in (None, [], (), {})
+            or f.default is f.default_factory is MISSING
+        }
+    if isinstance(value, Mapping):
+        return {k: as_json(x) for k, x in value.items()}
+    return [as_json(x) for x in value] if isinstance(value, list | tuple) else value
+
+
 # Settings
 
 

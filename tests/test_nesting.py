@@ -21,6 +21,7 @@ from small_runs import (
     lines,
     policies,
     reports_every,
+    small_manifest,
     stage_entry,
     stopped_run,
 )
@@ -237,7 +238,7 @@ def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, ki
 @pytest.mark.parametrize("kind", ["together", "then", "off-policy", "three"])
 def test_all_learn_at_every_level_in_one_stream(whole, kind):
     _, path = whole(kind)
-    entry = RunDirectory.open(path).manifest["stages"][-1]
+    entry = RunDirectory.open(path).manifest.stages[-1]
     assert entry.kind == "together"
     told = {name for line in lines(path) if line["stage"] == entry.name for name in line}
     deep = {k for k in entry.learns if "/" in k}
@@ -328,7 +329,7 @@ def test_a_run_has_everyones_file_with_a_checksum(whole):
     names = {name.removesuffix(".safetensors") for name in policies(path)}
     own = {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
     assert names == own | {f"together.{name}" for name in own}
-    stages = {s.name: s for s in RunDirectory.open(path).manifest["stages"]}
+    stages = {s.name: s for s in RunDirectory.open(path).manifest.stages}
     assert set(stages) == {*(n.replace(".", "/") for n in own), "together"}
     assert all(s.sha256 or all(s.policies.values()) for s in stages.values())
 
@@ -532,7 +533,7 @@ def stage(name, kept):
     ],
 )
 def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
-    run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
+    run = SimpleNamespace(manifest=small_manifest(*(stage(*told) for told in stages.items())))
     found = resolve_greedy(roles_of(declare()), run).levels.values()
     assert tuple(level.selection.greedy_skills for level in found) == greedy
     declared = declare(inside(greedy_skills=False), greedy_skills=True)

@@ -386,7 +386,7 @@ def _rates(before: Handover, later: Handover, place: tuple[int, int]) -> str:
 def repairs_of(run: RunDirectory) -> list[Repair]:
     """Return the repairs of a run that are judged, in their order."""
     repairs = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         repair = entry.repair
         if repair is not None and repair.later is not None:
             repairs.append(

@@ -218,7 +218,7 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
             continue
         source = source_of(policy)
         # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
-        acts = source.get("sha256") or str(source.get("name")).partition(".")[2]
+        acts = source.sha256 or str(source.name).partition(".")[2]
         reflexes = [reflex.name for reflex in skills.reflexes]
         goals = skills.skills[i].goal_space
         own = [] if goals is None else [str(goals)]

@@ -179,13 +179,13 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     if agent is not None:
         points_of_stage = {c.stage: c.points for c in all_curves if c.agent == agent}
     else:
-        whole = {e.name for e in run.manifest["stages"] if e.kind in WHOLE}
+        whole = {e.name for e in run.manifest.stages if e.kind in WHOLE}
         points_of_stage = {
             c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole
         }
     before = 0
     parts = list[tuple[int, dict[str, Curve]]]()
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         if entry.name in points_of_stage:
             parts.append((before, points_of_stage[entry.name]))
         # An agent's steps are the steps of the stages in which it learns.

@@ -17,7 +17,7 @@ from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import error_text, suggest
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.schema import as_json
 from skillweave.terminal import say
 
 MLFLOW_EXPERIMENT = "skillweave"
@@ -172,7 +172,7 @@ class MLflow(Tracker):
                 "MLFLOW_TRACKING_URI, or train without this tracker"
             ) from error
         self._id: str = mlflow_run.info.run_id
-        stages = [stage.name for stage in run.manifest["stages"]]
+        stages = [stage.name for stage in run.manifest.stages]
         self._sent_steps = {s: mlflow_run.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
 
     def _existing(self, tag: str) -> Any:
@@ -197,8 +197,9 @@ class MLflow(Tracker):
             tags={MLFLOW_TAG: tag},
             run_name=self._run.path.resolve().name,
         )
-        settings = {k: v for k, v in manifest.items() if not isinstance(v, dict | list)}
-        for stage in manifest["stages"]:
+        fields = {"kind": manifest.kind} | as_json(manifest) | (as_json(manifest.hierarchy) or {})
+        settings = {k: v for k, v in fields.items() if not isinstance(v, dict | list)}
+        for stage in manifest.stages:
             settings |= flat(stage.algorithm, f"{stage.name}.")
         param = importlib.import_module("mlflow.entities").Param
         params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
@@ -252,7 +253,7 @@ class MLflow(Tracker):
 
 def identifier(run: RunDirectory) -> str:
     """Return 16 letters that identify a run, also when it is resumed."""
-    parts = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
+    parts = (str(run.path.resolve()), run.manifest.created, run.manifest.id)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
@@ -289,7 +290,7 @@ def trackers_of(run: RunDirectory) -> Iterator[tuple[Tracker, ...]]:
     """
     with ExitStack() as stack:
         try:
-            trackers = make_trackers(run.manifest.get("track", ()), run)
+            trackers = make_trackers(run.manifest.track, run)
         except MissingExtra:
             trackers = ()
         for tracker in trackers:
@@ -306,7 +307,7 @@ def track_film(run: RunDirectory, path: Path) -> None:
 
 def steps_of(run: RunDirectory) -> int:
     """Return the environment steps of all stages."""
-    return sum(stage.steps or 0 for stage in run.manifest["stages"])
+    return sum(stage.steps or 0 for stage in run.manifest.stages)
 
 
 def wandb_mode() -> Any:

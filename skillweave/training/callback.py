@@ -105,7 +105,7 @@ class TrainCallback(Listener):
         steps: int,
         metrics: Mapping[str, float | None],
     ) -> TrainEvent:
-        stages = self._run.manifest["stages"]
+        stages = self._run.manifest.stages
         done = [s for s in stages if s.done]
         budget = self._run.stage(name).budget
         passed = sum(s.budget for s in done) + min(steps, budget)
@@ -114,7 +114,7 @@ class TrainCallback(Listener):
             stage=name,
             steps=steps,
             budget=budget,
-            total_steps=sum(s.steps for s in done) + steps,
+            total_steps=sum(s.steps or 0 for s in done) + steps,
             progress=passed / sum(s.budget for s in stages),
             metrics={k: float(v) for k, v in metrics.items() if v is not None},
             run_dir=self._run.path,

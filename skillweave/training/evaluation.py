@@ -221,11 +221,13 @@ class Evaluation:
         j = self.to_json()
         digits = 2 if max(map(abs, self.returns)) < 10 else 1  # many are shares: 0 to 1
         mean, std, low, high, iqm = (
-            f"{value:.{digits}f}" for value in (j["mean"], j["std"], *j["ci95"], j["iqm"])
+            f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
         )
-        line = f"{mean} ± {std} over {j['episodes']} episodes (95 % CI {low} to {high}, IQM {iqm})"
-        if j["solved_fraction"] is not None:
-            line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
+        line = (
+            f"{mean} ± {std} over {len(self.returns)} episodes (95 % CI {low} to {high}, IQM {iqm})"
+        )
+        if self.solved_fraction is not None:
+            line += f", {self.solved_fraction:.0%} at {self.threshold:g} or more"
         if self.success_rate is not None:
             line += f", {self.success_rate:.0%} succeed"
         line += f", {j['length_mean']:.0f} steps an episode"

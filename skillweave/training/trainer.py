@@ -63,8 +63,6 @@ class OneAgent:
         """Make the environments and the agent; return the agent's state."""
         stage, config, learning_task = self.stage, self.stage.config, self.stage.learning_task
         manifest = stage.run.manifest
-        every = manifest.get("eval_every")
-        episodes = manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
         workers = stage.entry.workers
         make = partial(_seeded, self.maker(), stage.seeds / "global")
@@ -73,7 +71,11 @@ class OneAgent:
         )
         self._resources.callback(self.collectors.close)
         self.evaluation = PeriodicEvaluation(
-            learning_task, stage.seeds, every, episodes, config.num_envs
+            learning_task,
+            stage.seeds,
+            manifest.eval_every,
+            manifest.eval_episodes,
+            config.num_envs,
         )
         self._resources.callback(self.evaluation.close)
         self.episodes = Episodes(learning_task.log_info)
@@ -217,7 +219,7 @@ class OneAgent:
                 self.stage.seeds,
                 self.stage.budget,
                 resume_from=self.at,
-                checkpoint_every=int(self.stage.run.manifest["checkpoint_every"]),
+                checkpoint_every=self.stage.run.manifest.checkpoint_every,
                 on_tick=on_tick,
                 on_checkpoint=on_checkpoint,
                 on_calls=None if self.stage.recorder is None else self.stage.recorder.add,
@@ -322,9 +324,9 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
         remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
-    seeds = Seeds(int(run.manifest["seed"])) / stage.name
+    seeds = Seeds(run.manifest.seed) / stage.name
     learning_task = stage.learning_task(earlier)
-    if keys := run.manifest.get("log_info"):
+    if keys := run.manifest.log_info:
         learning_task = replace(learning_task, log_info=tuple(keys))
     learning_task, recorder = begin_calls(run, entry, learning_task)
     learner = course.make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
@@ -353,10 +355,10 @@ def begin_calls(
     run: RunDirectory, entry: StageEntry, learning_task: LearningTask
 ) -> tuple[LearningTask, Recorder | None]:
     """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
-    steps, called = run.manifest.get("log_calls"), learning_task.called
+    steps, called = run.manifest.log_calls, learning_task.called
     if steps is None or called is None:
         return learning_task, None
-    info, num_envs = tuple(run.manifest["log_calls_info"]), entry.num_envs
+    info, num_envs = run.manifest.log_calls_info, entry.num_envs
     spaces = called.spec.spaces.observation, called.spec.spaces.action
     recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps, spec=called.spec)
     return replace(learning_task, log_calls=info), recorder

@@ -208,7 +208,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -> None:
     runs = [RunDirectory.open(folder / name) for name in "abc"]
     first, second = grouped(runs)
-    assert [r.manifest["seed"] for r in first.runs] == [0, 1]
+    assert [r.manifest.seed for r in first.runs] == [0, 1]
     assert (first.key, first.name) == ("A", "cart, call_steps 5")
     assert (second.key, second.name) == ("B", "cart, call_steps 3")
     assert [g.name for g in grouped(runs[:2])] == ["cart"]

@@ -13,7 +13,8 @@ from typing import Any
 from skillweave.policies.core import flat
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.runs.manifest import LevelEntry, Manifest
+from skillweave.schema import as_json
 from skillweave.skills import Skill
 from skillweave.training.skill_report import SkillReport, Words
 
@@ -88,6 +89,8 @@ MADE = {
     "continued",
 }
 """Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
+OF_CODE = ("selector", "guide")
+"""Fields of the outermost hierarchy's entry that are no settings."""
 
 
 def name_of(run: RunDirectory) -> str:
@@ -98,28 +101,27 @@ def name_of(run: RunDirectory) -> str:
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
     manifest = run.manifest
-    rows = [("Environment", manifest["env"])]
-    if manifest["env_kwargs"]:
-        rows.append(("Made with", plain(manifest["env_kwargs"])))
-    rows.append(("Recipe", manifest.get("recipe") or "declared in Python"))
-    rows += [("Seed", str(manifest["seed"])), ("Made", manifest["created"].replace("T", " "))]
-    if manifest["kind"] == "hierarchy":
-        rows.append(("Skills", ", ".join(s.name for s in manifest["skills"])))
-        rows.append(("A call lasts", _call_length(manifest)))
-        selector = manifest.get("selector")
-        rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
-        rows.append(("Learning", manifest.get("learn", "apart")))
-        if manifest.get("interrupt") is not None:
-            rows.append(("Calls are cut at", f"{manifest['interrupt']} deviations"))
-        if manifest.get("reflexes"):
-            rows.append(("Reflexes", ", ".join(manifest["reflexes"])))
+    rows = [("Environment", manifest.env)]
+    if manifest.env_kwargs:
+        rows.append(("Made with", plain(manifest.env_kwargs)))
+    rows.append(("Recipe", manifest.recipe or "declared in Python"))
+    rows += [("Seed", str(manifest.seed)), ("Made", manifest.created.replace("T", " "))]
+    if (level := manifest.hierarchy) is not None:
+        rows.append(("Skills", ", ".join(manifest.by_path)))
+        rows.append(("A call lasts", _call_length(level)))
+        rows.append(("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"))
+        rows.append(("Learning", level.learn))
+        if level.interrupt is not None:
+            rows.append(("Calls are cut at", f"{level.interrupt} deviations"))
+        if level.reflexes:
+            rows.append(("Reflexes", ", ".join(level.reflexes)))
     return rows
 
 
-def _call_length(manifest: Mapping[str, Any]) -> str:
-    if "call_lengths" in manifest:
-        return f"{plain(manifest['call_lengths'])} steps at most, as the selector chooses"
-    most = manifest["call_steps"]
+def _call_length(level: LevelEntry) -> str:
+    if level.call_lengths:
+        return f"{plain(level.call_lengths)} steps at most, as the selector chooses"
+    most = level.call_steps
     if most is None:
         return "until the skill stops"
     return "1 step" if most == 1 else f"at most {most:,} steps"
@@ -128,7 +130,7 @@ def _call_length(manifest: Mapping[str, Any]) -> str:
 def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
     """Return a row for each stage; ``steps``: by stage, the steps of its last metrics."""
     rows = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         notes = []
         if entry.continued:
             notes.append(f"continued after {', '.join(f'{k:,}' for k in entry.continued)} steps")
@@ -161,7 +163,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     """Return a sentence for each unfinished stage; ``steps``: by stage, at its last metrics."""
     sentences = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         name, budget = entry.name, entry.budget
         if entry.status == "waiting":
             sentences.append(f"The stage {name!r} has not begun.")
@@ -178,32 +180,17 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     return sentences
 
 
-def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def settings(manifest: Manifest) -> dict[str, Any]:
     """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    values: dict[str, Any] = {"env": manifest["env"]} | flat(manifest["env_kwargs"], "env_kwargs.")
-    names = (
-        "kind",
-        "learn",
-        "call_steps",
-        "call_lengths",
-        "interrupt",
-        "greedy_skills",
-        "greedy_selector",
-        "start_calls",
-        "search_steps",
-        "episode_calls",
-        "call_cost",
-        "reflexes",
-        "checkpoint_every",
-        "eval_every",
-        "eval_episodes",
-        "keep",
-    )
-    values |= {k: manifest[k] for k in names if k in manifest}
-    for skill in manifest.get("skills", ()):
+    values: dict[str, Any] = {"env": manifest.env} | flat(manifest.env_kwargs, "env_kwargs.")
+    level = as_json(manifest.hierarchy) or {}
+    values |= {"kind": manifest.kind} | {k: level[k] for k in level if k not in OF_CODE}
+    names = ("checkpoint_every", "eval_every", "eval_episodes", "keep")
+    values |= {name: getattr(manifest, name) for name in names}
+    for skill in manifest.skills:
         fields = {k: v for k, v in as_json(skill).items() if k != "name"}
         values |= flat(fields, f"skills.{skill.name}.")
-    for entry in manifest["stages"]:
+    for entry in manifest.stages:
         left_out = LEFT_OUT | MADE | {"name", "starts"}
         fields = {k: v for k, v in as_json(entry).items() if k not in left_out}
         # From which run differs from seed to seed.

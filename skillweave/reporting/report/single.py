@@ -225,7 +225,7 @@ def write_report(
             sections.append(played.section)
         except SkillweaveError as error:
             missing.append(f"There are no episodes and no film: {_sentence(error)}")
-    if not all_curves and run.manifest["stages"]:
+    if not all_curves and run.manifest.stages:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
     try:
@@ -262,10 +262,10 @@ def _sentence(error: SkillweaveError) -> str:
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
-    names = [skill.name for skill in run.manifest.get("skills", ())]
+    names = [skill.name for skill in run.manifest.skills]
     colors = {name: color_of(i) for i, name in enumerate(names)}
     colors |= {} if played is None else played.colors
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         for name in (entry.name, *entry.learns, *entry.algorithms):
             colors.setdefault(name, color_of(len(colors)))
     return {name: hex_of(color) for name, color in colors.items()}
@@ -290,17 +290,17 @@ def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) ->
     manifest = run.manifest
     return {
         "title": facts.name_of(run),
-        "kind": "hierarchy" if manifest["kind"] == "hierarchy" else "plain agent",
-        "env": manifest["env"],
+        "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
+        "env": manifest.env,
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
-        "versions": list(manifest["versions"].items()),
+        "versions": list(manifest.versions.items()),
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
-            for entry in manifest["stages"]
+            for entry in manifest.stages
         ),
-        "training_seconds": sum(entry.seconds or 0.0 for entry in manifest["stages"]),
+        "training_seconds": sum(entry.seconds or 0.0 for entry in manifest.stages),
         "missing": missing,
         "finished": run.finished,
     }
@@ -318,7 +318,7 @@ def _scores(
             saved, source = own, "played for this report"
     if saved is None:
         nothing: dict[str, Any] = dict.fromkeys(("skill_table", "reflexes", "transitions"), ())
-        text = no_verdict(run.manifest["stages"])
+        text = no_verdict(run.manifest.stages)
         return nothing | {"verdict": text, "binary": False, "score": None}
     score = saved.evaluation
     docs = (
@@ -350,14 +350,14 @@ def score_words(score: Evaluation) -> dict[str, Any]:
     say = partial(number, scale=scale_of(score.returns))
     count = solved(score)
     words: dict[str, Any] = {
-        "mean": say(score_json["mean"]),
+        "mean": say(score.mean),
         "interval": None if len(score.returns) == 1 else span(score_json["ci95"], say),
         "iqm": say(score_json["iqm"]),
-        "range": span((score_json["min"], score_json["max"]), say),
-        "reached": percent(score_json["solved_fraction"]),
+        "range": span((min(score.returns), max(score.returns)), say),
+        "reached": percent(score.solved_fraction),
         "threshold": None if score.threshold is None else f"{score.threshold:g}",
         "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
-        "cut": score_json["cut"],
+        "cut": score.cut,
         "binary": is_binary(score.returns),
         "solved": None,
     }
@@ -371,7 +371,7 @@ def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]
     """Return a section for each stage whose population evolved."""
     sections = []
     data["trees"] = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         lineage = read_lineage(run, entry.name)
         if lineage is None:
             continue
