@@ -66,7 +66,7 @@ def _half_done(path: Path) -> bool:
     if not (path / "run.json").exists():
         return False
     run = RunDirectory.open(path)
-    last = run.manifest["stages"][-1]
+    last = run.manifest.stages[-1]
     at = [x["steps"] for x in run.metrics() if x["stage"] == last.name]
     return bool(at) and at[-1] > last.budget / 2
 
@@ -75,7 +75,7 @@ def weights(run: RunDirectory) -> dict[str, dict[str, bytes]]:
     """Return all that every stage has learnt."""
     return {
         f"{stage.name}.{name}": {k: v.numpy().tobytes() for k, v in policy.to_file()[0].items()}
-        for stage in run.manifest["stages"]
+        for stage in run.manifest.stages
         for name, policy in run.load_policies(stage.name).items()
     }
 

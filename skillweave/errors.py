@@ -5,6 +5,8 @@ Each message is one sentence for people: what is wrong, where, and what to do ab
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from skillweave.policies.errors import (
@@ -41,6 +43,15 @@ class MissingExtra(SkillweaveError, ImportError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Support pickling, because the arguments differ from the message."""
         return make_error, ("MissingExtra", str(self))
+
+
+@contextmanager
+def needs_extra(feature: str, extra: str) -> Iterator[None]:
+    """Raise MissingExtra where a package that is imported within the block is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtra(feature, extra) from error
 
 
 class Interrupted(ShortTraceback, KeyboardInterrupt):

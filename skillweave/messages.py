@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -57,6 +57,19 @@ def shortened(text: str, longest: int = 500) -> str:
     """Return text for a message, its middle left out where it is long."""
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} … {text[-half:]}"
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> str:
+    """Return a table, a line for each row.
+
+    Args:
+        rows: cells of text, equally many in each.
+        left: the number of columns that are aligned left; the others are aligned right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    pads = (str.ljust,) * left + (str.rjust,) * (len(widths) - left)
+    lines = ("  ".join(p(c, w) for p, c, w in zip(pads, row, widths, strict=True)) for row in rows)
+    return "\n".join(lines)
 
 
 def suggest(

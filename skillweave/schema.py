@@ -38,9 +38,7 @@ from skillweave.policies.files import shown
 C = TypeVar("C", bound=type[Any])
 
 LARGEST = 2**63
-"""The limit of whole numbers in files."""
-BITS = 43
-"""Those that are declared need no more bits: a million times they fit into 64."""
+"""The limit of whole numbers, which arrays of int64 must represent."""
 LARGEST_FLOAT = 3.4e38
 """The limit of other numbers, which tensors of float32 must represent."""
 LONGEST_TEXT = 4096
@@ -54,11 +52,13 @@ class Check(NamedTuple):
     """A condition on a field: ``Annotated[int, Check("at least 1", lambda x: x >= 1)]``.
 
     Beside numbers the text continues "a whole number". Beside any other type it replaces the
-    description of the type.
+    description of the type. ``convert`` first brings other forms of a value into one of this
+    kind; it raises an error where it cannot.
     """
 
     text: str
     holds: Callable[[Any], bool] = lambda _: True
+    convert: Callable[[Any], Any] = lambda x: x
 
 
 AtLeastOne = Annotated[int, Check("at least 1", lambda x: x >= 1)]
@@ -160,7 +160,7 @@ class _Fitting:
         kind, checks = _parts(kind)
         text = ", ".join(check.text for check in checks)
         try:
-            found = self._inside(kind, value, path)
+            found = self._inside(kind, _converted(value, checks), path)
         except _Unfit as error:
             if text and error.path == path:
                 error = _Unfit(path, value, text)
@@ -171,8 +171,7 @@ class _Fitting:
             whole = isinstance(found, int)
             if not whole and not math.isfinite(found):
                 raise _Unfit(path, found, text or _FINITE)
-            bits = BITS if self.file is None and kind is int else 63
-            largest, limit = (2**bits, f"2^{bits}") if whole else (LARGEST_FLOAT, "3.4e38")
+            largest, limit = (LARGEST, "2^63") if whole else (LARGEST_FLOAT, "3.4e38")
             if abs(found) >= largest:
                 raise _Unfit(path, found, f"below {limit}" if found > 0 else f"above -{limit}")
         return found
@@ -195,11 +194,16 @@ class _Fitting:
         """
         recorded = isinstance(value, str) and RECORDED in get_args(kind)
         kind, checks = _parts(kind)
-        fits, words = self._bare_form(kind, value)
+        fits = True
+        try:
+            value = _converted(value, checks)
+        except Exception:  # any, as what is converted may be an object of the user
+            fits = False
+        is_kind, words = self._bare_form(kind, value)
         if checks:
             noun = {int: ["a whole number"], float: ["a number"]}.get(kind, [])
             words = [", ".join([*noun, *(check.text for check in checks)])]
-        return (":" in value if recorded else fits), words
+        return (":" in value if recorded else fits and is_kind), words
 
     def _bare_form(self, kind: Any, value: Any) -> tuple[bool, list[str]]:
         """Return the same of a kind without checks."""
@@ -333,6 +337,12 @@ def _parts(kind: Any) -> tuple[Any, tuple[Check, ...]]:
     return inner, tuple(note for note in notes if isinstance(note, Check))
 
 
+def _converted(value: Any, checks: tuple[Check, ...]) -> Any:
+    for check in checks:
+        value = check.convert(value)
+    return value
+
+
 def _plain(value: Any) -> Any:
     """Return NumPy's numbers and texts as Python's, where Python has them."""
     found = value.item() if isinstance(value, np.generic) else value
@@ -421,6 +431,20 @@ def to_json(value: Any, where: str, advice: str) -> Any:
     )
 
 
+def as_json(value: Any) -> Any:
+    """Return a record of a file as plain JSON, without fields that are None or empty by default."""
+    if is_dataclass(value):
+        return {
+            f.name: as_json(content)
+            for f in fields(value)
+            if (content := getattr(value, f.name)) not in (None, [], (), {})
+            or f.default is f.default_factory is MISSING
+        }
+    if isinstance(value, Mapping):
+        return {k: as_json(x) for k, x in value.items()}
+    return [as_json(x) for x in value] if isinstance(value, list | tuple) else value
+
+
 # Settings
 
 
@@ -430,7 +454,6 @@ def settings(kind: C) -> C:
 
     Names are checked as by ``checked_names``. NumPy's numbers become Python's, and a field that
     holds other settings also takes a dict of them. The fields of subclasses are checked, too.
-    A method ``_convert`` may bring other forms of a field into that of its annotation first.
     Conditions on several fields belong into ``__post_init__``, which finds every field checked.
 
     Raises:
@@ -442,8 +465,6 @@ def settings(kind: C) -> C:
     def checked(self: Any) -> None:
         first = next(k for k in type(self).__mro__ if "_checks_fields" in vars(k))
         if first is kind:  # else the subclass that called this has checked already
-            if hasattr(self, "_convert"):
-                self._convert()
             check_fields(self)
         if own is not None:
             own(self)

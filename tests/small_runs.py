@@ -13,7 +13,7 @@ import pytest
 from skillweave import DQN, PPO, RNN, Hierarchy, Network, Run, Skill
 from skillweave.hierarchy import training
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import StageEntry
+from skillweave.runs.manifest import LevelEntry, Manifest, StageEntry
 from skillweave.training.replay_learner import ReplayLearner
 from skillweave.training.stage import assign_workers
 
@@ -42,6 +42,22 @@ def stage_entry(
 ) -> StageEntry:
     """The entry of a skill's stage."""
     return StageEntry(name, "skill", [name], None, budget, {"num_envs": 4}, None, status, **more)
+
+
+def level_entry(**fields: Any) -> LevelEntry:
+    """The entry of a hierarchy that learns apart."""
+    plain: dict[str, Any] = {"learn": "apart", "call_steps": 10, "interrupt": None}
+    plain |= {"greedy_skills": True, "greedy_selector": True, "start_calls": None}
+    plain |= {"search_steps": None, "episode_calls": 1, "call_cost": 0.0, "reflexes": []}
+    return LevelEntry(**plain | fields)
+
+
+def small_manifest(*stages: StageEntry, **fields: Any) -> Manifest:
+    """The manifest of a plain agent, or of a hierarchy."""
+    plain: dict[str, Any] = {"env": "CartPole-v1", "env_kwargs": {}, "seed": 0}
+    plain |= {"checkpoint_every": 100, "eval_every": None, "eval_episodes": 20}
+    plain |= {"log_info": (), "needs_recipe": False, "resume_needs_recipe": False}
+    return Manifest(stages=list(stages), **plain | fields)
 
 
 class Left(Skill):
@@ -164,8 +180,8 @@ def assert_metrics_fit(run: Path, reference: Path) -> None:
 def new_run(hierarchy: Hierarchy, path: Path, **options: Any) -> RunDirectory:
     """A new run of as many workers as the recipe says."""
     content = training.manifest(hierarchy, **{"seed": 3, "flat": False} | options)
-    assign_workers(content["stages"], hierarchy.spec)
-    return RunDirectory.create(path, content | {"recipe": None})
+    assign_workers(content.stages, hierarchy.spec)
+    return RunDirectory.create(path, content)
 
 
 def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> RunDirectory:

@@ -249,8 +249,8 @@ def interrupted(path: Path, declared: Any, *signals: int) -> None:
     from skillweave.training.stage import assign_workers
 
     content = declared.manifest(3, TrainDefaults(**REPORTED))
-    assign_workers(content["stages"], declared.spec)
-    run = RunDirectory.create(path, content | {"recipe": None})
+    assign_workers(content.stages, declared.spec)
+    run = RunDirectory.create(path, content)
     try:
         with pytest.raises(KeyboardInterrupt):
             training.train(declared, run, (Interrupt(10, *signals),))

@@ -21,6 +21,7 @@ from small_runs import (
     lines,
     policies,
     reports_every,
+    small_manifest,
     stage_entry,
     stopped_run,
 )
@@ -40,13 +41,13 @@ from skillweave.cli import main
 from skillweave.envs.make import make_engine
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.select_best import resolve_greedy
+from skillweave.planning.columns import ENDS
 from skillweave.runs.comparison import Comparison
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.states import load_state
 from skillweave.training.evaluation import episode_seeds, evaluate
 from skillweave.training.play import SeededEpisodes, play
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 
 CARTPOLE = EnvSpec("CartPole-v1", engine="sync", workers=1)
 
@@ -237,7 +238,7 @@ def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, ki
 @pytest.mark.parametrize("kind", ["together", "then", "off-policy", "three"])
 def test_all_learn_at_every_level_in_one_stream(whole, kind):
     _, path = whole(kind)
-    entry = RunDirectory.open(path).manifest["stages"][-1]
+    entry = RunDirectory.open(path).manifest.stages[-1]
     assert entry.kind == "together"
     told = {name for line in lines(path) if line["stage"] == entry.name for name in line}
     deep = {k for k in entry.learns if "/" in k}
@@ -309,17 +310,17 @@ def test_calls_are_logged_by_the_paths_of_who_acts(whole):
     log = PlayedEpisodes(played, episode_seeds(0, 4))
     assert log.labels == ("left", "inner/balance", "inner/right", "push")
     for i, name in enumerate(log.labels):
-        own = [c for e in log.episodes for c in e.calls if c.skill == i]
+        own = np.concatenate([e.calls[e.calls["skill"] == i] for e in log.episodes])
         told = score.skills[name]
-        assert (len(own), sum(c.steps for c in own)) == (told.calls, told.steps)
-        ends = {end: sum(c.why == end for c in own) for end in told.ended}
+        assert (len(own), own["steps"].sum()) == (told.calls, told.steps)
+        ends = {name: int((own["end_reason"] == end).sum()) for end, name in ENDS.items()}
         assert ends == told.ended
-        own_sum = sum(c.own for c in own)
+        own_sum = own["own_return"].sum()
         assert own_sum == pytest.approx(told.return_sum, rel=1e-5, abs=1e-5)
     assert [len(e.rewards) for e in log.episodes] == list(score.lengths)
     for i, calls in enumerate(e.calls for e in log.episodes):
-        ends = np.cumsum([c.steps for c in calls])
-        assert [c.start for c in calls] == [0, *ends[:-1]]
+        ends = np.cumsum(calls["steps"])
+        assert calls["age"].tolist() == [0, *ends[:-1]]
         assert ends[-1] == score.lengths[i]
 
 
@@ -328,7 +329,7 @@ def test_a_run_has_everyones_file_with_a_checksum(whole):
     names = {name.removesuffix(".safetensors") for name in policies(path)}
     own = {"left", "selector", "inner.balance", "inner.right", "inner.selector"}
     assert names == own | {f"together.{name}" for name in own}
-    stages = {s.name: s for s in RunDirectory.open(path).manifest["stages"]}
+    stages = {s.name: s for s in RunDirectory.open(path).manifest.stages}
     assert set(stages) == {*(n.replace(".", "/") for n in own), "together"}
     assert all(s.sha256 or all(s.policies.values()) for s in stages.values())
 
@@ -530,7 +531,7 @@ def stage(name, kept):
     ],
 )
 def test_whether_skills_are_greedy_is_what_the_latest_stage_says_that_counts(stages, greedy):
-    run = SimpleNamespace(manifest={"stages": [stage(*told) for told in stages.items()]})
+    run = SimpleNamespace(manifest=small_manifest(*(stage(*told) for told in stages.items())))
     found = resolve_greedy(roles_of(declare()), run).levels.values()
     assert tuple(level.selection.greedy_skills for level in found) == greedy
     declared = declare(inside(greedy_skills=False), greedy_skills=True)

@@ -13,7 +13,7 @@ from skillweave.algorithms.config import DQN, PPO, config_from_json, config_to_j
 from skillweave.errors import RunError
 from skillweave.evolution.config import Evolution, evolution_from_json, evolution_to_json
 from skillweave.policies.files import DEEPEST, check_file, parse_json, read_file, shown
-from skillweave.schema import LARGEST, AtLeastOne, Count, fit
+from skillweave.schema import LARGEST, AtLeastOne, Count, fit, fitted
 
 
 class Inner(TypedDict):
@@ -71,6 +71,10 @@ def test_what_does_not_fit_is_told_by_its_field(change: dict[str, Any], says: st
         fit(Outer, GOOD | change, "x.json")
     assert says in str(caught.value)
     assert len(str(caught.value)) < 200
+
+
+def test_large_numbers_that_fit_into_64_bits_can_be_declared() -> None:
+    assert fitted(Count, 2**62, "PPO.num_envs") == 2**62
 
 
 def test_what_fits_comes_back_with_dataclasses_made_and_other_fields_kept() -> None:

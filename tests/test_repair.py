@@ -401,7 +401,7 @@ def test_a_repair_that_was_stopped_while_it_was_measured_goes_on(
     with pytest.raises(Interrupted):
         repaired(run, tmp_path / "part", **SHORT)
     monkeypatch.setattr(repair, "verdict", judge)
-    stages = RunDirectory.open(tmp_path / "part").manifest["stages"]
+    stages = RunDirectory.open(tmp_path / "part").manifest.stages
     assert all(entry.done for entry in stages)
     with pytest.raises(RunError, match=r"run\.repair"):
         sw.load(tmp_path / "part", declare())
@@ -518,5 +518,5 @@ def test_start_calls_by_name_are_checked_and_recorded(tmp_path: Path) -> None:
     apart = sw.Apart(skill_steps=1_024, start_calls=["flip"])  # type: ignore[arg-type]
     assert apart.start_calls == ("flip",)
     run = declare(apart=apart).train(tmp_path / "run", quiet=True)
-    assert run.info()["start_calls"] == ["flip"]
+    assert run.info()["hierarchy"]["start_calls"] == ["flip"]
     assert sw.load(run.path, declare()).hierarchy.apart.start_calls == ("flip",)

@@ -24,6 +24,7 @@ from small_runs import (
     new_run,
     policies,
     reports_every,
+    small_manifest,
     stopped_run,
 )
 from toys import ASKS, Echo
@@ -344,12 +345,7 @@ def stage_of(name: str, save_buffer: bool = True) -> Stage:
 
 
 def echo_run(path: Path, stage: Stage) -> RunDirectory:
-    manifest = {
-        "kind": "agent", "env": "Echo", "env_kwargs": {}, "seed": 3, "skills": [],
-        "checkpoint_every": 125, "eval_every": None, "eval_episodes": 20,
-        "resume_needs_recipe": False,
-        "call_steps": 1, "greedy_skills": True, "needs_recipe": False, "stages": [stage.entry()],
-    }  # fmt: skip
+    manifest = small_manifest(stage.entry(), env="Echo", seed=3, checkpoint_every=125)
     return RunDirectory.create(path, manifest)
 
 

@@ -120,6 +120,15 @@ SEES = Kind(
     ),
     ((0, 1, 4), [0, 1, 4], ("x", 1, "y.z")),
 )
+NUMBERS = Kind(
+    (True, "x", {}, NAN, INF, [], [NAN], [[0.5]], HUGE), (0.5, np.float64(0.5), [0.5, 1.0])
+)
+RANGE = Kind((5, "x", True, [], (1.0,), (1.0, -1.0), (0.0, INF)), ([-1.0, 1.0], None))
+PLACES = Kind(
+    (0.5, "x", "1:y", True, [], [-1], [0.5], [[0]], {}, slice(0.5), range(0), np.array(0.5)),
+    ([0, 2], slice(0, 3), None),
+)
+SCALING = {"scale": NUMBERS, "offset": NUMBERS, "clip": RANGE}
 ALGORITHM = settings(sw.PPO(), sw.DQN())
 
 ON_POLICY = {
@@ -194,6 +203,12 @@ TABLE: dict[type[Any], dict[str, Kind]] = {
         "sees": or_none(SEES),
         "planes": or_none(word("first", "last")),
     },
+    sw.Part: SCALING | {
+        "key": Kind((5, True, None, []), ("x",)), "places": PLACES, "one_hot": FLAG,
+    },
+    sw.Goal: SCALING | {"low": or_none(NUMBERS), "high": or_none(NUMBERS)},
+    sw.LastAction: SCALING,
+    sw.Acts: SCALING | {"to": PLACES, "rest": or_none(NUMBERS)},
     sw.Apart: {
         "skill_steps": or_none(AT_LEAST_ONE), "selector_steps": or_none(AT_LEAST_ONE),
         "start_calls": or_none(AT_LEAST_ONE), "search_steps": or_none(AT_LEAST_ONE),

@@ -273,10 +273,8 @@ def begun(path, source, **how):
     """A run that starts from another one, not trained yet."""
     hierarchy, learnt = declare(**how), learners_of_run(source)
     content = training.manifest(hierarchy, seed=3, flat=False)
-    record_initial_policies(content["stages"], learnt, source)
-    return RunDirectory.create(
-        path, content | {"recipe": None}, partial(copy_initial_policies, learnt=learnt)
-    )
+    record_initial_policies(content.stages, learnt, source)
+    return RunDirectory.create(path, content, partial(copy_initial_policies, learnt=learnt))
 
 
 @pytest.mark.slow

@@ -35,7 +35,8 @@ from skillweave.evolution import Evolution, Mutations
 from skillweave.hierarchy import select_best, training
 from skillweave.runs.comparison import SAMPLING
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import Checkpoint, as_json
+from skillweave.runs.manifest import Checkpoint
+from skillweave.schema import as_json
 from skillweave.training import joint
 from skillweave.training.episodes import Episodes
 from skillweave.training.skill_report import SkillReport
@@ -124,7 +125,7 @@ def test_all_who_learn_change_and_all_who_are_ready_stay(whole):
     told = [name for line in lines(path) for name in line]
     for name in ("selector", "left", "balance"):
         assert f"{name}.samples" in told
-    (entry,) = RunDirectory.open(path).manifest["stages"]
+    (entry,) = RunDirectory.open(path).manifest.stages
     assert entry.learns == ["selector", "left", "balance", "skill_critic"]
     assert 450 <= entry.steps <= 450 + 32, "a stage ends within one rollout of its budget"
 
@@ -396,9 +397,11 @@ def test_a_run_stopped_before_it_is_judged_is_not_finished(tmp_path, monkeypatch
 def test_a_run_says_what_nobody_said_where_it_makes_a_difference(tmp_path, learn, said):
     """Nothing differs from what was left open."""
     run = new_run(declare(learn=learn), tmp_path / "run")
-    assert run.manifest["greedy_skills"] is said
-    run.manifest["greedy_skills"] = True
-    seed = run.manifest["seed"]
+    level = run.manifest.hierarchy
+    assert level is not None
+    assert level.greedy_skills is said
+    run.manifest.hierarchy = replace(level, greedy_skills=True)
+    seed = run.manifest.seed
     assert differences(training.manifest(declare(learn=learn), seed=seed), run) == ""
     other = declare(learn=learn, greedy_skills=False)
     told = differences(training.manifest(other, seed=seed), run)
@@ -549,7 +552,7 @@ def test_a_stage_ends_early_at_its_target(tmp_path):
     hierarchy = declare(eval_every=200, eval_episodes=2, target_return=5.0, together_steps=10_000)
     path = tmp_path / "run"
     hierarchy.train(path, seed=0, quiet=True)
-    (entry,) = RunDirectory.open(path).manifest["stages"]
+    (entry,) = RunDirectory.open(path).manifest.stages
     assert entry.reached.value >= 5.0
     assert 200 <= entry.steps < 500
     assert entry.evaluation_steps > 10

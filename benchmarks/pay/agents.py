@@ -334,7 +334,7 @@ def is_over(path: Path) -> bool:
     """Return whether there is a run, and all its stages are done."""
     if not path.exists():
         return False
-    return all(s.done for s in RunDirectory.open(path).manifest["stages"])
+    return all(s.done for s in RunDirectory.open(path).manifest.stages)
 
 
 def replace_selector(hierarchy: Hierarchy, selector: Any) -> Hierarchy:

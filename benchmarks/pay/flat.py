@@ -47,12 +47,12 @@ class Flat(Agent):
             run = RunDirectory.open(path)
         else:
             content = self.manifest(seed)
-            content["stages"][0].workers = 1  # runs go side by side
+            content.stages[0].workers = 1  # runs go side by side
             learnt = {} if self.starts_from is None else learners_of_run(self.starts_from)
             if self.starts_from is not None:
-                record_initial_policies(content["stages"], learnt, str(self.starts_from))
+                record_initial_policies(content.stages, learnt, str(self.starts_from))
             keep = partial(copy_initial_policies, learnt=learnt)
-            run = RunDirectory.create(path, content | {"recipe": None, "track": ()}, keep)
+            run = RunDirectory.create(path, content, keep)
         try:
             run.begin()
             policy = training.train(self, run, (), partial(_FlatLearner, self))
@@ -74,8 +74,8 @@ class _FlatLearner(OneAgent):
         self.evaluation = PeriodicEvaluation(
             skill_task(agent_role(self._flat.spec)),
             self.stage.seeds,
-            manifest["eval_every"],
-            manifest["eval_episodes"],
+            manifest.eval_every,
+            manifest.eval_episodes,
             self.stage.config.num_envs,
         )
         self._resources.callback(self.evaluation.close)

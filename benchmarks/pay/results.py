@@ -156,7 +156,7 @@ def curve_of(path: Path, unit: float, stages: tuple[str, ...]) -> list[tuple[int
     """
     run = RunDirectory.open(path)
     before, total = {}, 0
-    for stage in run.manifest["stages"]:
+    for stage in run.manifest.stages:
         before[stage.name] = total
         total += stage.steps or 0
     found = []

@@ -205,7 +205,7 @@ def position(run: Path) -> tuple[int, int, int]:
     if not (run / "run.json").exists():
         return 0, 0, 0
     found = RunDirectory.open(run)
-    done = [p.name for p in found.manifest["stages"] if p.done]
+    done = [p.name for p in found.manifest.stages if p.done]
     for name in done:
         found.load_policies(name)
     for file in ("checkpoint", "checkpoint.previous"):

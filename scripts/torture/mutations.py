@@ -21,7 +21,7 @@ from scripts.torture import hostile_onnx, hostile_pickles
 from skillweave.runs.files import write_tensors
 
 ASKED = re.compile(
-    r"run\.json\.(env|env_kwargs|call_steps|greedy_skills|seed|checkpoint_every|eval_every|eval_episodes"
+    r"run\.json\.(env|env_kwargs|hierarchy\.(call_steps|greedy_skills)|seed|checkpoint_every|eval_every|eval_episodes"
     r"|skills\.\d+\.max_steps|stages\.\d+\.(budget|algorithm|evolution))\b"
 )
 """Settings of run.json that may be changed by hand: the run then plays, or trains, otherwise."""

@@ -50,7 +50,7 @@ from skillweave.compat.agilerl_files import convert
 from skillweave.reporting.lineage import read_lineage
 from skillweave.reporting.plots import plot_run
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.schema import as_json
 from skillweave.seeding import Seeds
 from skillweave.spaces import pack
 from skillweave.types import Policy
@@ -115,7 +115,7 @@ def looked_at(run: Path, changed: str) -> None:
     found = RunDirectory.open(run)
     if changed.endswith(".jsonl"):
         list(found.metrics())
-        for stage in found.manifest["stages"]:
+        for stage in found.manifest.stages:
             read_lineage(found, stage.name)
         file = run.parent / changed
         if zlib.crc32(file.read_bytes() if file.is_file() else b"") % PLOTTED == 0:
@@ -136,9 +136,9 @@ def from_data(folder: Path, changed: str) -> Play:
     """Load a run that says itself what it is."""
     run = folder / "run"
     looked_at(run, changed)
-    manifest = as_json(RunDirectory.open(run).manifest)
-    kind = Agent if manifest["kind"] == "agent" else Hierarchy
-    return play(kind.from_manifest(manifest).load(run))
+    manifest = RunDirectory.open(run).manifest
+    kind = Agent if manifest.hierarchy is None else Hierarchy
+    return play(kind.from_manifest(as_json(manifest)).load(run))
 
 
 def resumed(kind: Kind) -> Callable[[Path, str], Play]:

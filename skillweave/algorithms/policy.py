@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, NotRequired, TypedDict, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +20,6 @@ from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.networks.net import seen_places
 from skillweave.ops.seen import Seen
-from skillweave.schema import fit
 from skillweave.spaces import pack, space_from_json, space_to_json, to_tensor
 from skillweave.types import Array, Memory, Memoryless
 
@@ -108,29 +108,25 @@ class AgentPolicy(Memoryless):
             digest.update(value.reshape(-1).numpy().data)
         return {"sha256": digest.hexdigest()}
 
-    def to_file(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return tensors and the JSON header that ``from_file`` needs."""
-        return self.weights, {
-            "kind": "agent",
-            "algorithm": config_to_json(self.algorithm.config),
-            "observation_space": space_to_json(self.observation_space),
-            "action_space": space_to_json(self.action_space),
-        }
+    def to_file(self) -> tuple[dict[str, Tensor], AgentHeader]:
+        """Return tensors and the header that ``from_file`` needs."""
+        return self.weights, AgentHeader(
+            config_to_json(self.algorithm.config),
+            space_to_json(self.observation_space),
+            space_to_json(self.action_space),
+        )
 
     @classmethod
-    def from_file(
-        cls, tensors: dict[str, Tensor], header: dict[str, Any], where: str
-    ) -> AgentPolicy:
+    def from_file(cls, tensors: dict[str, Tensor], header: AgentHeader, where: str) -> AgentPolicy:
         """Create a policy from the tensors and header of ``to_file``.
 
         Raises:
             RunError: the header is damaged; or tensors are missing, have shapes or types that
                 differ from the header, or are not finite.
         """
-        fit(AgentHeader, header, where)
         try:
-            spaces = (space_from_json(header[f"{k}_space"]) for k in ("observation", "action"))
-            config = config_from_json(header["algorithm"], path="algorithm")
+            spaces = map(space_from_json, (header.observation_space, header.action_space))
+            config = config_from_json(header.algorithm, path="algorithm")
             algorithm = make_algorithm(config, *spaces)
         except SkillweaveError as error:
             raise RunError(f"{where}: {error}") from error
@@ -149,21 +145,25 @@ class AgentPolicy(Memoryless):
         return policy
 
 
-class AgentHeader(TypedDict):
-    """The JSON header of a policy's file."""
+@dataclass
+class AgentHeader:
+    """The header of a policy's file."""
 
     algorithm: dict[str, Any]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
-    kind: NotRequired[str]
-    run: NotRequired[str]
+    kind: Literal["agent"] = "agent"
+    run: str | None = None
     """The run in which the policy was trained."""
-    stage: NotRequired[str]
-    env: NotRequired[str]
-    env_kwargs: NotRequired[dict[str, Any]]
-    code: NotRequired[dict[str, str]]
-    recipe: NotRequired[str | None]
-    about: NotRequired[dict[str, Any]]
+    stage: str | None = None
+    starts: str | None = None
+    """The learner of a new run that starts from the policy."""
+    env: str | None = None
+    """The environment, in a file of weights alone."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    code: dict[str, str] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    """Further entries, of agents of AgileRL's interface."""
 
 
 def checked_tensor(

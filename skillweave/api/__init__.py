@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skillweave.algorithms.config import PPO, AlgorithmConfig, config_from_json
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.api.applying import (
     Trained,
     load_policy,
@@ -42,16 +42,17 @@ from skillweave.api.train_options import (
     TrainOptions,
 )
 from skillweave.arguments import checked_names
-from skillweave.collecting.lengths import calls_from_json
 from skillweave.envs.make import EngineName, EnvSpec
 from skillweave.errors import DeclarationError, RunError
 from skillweave.export.write import Export, write_export
 from skillweave.hierarchy.assembly import parts_of
 from skillweave.hierarchy.declaration import Declaration, with_roles
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
+from skillweave.hierarchy.recorded import calls_of
 from skillweave.hierarchy.repair import Repair, repairs_of
 from skillweave.hierarchy.roles import Roles, roles_of
 from skillweave.hierarchy.weights import (
+    HierarchyHeader,
     open_weights,
     read_agent,
     read_weights,
@@ -72,9 +73,9 @@ from skillweave.reporting.video import Film, render_policy
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub, must_be_own
-from skillweave.runs.manifest import SkillEntry, StageEntry, as_json
+from skillweave.runs.manifest import LevelEntry, manifest_in
 from skillweave.runs.trackers import track_film
-from skillweave.schema import AtLeastOne, Count, fit, fitted
+from skillweave.schema import AtLeastOne, Count, as_json, fitted
 from skillweave.shipped import weights_path
 from skillweave.skills import Skill
 from skillweave.skills.base import RecordedSkill
@@ -132,10 +133,9 @@ class Agent(PlainAgent):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Agent:
         """Return the agent of a run's ``manifest`` (``run.json``), without the user's code."""
-        (recorded,) = manifest["stages"]
-        stage: StageEntry = fit(StageEntry, recorded, "")
-        config = config_from_json(stage.algorithm)
-        agent = cls(spec_of(manifest), config, stage.budget)
+        recorded = manifest_in(manifest)
+        (stage,) = recorded.stages
+        agent = cls(spec_of(recorded), config_from_json(stage.algorithm), stage.budget)
         agent.recorded = True
         return agent
 
@@ -156,12 +156,12 @@ class Agent(PlainAgent):
         """
         path = as_path(path, "path")
         tensors, header = open_weights(path)
-        if header["kind"] != "agent" or "env" not in header:
+        if isinstance(header, HierarchyHeader) or header.env is None:
             raise RunError(
                 f"{path} does not name the environment of its agent; declare the agent, and "
                 "use its load_weights"
             )
-        agent = cls(spec_of(header), config_from_json(header["algorithm"], str(path)), 1)
+        agent = cls(spec_of(header), config_from_json(header.algorithm, str(path)), 1)
         return Run(agent, path, read_agent(agent.spec, tensors, header, path))
 
 
@@ -238,7 +238,7 @@ class Hierarchy(Declaration):
         self.validate()
         path = as_path(path, "path")
         tensors, header = open_weights(path)
-        if header["kind"] == "agent":
+        if isinstance(header, AgentHeader):
             agent = read_agent(self.spec, tensors, header, path)
             return Run(self.plain_agent(), path, agent)
         # The file sets how skills are called.
@@ -254,30 +254,31 @@ class Hierarchy(Declaration):
     @classmethod
     def from_manifest(cls, manifest: dict[str, Any]) -> Hierarchy:
         """Return the hierarchy of a run's ``manifest``, without the user's code."""
-        spec = spec_of(manifest)
+        recorded = manifest_in(manifest)
+        spec = spec_of(recorded)
         skills: dict[str, list[Skill]] = {}  # by the path of their level
         rests: dict[str, Any] = {}  # as well
-        entries: list[SkillEntry] = fit(list[SkillEntry], manifest["skills"], "")
-        for entry in reversed(entries):  # the skills of a hierarchy follow it
+        for entry in reversed(recorded.skills):  # the skills of a hierarchy follow it
             name, level = name_of(entry.name), level_of(entry.name)
             attributes: dict[str, Any] = {"name": name, "max_steps": entry.max_steps}
             if entry.call_steps is not None:
                 attributes["call_steps"] = entry.call_steps
-            attributes |= part_from_json(as_json(entry))
+            attributes |= part_from_json(entry.sees, entry.acts)
             rests[level] = rests.get(level, ZERO) if entry.rest is None else entry.rest
             if entry.hierarchy is not None:
                 attributes["policy"] = cls._recorded(
                     spec, entry.hierarchy, skills.pop(entry.name), rests[entry.name]
                 )
             skills.setdefault(level, []).insert(0, type(name, (RecordedSkill,), attributes)())
-        return cls._recorded(spec, manifest, skills[""], rests[""])
+        assert recorded.hierarchy is not None
+        return cls._recorded(spec, recorded.hierarchy, skills[""], rests[""])
 
     @classmethod
     def _recorded(
-        cls, spec: EnvSpec, entry: Mapping[str, Any], skills: list[Skill], rest: Any
+        cls, spec: EnvSpec, entry: LevelEntry, skills: list[Skill], rest: Any
     ) -> Hierarchy:
         """Return a run's hierarchy, or one below it, from its entry and its skills."""
-        hierarchy = cls(spec, skills, call_steps=calls_from_json(entry), rest=rest)
+        hierarchy = cls(spec, skills, call_steps=calls_of(entry), rest=rest)
         hierarchy.recorded = True
         return hierarchy
 
@@ -899,7 +900,7 @@ class PlannedRun(TrainedPolicy):
 
 def declaration_of(declared: Hierarchy | Agent, run: RunDirectory) -> Hierarchy | Agent:
     """Return what a run trained: the hierarchy, or its flat baseline."""
-    if run.manifest["kind"] == "agent" and isinstance(declared, Hierarchy):
+    if run.manifest.hierarchy is None and isinstance(declared, Hierarchy):
         return declared.plain_agent()
     return declared
 

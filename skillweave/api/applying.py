@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
+from skillweave.algorithms.policy import AgentHeader
 from skillweave.collecting.user_code import environment_texts, notice_changes
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import RunError
 from skillweave.hierarchy import training
 from skillweave.hierarchy.declaration import Declaration, with_roles
-from skillweave.hierarchy.roles import Level, Roles, roles_of
-from skillweave.hierarchy.weights import (
+from skillweave.hierarchy.recorded import (
     check_guided,
     check_same_part,
     check_selector,
-    with_calls,
+    with_entry,
 )
-from skillweave.paths import SELECTOR
+from skillweave.hierarchy.roles import Level, Roles, roles_of
 from skillweave.reporting.report.facts import plain, settings
 from skillweave.runs.command_words import called_by
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import SkillEntry, as_json
+from skillweave.runs.manifest import Manifest, SkillEntry
 from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import other_goals
 from skillweave.spaces import space_from_json
@@ -49,7 +48,7 @@ def load_policy(declared: D, path: Path) -> Trained[D]:
     declared.validate()
     with called_by(declared._caller):
         declared = apply_manifest(declared, run)
-        if run.manifest["kind"] == "agent":
+        if run.manifest.hierarchy is None:
             return declared, run, load_agent_of(run)
         assert isinstance(declared, Declaration)
         return declared, run, training.load(roles_of(declared), run)
@@ -62,32 +61,21 @@ def apply_manifest(declared: D, run: RunDirectory) -> D:
         RunError: the run is not one of this declaration.
     """
     check_run(declared, run)
-    if not isinstance(declared, Declaration) or run.manifest["kind"] != "hierarchy":
+    if not isinstance(declared, Declaration) or run.manifest.hierarchy is None:
         return declared
     return with_roles(declared, _recorded_roles(roles_of(declared), run))
 
 
 def _recorded_roles(roles: Roles, run: RunDirectory) -> Roles:
     """Return the roles of a declaration with the settings that a run records."""
-    entries: dict[str, SkillEntry] = {entry.name: entry for entry in run.manifest["skills"]}
+    entries, levels = run.manifest.by_path, run.manifest.levels
 
     def recorded(level: Level) -> Level:
-        entry: Any = entries[level.path].hierarchy if level.path else run.manifest
+        entry = levels[level.path]
         where = f"{run.path}: {level.path}" if level.path else str(run.path)
-        check_guided(level.guide is not None, "guide" in entry, where)
-        guide = level.guide
-        if guide is not None:
-            guide = replace(guide, restrict=entry["guide_restrict"], target_kl=entry["guide_kl"])
-        level = with_calls(level, entry)
-        search = ("start_calls", "search_steps", "episode_calls")
-        return replace(
-            level,
-            skills={path: _limited(s, entries[path]) for path, s in level.skills.items()},
-            guide=guide,
-            learn=entry["learn"],
-            apart=replace(level.apart, **{name: entry[name] for name in search}),
-            selection=replace(level.selection, call_cost=entry["call_cost"]),
-        )
+        check_guided(level.guide is not None, entry.guide is not None, where)
+        skills = {path: _limited(skill, entries[path]) for path, skill in level.skills.items()}
+        return replace(with_entry(level, entry), skills=skills)
 
     return roles.changed(recorded)
 
@@ -101,7 +89,7 @@ def _limited(skill: Skill, entry: SkillEntry) -> Skill:
     return limited
 
 
-def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool = True) -> str:
+def differences(content: Manifest, run: RunDirectory, *, budgets: bool = True) -> str:
     """Describe the settings in which a run differs from a manifest; empty if none does.
 
     Args:
@@ -111,7 +99,7 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
     here, there = settings(content), settings(run.manifest)
     if not budgets:
         here = {k: v for k, v in here.items() if not k.endswith(".budget")}
-    evolve = tuple(f"{s.name}." for s in run.manifest["stages"] if s.evolution)
+    evolve = tuple(f"{s.name}." for s in run.manifest.stages if s.evolution)
     # A population's settings follow a plan. A file's place is no setting; its checksum is.
     both = [k for k in here if k in there and not k.startswith(evolve) and not k.endswith(".file")]
     # Greediness that this declaration leaves open cannot differ.
@@ -130,7 +118,7 @@ def differences(content: Mapping[str, Any], run: RunDirectory, *, budgets: bool 
 def check_run(declared: Declared, run: RunDirectory) -> None:
     """Raise a RunError where a run is not one of this declaration; notice other code."""
     code = environment_texts(declared.spec)
-    if run.manifest["kind"] == "hierarchy":
+    if run.manifest.hierarchy is not None:
         if not isinstance(declared, Declaration):
             raise RunError(f"{run.path} is the run of a hierarchy, not of a plain agent")
         roles = roles_of(declared)
@@ -138,20 +126,19 @@ def check_run(declared: Declared, run: RunDirectory) -> None:
         code = roles.code
     what = "hierarchy" if isinstance(declared, Declaration) else "agent"
     _check_place(declared.spec, what, run)
-    notice_changes(run.manifest.get("code", {}), code, f"{run.path} was trained")
+    notice_changes(run.manifest.code, code, f"{run.path} was trained")
 
 
 def _check_roles(roles: Roles, run: RunDirectory) -> None:
     """Raise a RunError where a run was trained with other skills, selectors or reflexes."""
     mine = list(roles.skills)
-    theirs = [entry.name for entry in run.manifest["skills"]]
+    theirs = list(run.manifest.by_path)
     if mine != theirs:
         raise RunError(
             f"{run.path} was trained with the skills {', '.join(theirs)}, but this hierarchy "
             f"has {', '.join(mine)}"
         )
-    entries: dict[str, dict[str, Any]] = {"": run.manifest}
-    for entry in run.manifest["skills"]:
+    for entry in run.manifest.skills:
         path = entry.name
         if (path in roles.levels) != (entry.hierarchy is not None):
             raise RunError(
@@ -159,13 +146,12 @@ def _check_roles(roles: Roles, run: RunDirectory) -> None:
                 "this declaration, not in both; declare it as it was trained"
             )
         _check_goals(roles.skills[path], entry, f"{run.path}: skill {path!r}")
-        check_same_part(roles, path, as_json(entry), f"{run.path}: skill {path!r}")
-        if entry.hierarchy is not None:
-            entries[path] = entry.hierarchy
+        check_same_part(roles, entry, str(run.path))
+    levels = run.manifest.levels
     for path, level in roles.levels.items():
         where = f"{run.path}: {path}" if path else str(run.path)
-        check_selector(level.ready_selector is not None, SELECTOR in entries[path], where)
-        _check_reflexes(level, entries[path], where)
+        check_selector(level.ready_selector is not None, levels[path].selector is not None, where)
+        _check_reflexes(level, levels[path].reflexes, where)
 
 
 def _check_goals(skill: Skill, entry: SkillEntry, who: str) -> None:
@@ -176,9 +162,8 @@ def _check_goals(skill: Skill, entry: SkillEntry, who: str) -> None:
         raise RunError(f"{who} {says}")
 
 
-def _check_reflexes(level: Level, entry: dict[str, Any], where: str) -> None:
-    """Raise a RunError where the reflexes are not those of training."""
-    theirs: list[str] = entry["reflexes"]
+def _check_reflexes(level: Level, theirs: list[str], where: str) -> None:
+    """Raise a RunError where the reflexes are not ``theirs``, those of training."""
     mine = [str(r.name) for r in level.reflexes]
     if mine != theirs:
         raise RunError(
@@ -198,7 +183,7 @@ def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
         spec: the declared environment.
         what: the word for what is declared on it: agent or hierarchy.
     """
-    theirs, their_kwargs = run.manifest["env"], run.manifest["env_kwargs"]
+    theirs, their_kwargs = run.manifest.env, run.manifest.env_kwargs
     mine, my_kwargs = spec.name, spec.json_kwargs
     if (theirs, their_kwargs) == (mine, my_kwargs):
         return
@@ -210,13 +195,14 @@ def _check_place(spec: EnvSpec, what: str, run: RunDirectory) -> None:
     )
 
 
-def spec_of(header: dict[str, Any]) -> EnvSpec:
+def spec_of(header: Manifest | AgentHeader) -> EnvSpec:
     """Return the environment that a manifest or a weights file's header names.
 
     Raises:
         RunError: it needs code.
     """
-    spec = EnvSpec(header["env"], kwargs=header.get("env_kwargs", {}))
+    assert header.env is not None
+    spec = EnvSpec(header.env, kwargs=header.env_kwargs)
     if not spec.is_data:
         raise RunError(f"the environment {spec.name!r} names code; give the recipe")
     return spec

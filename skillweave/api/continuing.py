@@ -13,7 +13,7 @@ from skillweave.paths import decides, is_below, level_of
 from skillweave.runs.command_words import from_command_line, start_words
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import is_copy_of_hub
-from skillweave.runs.manifest import StageEntry
+from skillweave.runs.manifest import Manifest, StageEntry
 
 EVALUATIONS = "evaluation*.json"
 """Saved evaluations of a run, which are of the policy before it continued."""
@@ -29,7 +29,7 @@ def to_continue(path: Path) -> RunDirectory | None:
 
 def prepared(
     declared: D,
-    content: dict[str, Any],
+    content: Manifest,
     run: RunDirectory,
     evolve: Evolve,
 ) -> tuple[D, str]:
@@ -45,28 +45,27 @@ def prepared(
     """
     declared = apply_manifest(declared, run)
     _check_same(content, run)
-    stages = content["stages"]
-    if run.manifest["kind"] == "hierarchy":
+    stages = content.stages
+    if run.manifest.hierarchy is not None:
         # As the run learns, apart or together: it may be declared otherwise now.
         stages = [stage.entry() for stage in declared.stages()]
     budgets = _budgets(stages, run, evolve)
     sentences = [] if declared.recorded else [differences(content, run, budgets=False)]
-    if content["track"] != tuple(run.manifest.get("track", ())):
-        known = ", ".join(run.manifest.get("track", ())) or "none"
+    if content.track != run.manifest.track:
+        known = ", ".join(run.manifest.track) or "none"
         sentences.append(f"the run continues with its own trackers: {known}")
-    if content.get("log_calls") != run.manifest.get("log_calls"):
-        steps = run.manifest.get("log_calls")
+    if content.log_calls != (steps := run.manifest.log_calls):
         log = "no log of calls" if steps is None else f"log_calls={steps:,}"
         sentences.append(f"the run continues as it began, with {log}")
-    if not run.finished or max(_more(run.manifest["stages"], budgets).values()) > 0:
+    if not run.finished or max(_more(run.manifest.stages, budgets).values()) > 0:
         run.begin(finished=True)
-        run.manifest["code"] = run.manifest.get("code", {}) | content["code"]  # as it goes on
+        run.manifest.code |= content.code  # as it goes on
     try:
         sentences += _grow(run, budgets)
     except BaseException:
         run.close()
         raise
-    if run.finished and not any(entry.reached for entry in run.manifest["stages"]):
+    if run.finished and not any(entry.reached for entry in run.manifest.stages):
         more = "--set steps=N, or --scale" if from_command_line() else "more steps"
         sentences.append(
             f"{run.path} is finished, so nothing is trained; to train it for longer, give it {more}"
@@ -74,27 +73,27 @@ def prepared(
     return declared, "; ".join(filter(None, sentences))
 
 
-def _check_same(content: Mapping[str, Any], run: RunDirectory) -> None:
+def _check_same(content: Manifest, run: RunDirectory) -> None:
     """Raise a RunError where a run is of another kind, recipe or seed than ``content``."""
     manifest = run.manifest
-    if content["kind"] != manifest["kind"]:
+    if content.kind != manifest.kind:
         flat = "--flat" if from_command_line() else "flat=True"
         one, other = f"a flat agent ({flat})", "a hierarchy"
-        if manifest["kind"] == "hierarchy":
+        if manifest.hierarchy is not None:
             one, other = other, one
         raise RunError(
             f"{run.path} is the run of {one}, but it was to continue as {other}; choose another "
             "directory"
         )
-    mine, theirs = content["recipe"], manifest.get("recipe")
+    mine, theirs = content.recipe, manifest.recipe
     if mine and theirs and Path(mine).name != Path(theirs).name:
         raise RunError(
             f"{run.path} is a run of the recipe {theirs}, not of {mine}; choose another directory"
         )
-    if content["seed"] != manifest["seed"]:
+    if content.seed != manifest.seed:
         raise RunError(
-            f"{run.path} was trained with seed {manifest['seed']}, not {content['seed']}; give "
-            "that seed, or choose another directory"
+            f"{run.path} was trained with seed {manifest.seed}, not {content.seed}; give that "
+            "seed, or choose another directory"
         )
 
 
@@ -104,11 +103,11 @@ def _budgets(stages: list[StageEntry], run: RunDirectory, evolve: Evolve) -> dic
     Args:
         stages: the entries of the stages that are declared now.
     """
-    if run.manifest["kind"] == "hierarchy":
+    if run.manifest.hierarchy is not None:
         names = {stage.name for stage in stages}
         if not isinstance(evolve, Mapping) or set(evolve) <= names:
             plan(stages, evolve)
-    theirs = {entry.name: entry for entry in run.manifest["stages"]}
+    theirs = {entry.name: entry for entry in run.manifest.stages}
     budgets = {}
     for stage in stages:
         if (entry := theirs.get(stage.name)) is not None:
@@ -133,7 +132,7 @@ def _grow(run: RunDirectory, budgets: Mapping[str, int]) -> list[str]:
     A stage whose learners learn again in a later one stays as it is, as the later one would not
     start from the new weights. The later one gets its steps, too.
     """
-    stages: list[StageEntry] = run.manifest["stages"]
+    stages = run.manifest.stages
     more = _more(stages, budgets)
     finished = run.finished
     grown = list[StageEntry]()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from skillweave.api import Agent, Hierarchy, Run, run_of
 from skillweave.api.applying import load_policy
@@ -16,7 +15,8 @@ from skillweave.messages import as_path, short
 from skillweave.runs import hub
 from skillweave.runs.command_words import python_string
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.runs.manifest import Manifest
+from skillweave.schema import as_json
 from skillweave.shipped import names
 from skillweave.training.plain_agent import Declared
 
@@ -100,7 +100,7 @@ def from_hub(
     return load_from(hub.download(hub.check_name(name), revision), hierarchy, ask=ASK_FROM_HUB)
 
 
-def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
+def finish(declared: Hierarchy, content: Manifest, run_dir: Path) -> Run:
     """Return the finished run of this manifest in ``run_dir``; train what is missing.
 
     Raises:
@@ -108,29 +108,30 @@ def finish(declared: Hierarchy, content: dict[str, Any], run_dir: Path) -> Run:
     """
     run = begun(declared, content, run_dir)
     if run is None:
-        options = AgentOptions(run_dir, seed=content["seed"], quiet=True)
+        options = AgentOptions(run_dir, seed=content.seed, quiet=True)
         return run_of(begin(declared, content, options))
     return declared.load(run_dir) if run.finished else declared.resume(run_dir, quiet=True)
 
 
 def declared_by(
-    run: RunDirectory, recipe: str | None = None, needs: str = "needs_recipe", ask: str = ASK
+    run: RunDirectory, recipe: str | None = None, to_train: bool = False, ask: str = ASK
 ) -> Hierarchy | Agent:
     """Return the declaration that a run was trained from; code never comes from inside the run.
 
     Args:
         recipe: a shipped recipe, or a file that is trusted; None: the one that the run names.
-        needs: the field of the manifest that is true where code is needed.
+        to_train: train it further, which may need code where acting does not.
         ask: a sentence for the error: how to give the code.
 
     Raises:
         RunError: it needs code that was not given.
     """
     manifest = run.manifest
-    if recipe is None and not manifest.get(needs, True):
-        kind = Agent if manifest["kind"] == "agent" else Hierarchy
+    needed = manifest.resume_needs_recipe if to_train else manifest.needs_recipe
+    if recipe is None and not needed:
+        kind = Agent if manifest.hierarchy is None else Hierarchy
         return kind.from_manifest(as_json(manifest))
-    return declared_in(recipe or manifest.get("recipe"), recipe, str(run.path), ask)
+    return declared_in(recipe or manifest.recipe, recipe, str(run.path), ask)
 
 
 def declared_in(recipe: str | None, given: str | None, where: str, ask: str = ASK) -> Hierarchy:

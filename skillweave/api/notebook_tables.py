@@ -96,7 +96,7 @@ def _learns_by(roles: Roles, path: str) -> str:
 def _stages(run: RunDirectory) -> Markup:
     """Return a table of a run's stages."""
     rows = []
-    for stage in run.manifest["stages"]:
+    for stage in run.manifest.stages:
         final = stage.final
         steps, seconds = stage.steps, stage.seconds
         rows.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +30,7 @@ from skillweave.messages import as_path, short, shown_path
 from skillweave.paths import join, level_of, name_of
 from skillweave.reporting.progress import Progress
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import RepairEntry, StageEntry
+from skillweave.runs.manifest import Manifest, RepairEntry, StageEntry
 from skillweave.skills.learnable import learn_on
 from skillweave.training.rehearsal import can_rehearse, save_rehearsal
 from skillweave.training.stage import check_stages
@@ -41,8 +42,6 @@ USUAL_STEPS = 200_000
 """Steps of a repair for which none are given."""
 GOOD = 0.95
 """A handover that is done at least this often needs no repair."""
-OF_THE_RUN = ("id", "sha256", "versions", "created", "stages", "track")
-"""Fields of a manifest that a new run has of its own."""
 
 
 def repair(
@@ -70,14 +69,14 @@ def repair(
     steps, done, calls = options.steps or USUAL_STEPS, options.done, options.calls
     learnt = parts_of(roles, policy)[skill]
     assert isinstance(learnt, AgentPolicy)
-    content, entries, policies = _content(declared, source, roles, policy)
-    if declared.recorded and content["resume_needs_recipe"]:
+    content, policies = _content(declared, source, roles, policy)
+    if declared.recorded and content.resume_needs_recipe:
         raise RunError(
             f"{shown_path(source)} was loaded without its code, and training needs that: load it "
             "with the hierarchy that was trained: sw.load(directory, hierarchy)"
         )
     config = learnt.algorithm.config
-    name = _stage_name(skill, {e.name for e in entries} | set(roles.skills))
+    name = _stage_name(skill, {e.name for e in content.stages} | set(roles.skills))
     recorded = config_to_json(config)
     entry = StageEntry(name, "skill", [skill], None, steps, recorded, None, "waiting")
     check_stages([entry], None)
@@ -93,7 +92,6 @@ def repair(
     before = matrix_to_json(found.matrix)
     known = sorted(done or ())
     entry.repair = RepairEntry(skill, after, calls, known, reason, before, found.gain)
-    content |= {"stages": [entry], "seed": options.seed, "code": roles.code}
     rehearsal = None
     role = roles[skill]
     assert role.skill is not None
@@ -105,7 +103,8 @@ def repair(
             "only PPO without a memory rehearses."
         )
     write = partial(_write, policies=policies, stage=entry.name, rehearsal=rehearsal)
-    base = Base(entries, write, "repair")
+    base = Base(content.stages, write, "repair")
+    content = replace(content, stages=[entry], code=roles.code)
     return begin(declared, content, options.training, reason, base, done)
 
 
@@ -117,13 +116,13 @@ def _go_on(declared: D, skill: str, after: str, options: RepairOptions) -> Train
             f'repair({name_of(skill)!r}, after={name_of(after)!r}, run_dir="runs/a", resume=True)'
         )
     run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
-    repairs = [e for e in run.manifest["stages"] if e.repair is not None]
-    if not repairs or (repairs[-1].repair.skill, repairs[-1].repair.after) != (skill, after):
+    repairs = [(e, e.repair) for e in run.manifest.stages if e.repair is not None]
+    if not repairs or (repairs[-1][1].skill, repairs[-1][1].after) != (skill, after):
         raise RunError(
             f"{shown_path(run.path)} holds no repair of {skill!r} after {after!r}; leave out "
             "resume=True to start one in another directory"
         )
-    budget = repairs[-1].budget
+    budget = repairs[-1][0].budget
     if options.steps not in (None, budget):
         raise DeclarationError(
             f"steps is {options.steps:,}, but this repair was started with {budget:,}: "
@@ -224,29 +223,26 @@ Policies = dict[str, dict[str, AgentPolicy]]
 
 def _content(
     declared: Declaration, source: Path, roles: Roles, policy: HierarchyPolicy
-) -> tuple[dict[str, Any], list[StageEntry], Policies]:
-    """Return a manifest without stages, entries of finished stages, and their policies."""
+) -> tuple[Manifest, Policies]:
+    """Return a manifest with entries of finished stages, and their policies."""
+    policies: Policies = {}
     if source.is_dir():
         run = RunDirectory.open(source)
-        content = {k: v for k, v in run.manifest.items() if k not in OF_THE_RUN}
-        entries = list[StageEntry](run.manifest["stages"])
-        policies = {entry.name: run.load_policies(entry.name) for entry in entries}
-        for entry in entries:
+        content = run.manifest
+        for entry in content.stages:
+            policies[entry.name] = run.load_policies(entry.name)
             entry.forget_files()
-        return content | {"eval_every": None, "keep": "last"}, entries, policies
-    content = training.manifest(declared, seed=0)
-    content |= {"eval_every": None, "keep": "last"}
-    parts, entries = parts_of(roles, policy), []
-    policies = dict[str, dict[str, AgentPolicy]]()
-    for entry in content.pop("stages"):
-        # A weights file does not record its training: the declaration's steps stand for it.
-        entry.status, entry.steps, entry.seconds = "done", entry.budget, 0.0
-        if entry.kind == "together":
-            entry.compared = entry.greedy_judged = False
-        entries.append(entry)
-        learnt = {name: parts[name] for name in entry.learns}
-        policies[entry.name] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
-    return content, entries, policies
+    else:
+        content = training.manifest(declared, seed=0)
+        parts = parts_of(roles, policy)
+        for entry in content.stages:
+            # A weights file does not record its training: the declaration's steps stand for it.
+            entry.status, entry.steps, entry.seconds = "done", entry.budget, 0.0
+            if entry.kind == "together":
+                entry.compared = entry.greedy_judged = False
+            learnt = {name: parts[name] for name in entry.learns}
+            policies[entry.name] = {k: p for k, p in learnt.items() if isinstance(p, AgentPolicy)}
+    return replace(content, eval_every=None, keep="last"), policies
 
 
 def _write(run: RunDirectory, policies: Policies, stage: str, rehearsal: Array | None) -> None:

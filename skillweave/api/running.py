@@ -15,13 +15,7 @@ from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.api.applying import D, Trained, apply_manifest, differences
 from skillweave.api.continuing import prepared, to_continue
 from skillweave.api.starting import starts
-from skillweave.api.train_options import (
-    AgentOptions,
-    Going,
-    ResumeOptions,
-    TrainOptions,
-    recorded,
-)
+from skillweave.api.train_options import AgentOptions, Going, ResumeOptions, TrainOptions
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.placement import LOCAL, Placement
 from skillweave.collecting.start_methods import runs_again, why_no_processes
@@ -41,16 +35,15 @@ from skillweave.runs.command_words import called_by, resume_words, saved_words
 from skillweave.runs.directory import First, RunDirectory
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.initial_policies import copy_initial_policies
-from skillweave.runs.manifest import StageEntry, identity
+from skillweave.runs.manifest import Manifest, StageEntry, identity
 from skillweave.runs.numbered import make_numbered
-from skillweave.runs.trackers import make_trackers
+from skillweave.runs.trackers import Listener, make_trackers
 from skillweave.seeding import Seeds, global_generators
 from skillweave.terminal import steady_streams
 from skillweave.training.callback import TrainCallback
 from skillweave.training.plain_agent import Declared
 from skillweave.training.role import Role, agent_role
 from skillweave.training.stage import assign_workers, check_replay, check_stages, workers_of
-from skillweave.training.stage_log import Listener
 
 READING: ContextVar[str | None] = ContextVar("READING", default=None)
 """The Python file that is being read for its declaration; None: none is."""
@@ -87,7 +80,7 @@ def train(declared: D, options: AgentOptions) -> Trained[D]:
 
 def begin(
     declared: D,
-    content: dict[str, Any],
+    content: Manifest,
     options: AgentOptions,
     note: str = "",
     base: Base | None = None,
@@ -105,7 +98,12 @@ def begin(
     # An environment may change the working directory as it is made.
     given = options.run_dir
     place = absolute("." if given is None else as_path(given, "run_dir"))
-    content = {**content, "recipe": content.get("recipe", declared.recipe), **recorded(options)}
+    content = replace(
+        content,
+        recipe=content.recipe or declared.recipe,
+        seed=options.seed,
+        track=tuple(options.track),
+    )
     with _surroundings(), called_by(declared._caller), ExitStack() as stack:
         stack.enter_context(collected_notices())  # the progress prints them later
         roles = _plan(declared, content, options)
@@ -114,7 +112,7 @@ def begin(
             stack.callback(run.close)
             return go_on(declared, run, options, note)
         start_from = options.start_from
-        if start_from is None and content["kind"] == "hierarchy" and declared._starts is not None:
+        if start_from is None and content.hierarchy is not None and declared._starts is not None:
             start_from = declared._starts()
         learnt, origin = starts(content, start_from, roles)
         first: First = partial(copy_initial_policies, learnt=learnt)
@@ -128,7 +126,7 @@ def begin(
             note = "; ".join(filter(None, (f"run: {shown_path(place)}", note)))
             stack.callback(_remove_if_empty, place)
         if base is not None:
-            content["stages"] = [*base.stages, *content["stages"]]
+            content.stages = [*base.stages, *content.stages]
             first = base.write
         run = RunDirectory.create(place, content, first, hold=True, overwrite=options.overwrite)
         stack.callback(run.close)
@@ -147,21 +145,21 @@ class Base:
     """The word at the end of a numbered directory's name."""
 
 
-def _kept_by_populations(content: dict[str, Any]) -> str:
+def _kept_by_populations(content: Manifest) -> str:
     """Return a sentence on the stages in which ``keep="best"`` changes nothing; may be empty."""
-    names = [stage.name for stage in content["stages"] if stage.evolution]
-    if content["keep"] != "best" or not names:
+    names = [stage.name for stage in content.stages if stage.evolution]
+    if content.keep != "best" or not names:
         return ""
     return f"{', '.join(names)}: a population always ends with its best member, whatever keep is."
 
 
-def _run_name(declared: Declared, content: Mapping[str, Any]) -> str:
+def _run_name(declared: Declared, content: Manifest) -> str:
     """Return the stem of a numbered directory: of the recipe, the hierarchy or the environment."""
     name, flat = declared.spec.name, ""
     if isinstance(declared, Declaration):
-        flat = "-flat" if content["kind"] == "agent" else ""
+        flat = "-flat" if content.hierarchy is None else ""
         name = name if declared.name == Declaration.name else declared.name
-    return (Path(content.get("recipe") or "").stem or name) + flat
+    return (Path(content.recipe or "").stem or name) + flat
 
 
 def _remove_if_empty(path: Path) -> None:
@@ -169,7 +167,7 @@ def _remove_if_empty(path: Path) -> None:
         path.rmdir()
 
 
-def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunDirectory | None:
+def begun(declared: Declaration, content: Manifest, run_dir: Path) -> RunDirectory | None:
     """Return the run of this manifest in ``run_dir``; None: it is not started.
 
     Raises:
@@ -179,8 +177,8 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
         return None
     run, content = RunDirectory.open(run_dir), copy.deepcopy(content)
     _plan(declared, content, Going())
-    grown = any(stage.continued for stage in run.manifest["stages"])
-    if grown or run.manifest.get("id") != identity(content):
+    grown = any(stage.continued for stage in run.manifest.stages)
+    if grown or run.manifest.id != identity(content):
         raise RunError(
             f"{run_dir} holds a run of other settings (or of another recipe, budget or version); "
             "choose another directory"
@@ -189,14 +187,14 @@ def begun(declared: Declaration, content: dict[str, Any], run_dir: Path) -> RunD
 
 
 @global_generators(Seeds(0) / "plan")  # environments are made, and timed
-def _plan(declared: Declared, content: dict[str, Any], options: Going) -> Mapping[str, Role]:
+def _plan(declared: Declared, content: Manifest, options: Going) -> Mapping[str, Role]:
     """Check everything, and complete the entries of a manifest's stages; return the roles."""
-    stages, spec, cluster = content["stages"], declared.spec, options.cluster
+    stages, spec, cluster = content.stages, declared.spec, options.cluster
     declared.check_spaces()
     plan(stages, options.evolve)
     check_several(stages, spec)
-    check_stages(stages, content["eval_every"], content["keep"])
-    if steps := content.get("log_calls"):
+    check_stages(stages, content.eval_every, content.keep)
+    if steps := content.log_calls:
         if any(stage.evolution for stage in stages):
             raise DeclarationError(
                 "log_calls is set, but members of a population have policies of their own, so no "
@@ -210,7 +208,7 @@ def _plan(declared: Declared, content: dict[str, Any], options: Going) -> Mappin
     if cluster is None and any(stage.workers > 1 for stage in stages):
         _must_not_run_again(spec)
     roles: Mapping[str, Role] = {AGENT: agent_role(declared.spec)}
-    if content["kind"] == "hierarchy":
+    if content.hierarchy is not None:
         assert isinstance(declared, Declaration)
         roles = roles_of(declared).by_path
     for stage in stages:
@@ -243,8 +241,8 @@ def resume(declared: D, options: ResumeOptions) -> Trained[D]:
     run = RunDirectory.open(as_path(options.run_dir, "run_dir"))
     applied, note = apply_manifest(declared, run), ""
     if not declared.recorded and declared.recipe is None:  # the command line may change a recipe
-        flat = run.manifest["kind"] == "agent"
-        note = differences(training.manifest(declared, seed=run.manifest["seed"], flat=flat), run)
+        flat = run.manifest.hierarchy is None
+        note = differences(training.manifest(declared, seed=run.manifest.seed, flat=flat), run)
     return go_on(applied, run, options, note)
 
 
@@ -265,20 +263,20 @@ def go_on(
         run.begin()
         notices = stack.enter_context(collected_notices())
         progress = stack.enter_context(Progress(quiet=options.quiet))
-        progress.plan(run.manifest["stages"])
+        progress.plan(run.manifest.stages)
         if note:
             progress.message(note)
         notices.tell_by(warn if options.quiet else progress.message)
         listeners: list[Listener] = [progress]
-        for tracker in make_trackers(run.manifest.get("track", ()), run):
+        for tracker in make_trackers(run.manifest.track, run):
             stack.callback(tracker.close)
             listeners.append(tracker)
         if options.callback is not None:  # last: the report that it receives is written by then
             listeners.append(TrainCallback(options.callback, run))
         make = _where(options.cluster, run, progress, stack)
-        learner = make_learner(run.manifest["stages"], options.evolve, make)
+        learner = make_learner(run.manifest.stages, options.evolve, make)
         try:
-            with global_generators(Seeds(int(run.manifest["seed"])) / "global"):
+            with global_generators(Seeds(run.manifest.seed) / "global"):
                 policy = training.train(declared, run, tuple(listeners), learner, done)
         except KeyboardInterrupt:
             raise Interrupted(f"{saved_words(run)}. Continue: {resume_words(run)}") from None
@@ -331,7 +329,7 @@ def _where(
     """
     if cluster is None or run.finished:
         return LOCAL
-    left = [s for s in run.manifest["stages"] if not s.done]
+    left = [s for s in run.manifest.stages if not s.done]
     counts = [s.workers for s in left]
     wanted = cluster.collectors
     if wanted is not None and any(s.workers != workers_of(s, wanted) for s in left):

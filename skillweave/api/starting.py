@@ -24,10 +24,9 @@ from skillweave.runs.initial_policies import (
     learners_of_run,
     options_of,
     record_initial_policies,
-    recorded_part,
     same_shapes,
 )
-from skillweave.runs.manifest import StageEntry
+from skillweave.runs.manifest import Manifest, StageEntry
 from skillweave.seeding import Seeds
 from skillweave.skills.goal_spaces import goal_part, other_goals
 from skillweave.skills.learnable import Learnable
@@ -50,7 +49,7 @@ StartFrom = Origin | Mapping[str, Origin] | None
 
 
 def starts(
-    content: dict[str, Any],
+    content: Manifest,
     start_from: StartFrom,
     roles: Mapping[str, Role],
 ) -> tuple[dict[str, Learnt], str]:
@@ -78,15 +77,14 @@ def starts(
             learnt |= learners_of_run(_place(start_from, "start_from"))
     # A dict rather than a set: the runs in the order in which they were given.
     where = ", ".join(dict.fromkeys(one.where for one in learnt.values()))
-    started = record_initial_policies(content["stages"], learnt, where)
+    started = record_initial_policies(content.stages, learnt, where)
     for origin in dict.fromkeys(learnt[name].where for name in sorted(started)):
         names = [name for name in started if learnt[name].where == origin]
         ends = tuple(f"skill {name!r}" for name in names)
-        code: dict[str, str] = content["code"]
-        now = {k: v for k, v in code.items() if " skill " not in k or k.endswith(ends)}
+        now = {k: v for k, v in content.code.items() if " skill " not in k or k.endswith(ends)}
         if says := changes(learnt[names[0]].code, now):
             notice(f"start from {origin}: {says} since it was trained")
-    for stage in content["stages"]:
+    for stage in content.stages:
         for name in stage.starts:
             role = roles[name]
             algorithm = make_algorithm(
@@ -96,7 +94,7 @@ def starts(
     return learnt, f"start from {where}: {', '.join(sorted(started))}"
 
 
-def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[str, Any]) -> Learnt:
+def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: Manifest) -> Learnt:
     """Return a policy made elsewhere as one that was learnt here.
 
     What it does not have (of PyTorch modules the critic, for example) is drawn by the run's seed.
@@ -111,7 +109,7 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
         )
     goals = None if role.skill is None else role.skill.goal_space
     origin.check(role.observation_space, role.action_space, goals, f"start_from: {name!r}")
-    first = next(stage for stage in content["stages"] if name in stage.learns)
+    first = next(stage for stage in content.stages if name in stage.learns)
     config = _config_in(first, name)
     fits = origin.learning_on(config, repr(name))
     changed = [
@@ -125,7 +123,7 @@ def _learnt_elsewhere(name: str, origin: Learnable, role: Role, content: dict[st
             f"write {origin.kind}({', '.join(changed)}), with the settings that you have"
         )
     algorithm = make_algorithm(config, role.observation_space, role.action_space)
-    fresh = algorithm.weights(algorithm.init([Seeds(content["seed"]) / name / "start"]))
+    fresh = algorithm.weights(algorithm.init([Seeds(content.seed) / name / "start"]))
     weights = {k: torch.from_numpy(v) for k, v in origin.weights(role.action_space).items()}
     wrong = [k for k, v in weights.items() if k not in fresh or fresh[k].shape != v.shape]
     if wrong:
@@ -202,7 +200,7 @@ def _use_of(value: Any) -> tuple[str, str] | None:
 
 
 def _learnt_by_name(
-    content: dict[str, Any], start_from: Mapping[str, Origin], roles: Mapping[str, Role]
+    content: Manifest, start_from: Mapping[str, Origin], roles: Mapping[str, Role]
 ) -> dict[str, Learnt]:
     """Return the policy that each named learner starts from.
 
@@ -210,7 +208,7 @@ def _learnt_by_name(
         DeclarationError: a name does not learn here.
         RunError: a name has not learnt in its run.
     """
-    here = sorted({name for entry in content["stages"] for name in entry.learns})
+    here = sorted({name for entry in content.stages for name in entry.learns})
     learnt: dict[str, Learnt] = {}
     known: dict[Path, dict[str, Learnt]] = {}
     for name, run in start_from.items():
@@ -239,9 +237,7 @@ def _learnt_by_name(
     return learnt
 
 
-def _check_start(
-    role: Role, algorithm: Algorithm, content: Mapping[str, Any], learnt: Learnt
-) -> None:
+def _check_start(role: Role, algorithm: Algorithm, content: Manifest, learnt: Learnt) -> None:
     """Raise a RunError where a learner cannot start from its policy in another run."""
     before, chooses = learnt.policy.algorithm, options_of(content, role.path)
     goal_space = None if role.skill is None else role.skill.goal_space
@@ -266,13 +262,14 @@ def _check_start(
     cannot = f"start_from: {role.path!r} cannot start with what it learnt in {learnt.where}: "
     if what:
         raise RunError(cannot + what)
-    now = recorded_part(content, role.path) or {}
-    then = learnt.part or now
-    for field in now:
-        if now[field] != then[field]:
+    here = content.by_path.get(role.path)
+    there = learnt.entry or here
+    for field in ("sees", "acts", "residual"):
+        then, now = getattr(there, field, None), getattr(here, field, None)
+        if here is not None and then != now:
             raise RunError(
-                f"{cannot}there its {field} was {shown(then[field])}, and here it is "
-                f"{shown(now[field])}. Declare it as it was, or name the other learners alone, "
+                f"{cannot}there its {field} was {shown(then)}, and here it is "
+                f"{shown(now)}. Declare it as it was, or name the other learners alone, "
                 f"start_from={{name: run}}, and {role.path!r} begins new"
             )
 

@@ -20,6 +20,7 @@ from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.policies.leaves import Selector
 from skillweave.policies.parts import Viewed
+from skillweave.schema import as_json
 from skillweave.selectors import ReadySelector
 from skillweave.skills import Reflex, Skill
 from skillweave.skills.base import own_methods
@@ -63,8 +64,9 @@ class OwnPolicy(Functional):
         self.labels = policy.labels
 
     def source(self) -> dict[str, Any]:
-        """Return the policy's source."""
-        return source_of(self.policy)
+        """Return the fields of the policy's source."""
+        fields: dict[str, Any] = as_json(source_of(self.policy))
+        return fields
 
 
 class ViewedSelector(Viewed, Selector):
@@ -117,8 +119,9 @@ class OwnSelector(ReadySelector):
         return ViewedSelector(selects(self.selector, "the selector"), self._view.obs)
 
     def source(self) -> dict[str, Any]:
-        """Return the selector's source."""
-        return source_of(self.selector)
+        """Return the fields of the selector's source."""
+        fields: dict[str, Any] = as_json(source_of(self.selector))
+        return fields
 
 
 def own_skills(skills: SkillSet, view: OwnView, space: gym.Space[Any]) -> SkillSet:

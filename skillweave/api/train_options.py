@@ -6,7 +6,7 @@ import ast
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cache, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,7 @@ from skillweave.errors import DeclarationError
 from skillweave.evolution.plan import Evolve
 from skillweave.schema import AtLeastOne, Count, fitted
 from skillweave.training.callback import Callback, check_callback
-from skillweave.training.options import RECORDED, CallReports, Continuing, Reports, Starting
+from skillweave.training.options import CallReports, Continuing, Reports, Starting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class AgentOptions(Going, Reports, Starting):
     """A new directory; None: the next number of ``runs/<name>-<n>``, named after the recipe, the
     hierarchy or the environment. A run that has saved nothing yet is replaced, unless a process
     trains it; any other only with ``overwrite``."""
-    track: Sequence[str] = field(default=(), kw_only=True, metadata=RECORDED)
+    track: Sequence[str] = field(default=(), kw_only=True)
     """Any of "tensorboard", "wandb" and "mlflow": one, or a list."""
     start_from: StartFrom = field(default=None, kw_only=True)
     """Another run, or its directory: a learner that has learnt there, by the same name, starts with
@@ -189,11 +189,6 @@ class RepairOptions(Watched, _Pair):
     def training(self) -> AgentOptions:
         """The options of the training in it."""
         return AgentOptions(self.run_dir, seed=self.seed, quiet=self.quiet, callback=self.callback)
-
-
-def recorded(options: AgentOptions) -> dict[str, Any]:
-    """Return the entries of a run's manifest for the options that say that they are recorded."""
-    return {f.name: getattr(options, f.name) for f in fields(options) if "recorded" in f.metadata}
 
 
 P = ParamSpec("P")

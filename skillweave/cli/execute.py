@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,10 +21,10 @@ from skillweave.cli.output import print_result, run_words, save_score
 from skillweave.cli.overrides import list_settings
 from skillweave.cli.sweep import sweep
 from skillweave.cli.training import resume, train
-from skillweave.collecting.lengths import calls_from_json
 from skillweave.compat.agilerl_files import convert
 from skillweave.errors import DeclarationError, RunError, SkillweaveError
-from skillweave.hierarchy.weights import open_weights
+from skillweave.hierarchy.recorded import calls_of
+from skillweave.hierarchy.weights import HierarchyHeader, open_weights
 from skillweave.notices import notice
 from skillweave.planning import Explorer, Handover, as_task
 from skillweave.planning.run_log import handover_json, handover_of
@@ -34,8 +34,9 @@ from skillweave.reporting.report.compare import write_comparison
 from skillweave.reporting.report.single import write_report
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import check_name, hub
-from skillweave.runs.manifest import as_json
+from skillweave.runs.manifest import Manifest
 from skillweave.runs.several import open_runs
+from skillweave.schema import as_json
 from skillweave.terminal import one_line, say
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 
@@ -173,7 +174,7 @@ def _report(command: commands.Report) -> None:
     run = RunDirectory.open(command.run)
     why_not = None
     trained = None
-    named = run.manifest.get("recipe")
+    named = run.manifest.recipe
     # A shipped recipe's code is trusted: with it, the skills' rewards and successes are known.
     recipe = command.recipe or (named if named in recipes.names() else None)
     if run.finished:
@@ -233,7 +234,7 @@ def _run_line(path: Path) -> dict[str, Any]:
         return {"path": str(path), "kind": "run", "env": "?", "status": str(error)}
     status = "finished" if run.finished else "unfinished"
     return {"path": str(path), "status": status} | {
-        k: run.manifest[k] for k in ("kind", "env", "seed")
+        k: getattr(run.manifest, k) for k in ("kind", "env", "seed")
     }
 
 
@@ -266,20 +267,21 @@ def _handover_lines(matrix: Handover | str | None) -> list[str]:
 
 
 def run_lines(
-    manifest: Mapping[str, Any], saved: Sequence[SavedEvaluation | None], target: object
+    manifest: Manifest, saved: Sequence[SavedEvaluation | None], target: object
 ) -> list[str]:
     """Return a run's manifest and its saved evaluations, as lines."""
-    env = one_line(manifest["env"])
-    created = one_line(manifest["created"])
-    lines = [f"{manifest['kind']} on {env}, seed {manifest['seed']}, made {created}"]
-    calls = f", call_steps {calls_from_json(manifest)}" if manifest["kind"] == "hierarchy" else ""
-    calls += f", ready selector: {manifest['selector']['kind']}" if "selector" in manifest else ""
-    calls += f", guide: {manifest['guide']['kind']}" if "guide" in manifest else ""
-    lines += [f"  recipe: {one_line(manifest.get('recipe') or '(declared in Python)')}{calls}"]
+    created, level = one_line(manifest.created), manifest.hierarchy
+    lines = [f"{manifest.kind} on {one_line(manifest.env)}, seed {manifest.seed}, made {created}"]
+    calls = ""
+    if level is not None:
+        calls = f", call_steps {calls_of(level)}"
+        calls += f", ready selector: {level.selector.kind}" if level.selector else ""
+        calls += f", guide: {level.guide.source.kind}" if level.guide else ""
+    lines += [f"  recipe: {one_line(manifest.recipe or '(declared in Python)')}{calls}"]
     lines += [
         f"  {'stage':<14} {'status':<9} {'steps':>10} {'seconds':>8} {'steps/s':>8} {'return':>8}"
     ]
-    for stage in manifest["stages"]:
+    for stage in manifest.stages:
         final = stage.final.get("return")
         lines.append(
             f"  {stage.name:<14} {stage.status:<9} {stage.steps or 0:>10,} "
@@ -292,7 +294,7 @@ def run_lines(
         if stage.continued:
             steps = ", ".join(f"{k:,}" for k in stage.continued)
             lines.append(f"    continued after {steps} steps")
-        if (reached := stage.reached) is not None:
+        if (reached := stage.reached) is not None and stage.target is not None:
             lines.append(
                 f"    target reached after {reached.steps:,} of {stage.budget:,} steps: "
                 f"{stage.target.of} {reached.value:g}"
@@ -310,7 +312,7 @@ def run_lines(
             )
         if stage.kept is not None:
             lines.append(f"    {stage.kept}")
-    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest["versions"].items())]
+    lines += ["  " + ", ".join(one_line(f"{k} {v}") for k, v in manifest.versions.items())]
     for score in saved:
         if score is not None:
             how = "greedy" if score.deterministic else "sampled"
@@ -398,10 +400,12 @@ def _load_target(command: commands.Watched | commands.Export | commands.Plan) ->
         return _load_run(path, command.recipe)
     if path.suffix == ".safetensors":
         header = open_weights(path)[1]
-        if header.get("kind") == "agent" and "env" in header:
+        named = None
+        if isinstance(header, HierarchyHeader):
+            named = header.recipe
+        elif header.env is not None:
             return Agent.from_weights(path)
-        recipe = command.recipe or header.get("recipe")
-        return declared_in(recipe, command.recipe, str(path)).load_weights(path)
+        return declared_in(command.recipe or named, command.recipe, str(path)).load_weights(path)
     hint = (
         " (add --pretrained for its shipped weights)" if command.target in recipes.names() else ""
     )
@@ -413,7 +417,7 @@ def _load_with_code(path: Path, recipe: str | None) -> Run:
 
     Without it, what it means that a call succeeded is unknown, which a notice says.
     """
-    named = RunDirectory.open(path).manifest.get("recipe")
+    named = RunDirectory.open(path).manifest.recipe
     run = _load_run(path, recipe or (named if named in recipes.names() else None))
     if isinstance(run.declaration, Hierarchy) and run.declaration.recorded:
         say(

@@ -34,6 +34,7 @@ from skillweave.errors import DeclarationError, RunError, SkillweaveError
 from skillweave.hierarchy import training
 from skillweave.messages import error_text, short
 from skillweave.reporting.report.groups import over_seeds
+from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, fitted
 from skillweave.terminal import say
 from skillweave.training.evaluation_file import load_evaluation
@@ -91,7 +92,7 @@ class Job:
         whole = len(saved.evaluation.returns) == self.evaluate
         return float(saved.evaluation.mean) if as_in_sweep and whole else None
 
-    def _manifest(self, hierarchy: Hierarchy) -> dict[str, Any]:
+    def _manifest(self, hierarchy: Hierarchy) -> Manifest:
         return training.manifest(hierarchy, seed=self.seed, flat=self.flat)
 
 

@@ -18,7 +18,7 @@ from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution.config import Evolution
 from skillweave.messages import shown_path
 from skillweave.runs.directory import RunDirectory
-from skillweave.schema import Count, fitted
+from skillweave.schema import Count, as_json, fitted
 from skillweave.training.options import Continuing, Starting
 
 
@@ -60,7 +60,7 @@ def train(command: commands.Train) -> None:
 def resume(command: commands.Resume) -> None:
     """Finish a run that was stopped."""
     run = RunDirectory.open(command.run)
-    declared = declared_by(run, command.recipe, "resume_needs_recipe")
+    declared = declared_by(run, command.recipe, to_train=True)
     cluster = None if command.ray is None else Ray(address=command.ray or None)
     try:
         trained = declared.resume(command.run, **_options(command, Continuing), cluster=cluster)
@@ -146,10 +146,10 @@ def _summary(
     command: commands.Train | commands.Resume, trained: Run, render: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
     """Return the results of a run, for programs and for people."""
-    manifest = trained.info()
-    result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": manifest["stages"]}
-    seconds = sum(p["seconds"] for p in manifest["stages"])
-    steps = sum(p["steps"] for p in manifest["stages"])
+    run = RunDirectory.open(trained.path)
+    stages = run.manifest.stages
+    result: dict[str, Any] = {"run": str(shown_path(trained.path)), "stages": as_json(stages)}
+    seconds, steps = sum(s.seconds or 0.0 for s in stages), sum(s.steps or 0 for s in stages)
     lines = [
         f"trained {steps:,} steps in {seconds:.1f} s ({steps / max(seconds, 1e-9):,.0f} steps/s)"
     ]
@@ -159,10 +159,10 @@ def _summary(
         save_score(trained, score)
         lines.append(f"score   {score.for_people()}")
     if render:
-        film = trained.render(trained.path / f"{manifest['kind']}.gif", quiet=command.quiet)
+        film = trained.render(trained.path / f"{run.manifest.kind}.gif", quiet=command.quiet)
         result["film"] = film
         lines.append(f"film    {film['path']}")
-    lines += run_words(RunDirectory.open(trained.path))
+    lines += run_words(run)
     return result, lines
 
 

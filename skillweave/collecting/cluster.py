@@ -14,7 +14,7 @@ from skillweave.collecting.group import Collectors, MakeCollector, share_of
 from skillweave.collecting.placement import Placement
 from skillweave.collecting.workers import WorkerFactory, Workers
 from skillweave.envs.make import cores
-from skillweave.errors import DeclarationError, MissingExtra, TrainingError
+from skillweave.errors import DeclarationError, TrainingError, needs_extra
 from skillweave.messages import error_text, short
 from skillweave.schema import AtLeastOne, Check, NonNegative, Positive, settings
 
@@ -157,10 +157,8 @@ def imported() -> Any:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     # What Ray says of lost actors would go to standard output; ``workers`` reports it.
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", ".")
-    try:
+    with needs_extra("Ray, for collectors on a cluster,", "ray"):
         import ray
-    except ImportError as error:
-        raise MissingExtra("Ray, for collectors on a cluster,", "ray") from error
     return ray
 
 

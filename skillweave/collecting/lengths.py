@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -64,16 +64,3 @@ class Lengths:
     @staticmethod
     def _written(steps: tuple[Any, ...]) -> str:
         return f"Lengths({', '.join('...' if s is ... else short(s) for s in steps)})"
-
-
-def calls_to_json(value: int | Lengths | None) -> dict[str, Any]:
-    """Return the limit of calls as entries of a JSON object."""
-    if isinstance(value, Lengths):
-        return {"call_steps": None, "call_lengths": list(value.steps)}
-    return {"call_steps": value}
-
-
-def calls_from_json(entry: Mapping[str, Any]) -> int | Lengths | None:
-    """Return the limit of calls; the inverse of ``calls_to_json``."""
-    lengths, steps = entry.get("call_lengths"), entry["call_steps"]
-    return steps if lengths is None else Lengths(*lengths)

@@ -10,7 +10,7 @@ import gymnasium as gym
 
 from skillweave.collecting.lengths import Lengths
 from skillweave.errors import PolicyError
-from skillweave.policies.core import Policy, innermost
+from skillweave.policies.core import Choices, Policy, innermost
 from skillweave.policies.functional import Functional, Returns
 from skillweave.policies.hierarchy import ActiveGuide, CalledSkill, Hierarchy, Interruption
 from skillweave.policies.leaves import Ready
@@ -24,12 +24,20 @@ from skillweave.skills.own_part import OwnPart
 from skillweave.types import Memoryless
 
 
-@dataclass(frozen=True)
-class SkillSet:
-    """Skills with their policies, and the limits of their calls; ``hierarchy_of`` lets them act.
+class LimitedCalls(Choices):
+    """Calls of skills that ``call_steps`` limits."""
 
-    A choice is a number below ``choices``: a skill, or a skill and a length.
-    """
+    call_steps: int | Lengths | None
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """The lengths that are chosen from; none where no length is chosen."""
+        return self.call_steps.steps if isinstance(self.call_steps, Lengths) else ()
+
+
+@dataclass(frozen=True)
+class SkillSet(LimitedCalls):
+    """Skills with their policies, and the limits of their calls; ``hierarchy_of`` lets them act."""
 
     skills: tuple[Skill, ...]
     policies: tuple[Any, ...]
@@ -48,16 +56,6 @@ class SkillSet:
     one."""
     greedy_selector: bool = True
     """The selector is greedy where its caller asks for deterministic actions; else it samples."""
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """The lengths that are chosen from; none where no length is chosen."""
-        return self.call_steps.steps if isinstance(self.call_steps, Lengths) else ()
-
-    @property
-    def choices(self) -> int:
-        """The number of choices: the first skill with each length, then the next skill."""
-        return len(self.skills) * max(1, len(self.lengths))
 
     @property
     def choice_space(self) -> gym.Space[Any]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file
-from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.seeding import Seeds
 
 
@@ -18,7 +19,7 @@ def save_agent(path: str | Path, algorithm: Algorithm, state: Any, about: dict[s
     """Write the one member of a state; ``about`` is plain JSON."""
     tensors, header = AgentPolicy.of(algorithm, state).to_file()
     tensors = tensors | {f"state.{k}": v for k, v in vars(state).items()}
-    write_tensors(Path(path), tensors, header | {"about": about})
+    write_tensors(Path(path), tensors, replace(header, about=about))
 
 
 def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str, Any]]:
@@ -37,10 +38,11 @@ def load_agent(path: str | Path, seeds: Seeds) -> tuple[Algorithm, Any, dict[str
             f"import-agilerl {path} --trust"
         )
     tensors, header = read_tensors(Path(path))
-    algorithm = AgentPolicy.from_file(tensors, header, str(path)).algorithm
+    of: AgentHeader = record_in(AgentHeader, header, path)
+    algorithm = AgentPolicy.from_file(tensors, of, str(path)).algorithm
     state = algorithm.init([seeds])
     algorithm.set_weights(state, tensors)
     saved = {k[len("state.") :]: v for k, v in tensors.items() if k.startswith("state.")}
     if saved:
         state = state_from(vars(state) | saved, state, str(path), algorithm.parameter_groups())
-    return algorithm, state, header.get("about", {})
+    return algorithm, state, of.about

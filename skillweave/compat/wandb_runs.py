@@ -6,7 +6,7 @@ import os
 import sys
 from typing import Any
 
-from skillweave.errors import MissingExtra
+from skillweave.errors import needs_extra
 from skillweave.runs.trackers import wandb_mode
 from skillweave.terminal import say
 
@@ -20,10 +20,8 @@ def start_wandb(project: str, name: str, config: dict[str, Any], key: str | None
     Raises:
         MissingExtra: wandb is not installed.
     """
-    try:
+    with needs_extra("tracking with wandb", "wandb"):
         import wandb
-    except ImportError as error:
-        raise MissingExtra("tracking with wandb", "wandb") from error
     stay_offline()
     if key is not None:
         wandb.login(key=key)

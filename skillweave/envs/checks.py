@@ -10,17 +10,19 @@ import copy
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from skillweave.envs.image_bounds import ImageBounds
-from skillweave.envs.infos import MASK, checked_mask, observes_mask
+from skillweave.envs.infos import MASK, observes_mask
 from skillweave.envs.pool import first_row
 from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import error_text, short
 from skillweave.notices import notice
+from skillweave.policies.spaces import space_of
 from skillweave.spaces import choice_counts, obs_shape
 from skillweave.spaces.packing import parts
 from skillweave.types import LARGEST_REWARD, Array, wrong_reward
@@ -121,18 +123,10 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         if seed is not None:
             for i, space in enumerate(self._drawn_spaces, 1):  # not the stream of env.np_random
                 space.seed((seed + i * 0x5BD1E995) % 2**31)
-        try:
-            result = self.env.reset(seed=seed, options=options)
-        except SkillweaveError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise self._wrong(f"reset() raised {error_text(error)}") from error
-        if not isinstance(result, tuple) or len(result) != 2:
-            raise self._wrong(f"reset() returned {_many(result)}; Gymnasium needs obs, info")
-        obs, info = result
-        if not self._fits(obs):
-            raise self._misfit(obs)
-        self._check_info(info)
+        reset = partial(self.env.reset, seed=seed, options=options)
+        values = self._called(reset, "reset()")
+        self._check(values, 2, "reset() returned", "obs, info")
+        obs, info = values
         if not self._looked:
             self._looked = True
             self._look_for_masks(info)
@@ -141,20 +135,10 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         """Step the environment and check the result."""
         self._elapsed += 1
-        try:
-            result = self.env.step(action)
-        except SkillweaveError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise self._wrong(f"step() raised {error_text(error)}") from error
-        if not isinstance(result, tuple) or len(result) != 5:
-            raise self._wrong(
-                f"step() returned {_many(result)}; Gymnasium needs five: obs, reward, "
-                "terminated, truncated, info"
-            )
-        obs, reward, terminated, truncated, info = result
-        if not self._fits(obs):
-            raise self._misfit(obs)
+        values = self._called(self.env.step, "step()", action)
+        needed = "five: obs, reward, terminated, truncated, info"
+        self._check(values, 5, "step() returned", needed)
+        obs, reward, terminated, truncated, info = values
         if type(reward) is not float:
             reward = float(self._scalar(reward, "its reward", "a number"))
         if not -LARGEST_REWARD <= reward <= LARGEST_REWARD:
@@ -163,13 +147,35 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             terminated = self._flag(terminated, "terminated")
         if type(truncated) is not bool:
             truncated = self._flag(truncated, "truncated")
-        if type(info) is not dict:
-            self._check_info(info)
         if terminated or truncated:
             obs, info = last_observation(obs, info, self.env)
         if self._chooses:
             info = self._with_mask(info, over=terminated or truncated)
         return obs, reward, terminated, truncated, info
+
+    def _check(self, values: Any, size: int, returned: str, needed: str) -> None:
+        """Raise an EnvError where ``reset`` or ``step`` returned no observation and info."""
+        if not isinstance(values, tuple) or len(values) != size:
+            many = isinstance(values, tuple)
+            what = f"{len(values)} values" if many else f"a {type(values).__name__}"
+            raise self._wrong(f"{returned} {what}; Gymnasium needs {needed}")
+        if not self._fits(values[0]):
+            space = short(self.env.observation_space, 200)
+            raise self._wrong(
+                f"its observation is {_described(values[0])}, which is not in its "
+                f"observation_space {space}"
+            )
+        if not isinstance(values[-1], dict):
+            raise self._wrong(f"its info is {short(values[-1])}; it must be a dict")
+
+    def _called(self, function: Callable[..., Any], name: str, *args: Any) -> Any:
+        """Return the result of a function of the environment."""
+        try:
+            return function(*args)
+        except SkillweaveError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise self._wrong(f"{name} raised {error_text(error)}") from error
 
     def _look_for_masks(self, info: dict[str, Any]) -> None:
         """Give a notice where a key or attribute that is not used looks like an action mask."""
@@ -177,7 +183,8 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         actions = self.env.action_space
         observed = space.spaces if isinstance(space, gym.spaces.Dict) else {}
         if not self._chooses:
-            if not _is_real(actions) and (
+            real = isinstance(actions, gym.spaces.Box) and np.issubdtype(actions.dtype, np.floating)
+            if not real and (  # nobody expects real numbers to have masks
                 MASK in info or MASK in observed or _attribute(self.env, "action_masks") is not None
             ):
                 notice(
@@ -210,15 +217,12 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
         elif self._masks is None or over:
             return info
         else:
-            try:
-                mask = self._masks()
-            except (Exception, SystemExit) as error:
-                raise self._wrong(f"action_masks() raised {error_text(error)}") from error
+            mask = self._called(self._masks, "action_masks()")
         others = {key: value for key, value in info.items() if key != MASK}
         if mask is None:  # all actions are allowed
             return others
         try:
-            return {**others, MASK: checked_mask(mask, self.env.action_space)}
+            return {**others, MASK: space_of(self.env.action_space).allowed(mask)}
         except ValueError as error:
             raise self._wrong(str(error)) from error
 
@@ -249,24 +253,9 @@ class CheckedEnv(gym.Wrapper[Any, Any, Any, Any]):
             raise self._wrong(f"{which} is {short(value)}; it must be {needed}")
         return bool(number)
 
-    def _check_info(self, info: Any) -> None:
-        if not isinstance(info, dict):
-            raise self._wrong(f"its info is {short(info)}; it must be a dict")
-
-    def _misfit(self, obs: Any) -> EnvError:
-        space = short(self.env.observation_space, 200)
-        return self._wrong(
-            f"its observation is {_described(obs)}, which is not in its observation_space {space}"
-        )
-
     def _wrong(self, what: str) -> EnvError:
         where = f"environment {self._number}, " if self._number is not None else ""
         return EnvError(f"{self._name}: {where}step {self._elapsed} of its episode: {what}")
-
-
-def _is_real(space: gym.Space[Any]) -> bool:
-    """Return whether actions are real numbers alone, which nobody expects to have masks."""
-    return isinstance(space, gym.spaces.Box) and np.issubdtype(space.dtype, np.floating)
 
 
 def _attribute(env: gym.Env[Any, Any], name: str) -> Any:
@@ -533,13 +522,10 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool]:
         except Exception:
             return False
         # Whole numbers are accepted as reals, and reals of another size.
-        return array.shape == shape and _kind_fits(array, dtype)
+        fits = array.dtype.kind in "fiub" and np.can_cast(array.dtype, dtype, "same_kind")
+        return array.shape == shape and fits
 
     return fits
-
-
-def _kind_fits(array: Array, dtype: np.dtype[Any]) -> bool:
-    return array.dtype.kind in "fiub" and np.can_cast(array.dtype, dtype, "same_kind")
 
 
 def _holds(space: gym.Space[Any], obs: Any) -> bool:
@@ -548,10 +534,6 @@ def _holds(space: gym.Space[Any], obs: Any) -> bool:
         return bool(space.contains(obs))
     except Exception:
         return False
-
-
-def _many(result: Any) -> str:
-    return f"{len(result)} values" if isinstance(result, tuple) else f"a {type(result).__name__}"
 
 
 def _described(obs: Any) -> str:

@@ -163,7 +163,7 @@ class GymnasiumEngine:
     def reset_some(self, ids: Array, seeds: Sequence[int] | None = None) -> Array:
         """Reset some environments; return observations (n, *obs_shape)."""
         if seeds is None:
-            seeds = [self._next_seed(int(i)) for i in ids]
+            seeds = [episode_seed(self._root, int(i), int(self._episode[i])) for i in ids]
         self._episode[ids] += 1
         self._seed[ids] = seeds
         self._history.forget(ids)
@@ -214,9 +214,6 @@ class GymnasiumEngine:
     def close(self) -> None:
         """Release the environments."""
         self._envs.close()
-
-    def _next_seed(self, row: int) -> int:
-        return episode_seed(self._root, row, int(self._episode[row]))
 
     def _begin(self, ids: Array) -> Array:
         """Reset environments ``ids`` to their seeds."""

@@ -50,11 +50,6 @@ class _Image:
         """Return whether values lie far beyond the bounds."""
         return self.scaled[0] < -BEYOND or self.scaled[1] > 1.0 + BEYOND
 
-    @property
-    def is_narrow(self) -> bool:
-        """Return whether the values differ, and use a small part of the range."""
-        return 0.0 < self.scaled[1] - self.scaled[0] <= NARROW
-
 
 class ImageBounds:
     """A check of an environment's first observations that gives a notice where bounds do not fit.
@@ -76,7 +71,8 @@ class ImageBounds:
         self._looks -= 1
         for image in list(self._images):
             image.see(obs)
-            if image.is_beyond or (not self._looks and image.is_narrow):
+            is_narrow = 0.0 < image.scaled[1] - image.scaled[0] <= NARROW
+            if image.is_beyond or (not self._looks and is_narrow):
                 self._images.remove(image)
                 self._notice(image)
         return self._looks > 0 and bool(self._images)

@@ -12,7 +12,7 @@ from skillweave.errors import EnvError
 from skillweave.messages import short
 from skillweave.policies.core import OWN_REWARD, SUCCESS
 from skillweave.policies.infos import NUMBERS, batched_infos
-from skillweave.policies.spaces import allows_each, space_of
+from skillweave.policies.spaces import allows_each
 from skillweave.skills.info_words import info_keys
 from skillweave.spaces import (
     action_codec,
@@ -67,14 +67,6 @@ def observes_mask(observation_space: gym.Space[Any], space: gym.Space[Any]) -> b
         return False
     size = sum(choice_counts(space))
     return bool(size) and int(np.prod(observation_space.spaces[MASK].shape or ())) == size
-
-
-def checked_mask(value: Any, space: gym.Space[Any]) -> Array:
-    """Return a mask of an environment or a user for the choices of a space as (A,) bool.
-
-    See ``Space.allowed``.
-    """
-    return space_of(space).allowed(value)
 
 
 class ActionMasks:

@@ -19,7 +19,7 @@ from skillweave.envs.checks import CheckedEnv, is_batched, refuse_batched
 from skillweave.envs.engine import Engine, GymnasiumEngine
 from skillweave.envs.envpool_engine import EnvPoolEngine
 from skillweave.envs.infos import ActionMasks, random_actions
-from skillweave.envs.obs_names import ObsNames, checked_obs_names, names_in
+from skillweave.envs.obs_names import Names, ObsNames, names_in
 from skillweave.envs.pool import MakePool, envpool, takes_ids
 from skillweave.errors import EnvError, MissingExtra, SkillweaveError
 from skillweave.messages import error_text, short, shortened, suggest
@@ -57,14 +57,6 @@ PoolMaker = Annotated[
     MakePool, Check("a function of num_envs, threads and seed that makes a pool", callable)
 ]
 """A function that makes environments side by side."""
-Names = Annotated[
-    ObsNames,
-    Check(
-        "a list with a name for each number of an observation, or for a Dict such lists by key: "
-        '{"place": ["x", "y"]}'
-    ),
-]
-"""Names of the numbers of an observation."""
 
 
 class Spaces(NamedTuple):
@@ -124,7 +116,6 @@ class EnvSpec:
         if is_batched(self.env):
             raise refuse_batched(short(self.env))
         check_fields(self)
-        checked_obs_names(self.obs_names, self.name)
 
     @property
     def spaces(self) -> Spaces:
@@ -245,9 +236,10 @@ class EnvSpec:
                 function.
         """
         recorded = {}
+        function = self.name if self.name.isidentifier() else "your_function"
+        known = isinstance(self.env, str)
+        call = f"gymnasium.make({self.env!r}, " if known else f"{function}("
         for name, value in self.kwargs.items():
-            known = isinstance(self.env, str)
-            call = f"gymnasium.make({self.env!r}, " if known else f"{self._function_name}("
             recorded[name] = to_json(
                 value,
                 f"{self.name}: kwargs[{name!r}]",
@@ -255,11 +247,6 @@ class EnvSpec:
                 f"{name}=...)",
             )
         return recorded
-
-    @property
-    def _function_name(self) -> str:
-        """Return the name in messages of the function that makes the environment."""
-        return self.name if self.name.isidentifier() else "your_function"
 
     @property
     def is_data(self) -> bool:

@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import gymnasium as gym
 
-from skillweave.errors import DeclarationError
-from skillweave.messages import short
+from skillweave.schema import Check, fitted
 
 ObsNames: TypeAlias = Sequence[str] | Mapping[str, Sequence[str]]
 """A name for each number of a flat observation; for a Dict, such names by key."""
+
+
+def _differ(names: Any) -> bool:
+    each = names.values() if isinstance(names, Mapping) else [names]
+    return all(len({*part} - {""}) == len(part) for part in each)
+
+
+Names = Annotated[
+    ObsNames,
+    Check(
+        "a list with a name of its own for each number of an observation, or for a Dict such "
+        'lists by key: {"place": ["x", "y"]}',
+        _differ,
+    ),
+]
+"""Names of the numbers of an observation, as users give them."""
 
 GYMNASIUM: dict[str, tuple[str, ...]] = {
     "Acrobot": (
@@ -40,27 +55,6 @@ GYMNASIUM: dict[str, tuple[str, ...]] = {
 """Names in Gymnasium's environments by id without version, from its documentation."""
 
 
-def checked_obs_names(names: object, where: str) -> ObsNames | None:
-    """Return the names, if they are texts in a list, or such lists by key.
-
-    Raises:
-        DeclarationError: they are not; the message begins with ``where``.
-    """
-    if names is None:
-        return None
-    parts: list[Any] = list(names.values()) if isinstance(names, Mapping) else [names]
-    for part in parts:
-        listed = isinstance(part, Sequence) and not isinstance(part, str)
-        if not listed or not all(isinstance(name, str) and name for name in part):
-            raise DeclarationError(
-                f"{where}: obs_names is {short(names)}; it must be a list with a name for each "
-                'number of an observation, or for a Dict such lists by key: {"place": ["x", "y"]}'
-            )
-        if len(set(part)) < len(part):
-            raise DeclarationError(f"{where}: obs_names has a name twice: {short(part)}")
-    return names  # type: ignore[return-value]
-
-
 def names_in(env: gym.Env[Any, Any], env_id: str | None) -> ObsNames | None:
     """Return the names in an environment's attribute, or those that Gymnasium documents.
 
@@ -73,5 +67,7 @@ def names_in(env: gym.Env[Any, Any], env_id: str | None) -> ObsNames | None:
     except AttributeError:
         names = None
     if names is not None:
-        return checked_obs_names(names, type(env.unwrapped).__name__)
+        where = f"{type(env.unwrapped).__name__}: obs_names"
+        found: ObsNames = fitted(Names, names, where)
+        return found
     return GYMNASIUM.get((env_id or "").rpartition("-v")[0])

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError, EnvError, MissingExtra
+from skillweave.errors import DeclarationError, EnvError, needs_extra
 from skillweave.messages import short, suggest
 from skillweave.spaces import pack, unpack
 from skillweave.types import Array
@@ -273,8 +273,6 @@ def installed() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
+    with needs_extra("the EnvPool engine", "envpool"):
         import envpool as package
-    except ImportError as error:
-        raise MissingExtra("the EnvPool engine", "envpool") from error
     return package

@@ -7,8 +7,8 @@ import numpy as np
 from skillweave.algorithms.policy import AgentPolicy
 from skillweave.collecting.collector import RETURN
 from skillweave.seeding import Seeds
-from skillweave.training.eval_envs import episodes_of
 from skillweave.training.learning_task import LearningTask
+from skillweave.training.periodic import episodes_of
 
 
 class FitnessEnvs:

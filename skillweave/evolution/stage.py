@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from skillweave.evolution.population import Population
 from skillweave.evolution.split import Parts
 from skillweave.evolution.stacks import Member
 from skillweave.networks.config import Network
-from skillweave.runs.manifest import BestEntry, Generation, MemberEntry, Winner
+from skillweave.runs.manifest import BestEntry, Generation, LineageLine, MemberEntry, Winner
 from skillweave.seeding import Seeds
 from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import StageRun
@@ -258,8 +258,10 @@ class EvolvingPopulation:
         store = self.population.part.store
         if store is not None and self.config.save_buffer and not self.over:  # type: ignore[union-attr]
             tensors |= prefixed("store", store.state())
-        best = self.best
-        weights, about = ({}, {}) if best is None else best.policy.to_file()
+        best, entry, weights = self.best, None, dict[str, Tensor]()
+        if best is not None:
+            weights, header = best.policy.to_file()
+            entry = BestEntry(best.fitness, best.number, best.generation, header)
         self.log.at.population = Generation(
             self.fitness_steps,
             self.done,
@@ -269,7 +271,7 @@ class EvolvingPopulation:
                 MemberEntry(m.number, m.steps, config_to_json(m.config), m.origin)
                 for m in self.population.members
             ],
-            None if best is None else BestEntry(best.fitness, best.number, best.generation, about),
+            entry,
         )
         self.log.save(None, tensors | prefixed("best", weights))
 
@@ -323,20 +325,20 @@ def lineage_of(
     fitness: Array,
     evolution: Evolution,
     best: int | None,
-) -> list[dict[str, Any]]:
+) -> list[LineageLine]:
     """Return a generation's lines; ``best``: the best member's number, if it is among them."""
     return [
-        {
-            "stage": stage,
-            "generation": generation,
-            "member": member.number,
-            **asdict(member.origin),
-            "fitness": float(value) if np.isfinite(value) else None,
-            "diverged": not np.isfinite(value),
-            "best": member.number == best,
-            "steps": member.steps,
-            "settings": settings_of(member.config, evolution),
-        }
+        LineageLine(
+            stage=stage,
+            generation=generation,
+            member=member.number,
+            **vars(member.origin),
+            fitness=float(value) if np.isfinite(value) else None,
+            diverged=not np.isfinite(value),
+            best=member.number == best,
+            steps=member.steps,
+            settings=settings_of(member.config, evolution),
+        )
         for member, value in zip(members, fitness, strict=True)
     ]
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from skillweave.algorithms.base import Algorithm
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.errors import MissingExtra, PolicyError
+from skillweave.errors import PolicyError, needs_extra
 from skillweave.networks.heads import ActionHead, JointHead
 from skillweave.ops.device import BOOL, FLOAT
 from skillweave.policies.leaves import Network
@@ -192,11 +192,9 @@ def traced(
         PolicyError: an operation of it has no counterpart; the message begins with ``where``.
         MissingExtra: the packages that write ONNX are not installed.
     """
-    try:
+    with needs_extra("exporting to ONNX", "onnx"):
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("exporting to ONNX", "onnx") from error
     how: Any = {"input_names": list(given), "output_names": list(outputs), "opset_version": OPSET}
     example = tuple(given.values())
     try:

@@ -24,13 +24,14 @@ from skillweave.policies.functional import Functional
 from skillweave.policies.hierarchy import CalledSkill, Hierarchy
 from skillweave.policies.mapped import Mapped, Take
 from skillweave.policies.parts import Reflexes
+from skillweave.schema import fitted
 from skillweave.skills import Reflex
 from skillweave.skills.base import RecordedSkill
 from skillweave.skills.foreign_policy import Foreign
 from skillweave.skills.goal_spaces import with_goal
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapped import check_range
-from skillweave.skills.mapping import check_in_range, checked_goal
+from skillweave.skills.mapping import GoalValue, check_in_range
 from skillweave.spaces.saving import gym_space
 from skillweave.types import Policy as AnyPolicy
 
@@ -91,7 +92,7 @@ class Exported(Functional, Foreign):
             DeclarationError: it takes none, or the goal is out of its range.
         """
         try:
-            numbers = checked_goal(goal)
+            numbers = fitted(GoalValue, goal, "goal")
             if not self.takes_goal:
                 raise DeclarationError(f"goal is given, {short(goal)}, but the policy takes none")
             if not callable(numbers):

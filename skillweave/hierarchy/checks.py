@@ -16,7 +16,7 @@ from skillweave.paths import name_of
 from skillweave.runs.manifest import Target
 from skillweave.schema import fitted
 from skillweave.selectors import Automaton
-from skillweave.skills import Reflex, Skill, ready_policy
+from skillweave.skills import Skill, ready_policy
 from skillweave.skills.learnable import learn_on
 from skillweave.skills.own_part import ZERO, checked_rest
 from skillweave.training.stage import target_of
@@ -91,15 +91,6 @@ def _distance(skill: Skill, field: str) -> int:
     """Return the place of a skill's field: 0 on the object, 1 in its class, more in those above."""
     places = [vars(skill), *map(vars, type(skill).__mro__)]
     return next((i for i, names in enumerate(places) if field in names), len(places))
-
-
-def checked_reflexes(reflexes: object) -> tuple[Reflex, ...]:
-    """Return the reflexes as a tuple.
-
-    Raises:
-        DeclarationError: the argument is no list of reflexes.
-    """
-    return tuple(fitted(Sequence[Reflex], reflexes, "reflexes"))
 
 
 def check_level(level: Level) -> None:
@@ -200,12 +191,15 @@ def _check_start_calls(level: Level) -> None:
 
 
 _ELSEWHERE = {
-    "algorithm": "selector=",
-    "steps": "steps=",
-    "target_return": "selection=Selection(target_return=...)",
-    "target_success": "selection=Selection(target_return=...)",
+    **dict.fromkeys(("sees", "acts"), "it to the skills in the hierarchy"),
+    "algorithm": "the hierarchy selector=",
+    "steps": "the hierarchy steps=",
+    **dict.fromkeys(
+        ("target_return", "target_success"),
+        "the hierarchy selection=Selection(target_return=...)",
+    ),
 }
-"""Attributes of a skill that a hierarchy sets itself, and the argument that sets them."""
+"""Attributes of a skill that one which is a hierarchy does not have, and what to give instead."""
 
 
 def check_nested(roles: Roles) -> None:
@@ -225,17 +219,10 @@ def check_nested(roles: Roles) -> None:
                 f"skill {path!r} is a hierarchy, but its policy is a property: make it a class "
                 "attribute"
             )
-        for field in ("sees", "acts"):
+        for field, advice in _ELSEWHERE.items():
             if getattr(skill, field) is not None:
                 raise DeclarationError(
-                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give it to "
-                    "the skills in the hierarchy"
-                )
-        for field, where in _ELSEWHERE.items():
-            if getattr(skill, field) is not None:
-                raise DeclarationError(
-                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give the "
-                    f"hierarchy {where}"
+                    f"skill {path!r} is a hierarchy, so it has no {field} of its own: give {advice}"
                 )
 
 

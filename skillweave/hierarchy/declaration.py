@@ -14,7 +14,6 @@ from skillweave.errors import DeclarationError
 from skillweave.hierarchy.checks import (
     check_level,
     check_nested,
-    checked_reflexes,
     checked_skills,
 )
 from skillweave.hierarchy.fitting import check_settings, ready_policies, ready_selectors
@@ -68,8 +67,8 @@ class Declaration(Settings, Nestable, Declared):
         """
         check_env(self.env)
         self.skills = checked_skills(self.skills, RESERVED)
-        self.reflexes = checked_reflexes(self.reflexes)
         check_fields(self)
+        self.reflexes = tuple(self.reflexes)
         names = {skill.name for skill in self.skills}
         if same := sorted(names & named_predicates(self.predicates, "predicates").keys()):
             raise DeclarationError(

@@ -134,7 +134,7 @@ def fitted_guide(level: Level, observation_space: gym.Space[Any]) -> ActiveGuide
         return None
     choices = gym.spaces.Discrete(len(level.skills) * max(1, len(guide.lengths)))
     who = join(level.path, "guide")
-    if guide.gives_goals:
+    if any(goal is not None for *_, goal in guide.named()):
         raise DeclarationError(
             f"{who}: it gives a goal, but the selector that it guides chooses goals itself: leave "
             "out the goal"

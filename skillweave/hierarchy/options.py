@@ -185,7 +185,7 @@ class OptionsEnv(VectorEnv[Any, Any, Any]):
         return {"final_obs": final, "_final_obs": ended}
 
     def _named(self, choice: Array) -> str:
-        return self.skills.skills[int(self._hierarchy.skill_of(choice))].name
+        return self.skills.skills[int(self.skills.skill_of(choice))].name
 
     def _choices(self, actions: Any) -> Array:
         """Return skills with goals as choices (N,); no number of a goal changes."""

@@ -56,7 +56,7 @@ class HierarchyPolicy(Functional):
         """
         skill_set = self.skills
         sources = [source_of(policy) for policy in (self.selector, *skill_set.policies)]
-        checksums = [[source["kind"], source.get("sha256")] for source in sources]
+        checksums: list[Any] = [[source.kind, source.sha256] for source in sources]
         skills = [
             [s.name, s.max_steps, *([] if s.call_steps is None else [s.call_steps])]
             for s in skill_set.skills
@@ -64,11 +64,10 @@ class HierarchyPolicy(Functional):
         reflexes = [r.name for r in skill_set.reflexes]
         interruption = skill_set.interruption
         if interruption is not None and interruption.critic is not None:
-            critic = source_of(interruption.critic)
-            checksums.append([interruption.margin, critic.get("sha256")])
+            checksums.append([interruption.margin, source_of(interruption.critic).sha256])
         if self.guide is not None:
             guide = source_of(cast(Policy, self.guide.selector))
-            checksums.append(["guide", guide.get("sha256")])
+            checksums.append(["guide", guide.sha256])
         parts = (part for part in skill_set.parts if part is not None)
         checksums += [["part", part.who, part.to_json()] for part in parts]
         call_steps = skill_set.lengths or skill_set.call_steps

@@ -244,13 +244,13 @@ def measure(
     size = CHUNK
     tell(f"measuring: calls of {skill} after {after}, at least {calls}")
     while True:
-        choose = PairChoice(names, max(1, len(skills.lengths)), skill, after)
+        choose = PairChoice(names, skills.each, skill, after)
         seed = SEED + len(parts)
         log, returns = with_returns(spec, skills, size, choose, num_envs, seed)
         steps += log.steps
         found = log.handover(done)
         matrix = found if matrix is None else _sum(matrix, found)
-        may = log.may_follow[log.skill == first][:, number * (log.choices // len(names))]
+        may = log.may_follow[log.skill == first][:, number * log.each]
         may_start |= bool(may.any())
         of_skill = log.skill == number
         won = calls_done(log, done)
@@ -386,7 +386,7 @@ def _rates(before: Handover, later: Handover, place: tuple[int, int]) -> str:
 def repairs_of(run: RunDirectory) -> list[Repair]:
     """Return the repairs of a run that are judged, in their order."""
     repairs = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         repair = entry.repair
         if repair is not None and repair.later is not None:
             repairs.append(

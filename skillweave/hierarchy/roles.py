@@ -17,7 +17,7 @@ from gymnasium import Space
 
 from skillweave.algorithms.config import AlgorithmConfig
 from skillweave.collecting.lengths import Lengths
-from skillweave.collecting.skill_set import SkillSet
+from skillweave.collecting.skill_set import LimitedCalls, SkillSet
 from skillweave.collecting.user_code import Texts, environment_texts, skill_texts
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError
@@ -84,7 +84,7 @@ class Nestable(OfSkills):
 
 
 @dataclass(kw_only=True)
-class Level(Settings):
+class Level(LimitedCalls, Settings):
     """A hierarchy's own settings: of the outermost one, or of one that is a skill of another."""
 
     path: str
@@ -107,16 +107,6 @@ class Level(Settings):
     def critic_path(self) -> str:
         """The path of its critic of skills."""
         return join(self.path, CRITIC)
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """The lengths of calls that are chosen from; none where no length is chosen."""
-        return self.call_steps.steps if isinstance(self.call_steps, Lengths) else ()
-
-    @property
-    def choices(self) -> int:
-        """Number of a selector's choices: skills, times lengths if these are chosen, too."""
-        return len(self.skills) * max(1, len(self.lengths))
 
     @property
     def names(self) -> tuple[str, ...]:

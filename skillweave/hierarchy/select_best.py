@@ -19,7 +19,7 @@ from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import StageEntry
 from skillweave.training.episodes import standard_error
 from skillweave.training.evaluation import Evaluation, evaluate
-from skillweave.training.skill_text import stuck_selector, useless_skills
+from skillweave.training.skill_report import stuck_selector, useless_skills
 from skillweave.training.stage import TOGETHER, Policies
 from skillweave.training.trainer import Course
 
@@ -100,7 +100,7 @@ def _scores(
 ) -> dict[str, Evaluation]:
     """Return the evaluations of all candidates, by name."""
     entry = run.stage(join(level.path, TOGETHER))
-    spec, seed = roles.spec, SEEDS + int(run.manifest["seed"])
+    spec, seed = roles.spec, SEEDS + run.manifest.seed
     num_envs = entry.num_envs
     max_steps = None
     if not entry.final.get("length"):
@@ -188,7 +188,7 @@ def _sampling(run: RunDirectory, path: str) -> tuple[bool, bool]:
     Args:
         path: of a level, which may have learnt together with the levels above it.
     """
-    stages: dict[str, StageEntry] = {s.name: s for s in run.manifest["stages"]}
+    stages = {s.name: s for s in run.manifest.stages}
     for above in levels_to(path):
         entry = stages.get(join(above, TOGETHER))
         if entry is None or not entry.done:

@@ -18,6 +18,18 @@ WIDEST = 65_536
 Activation = Literal["tanh", "relu", "elu", "silu", "gelu"]
 Width = Annotated[int, Check(f"at least 1 and at most {WIDEST:,}", lambda x: 1 <= x <= WIDEST)]
 """Units of a layer, channels, or pixels of a kernel."""
+
+
+def _seen(value: Any) -> Any:
+    """Return one place, several, or a key as a tuple."""
+    if isinstance(value, slice):
+        value = range(value.start or 0, value.stop, value.step or 1)
+    if isinstance(value, range | np.ndarray):
+        return tuple(np.ravel(value))
+    one = isinstance(value, str | int | np.integer) and not isinstance(value, bool)
+    return (value,) if one else value
+
+
 Key = Annotated[str, Check("the key of a part of the observation", lambda x: x != "")]
 Seen = Annotated[
     tuple[Count | Key, ...],
@@ -25,6 +37,7 @@ Seen = Annotated[
         "places in an observation, from 0, and keys of its parts, each once: sees=(0, 1, 4), "
         "slice(0, 8) or ('joints', 'arm.speed')",
         lambda x: 0 < len(x) == len(set(x)),
+        _seen,
     ),
 ]
 """Places of numbers in an observation, and keys of its parts."""
@@ -161,18 +174,6 @@ class Network:
             object.__setattr__(self, "encoder", _encoder(self.encoder))
         if self.sees is not None and self.encoder is not None:
             raise DeclarationError("Network: give sees or encoder, not both")
-
-    def _convert(self) -> None:
-        """Write ``sees`` as a tuple, before it is checked."""
-        sees: Any = self.sees
-        if isinstance(sees, slice):
-            bounds = (sees.start or 0, sees.stop, sees.step or 1)
-            sees = range(*bounds) if all(isinstance(x, int) for x in bounds) else sees
-        if isinstance(sees, range | np.ndarray):
-            sees = tuple(np.ravel(sees))
-        elif isinstance(sees, str | int | np.integer) and not isinstance(sees, bool):
-            sees = (sees,)
-        object.__setattr__(self, "sees", sees)
 
 
 def check_critic(config: Any) -> None:

@@ -1,17 +1,15 @@
 """Know and plan: tasks without training, logs of calls, and planning on them."""
 
-from skillweave.planning.blame import Blame
 from skillweave.planning.calls import CallLog, join
 from skillweave.planning.explorer import Explorer
 from skillweave.planning.forecast import Forecast
 from skillweave.planning.goal import GoalTask, reached
-from skillweave.planning.handover import CallEnds, Chain, Handover
+from skillweave.planning.handover import Blame, CallEnds, Chain, Handover
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.mission import Mission, either, in_any_order
+from skillweave.planning.mission import Mission, as_task, either, in_any_order
 from skillweave.planning.planner import Planner
 from skillweave.planning.predicates import Predicate, held, successes
 from skillweave.planning.record import record_calls
-from skillweave.planning.task import as_task
 
 __all__ = [
     "Blame",

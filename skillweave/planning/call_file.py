@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -23,8 +24,8 @@ from skillweave.planning.columns import (
     columns_of,
 )
 from skillweave.policies.core import CallEnd
-from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.schema import AtLeastOne, Count, fit
+from skillweave.runs.files import read_tensors, record_in, write_tensors
+from skillweave.schema import AtLeastOne, Count
 from skillweave.skills.base import NAME
 from skillweave.spaces import (
     obs_codec,
@@ -36,10 +37,10 @@ from skillweave.spaces import (
 )
 from skillweave.types import LARGEST_REWARD, Array
 
-KIND = "calls"
-PLAIN = ("checksums", "recurrent", "own_success")
-"""Entries of the header with a value for each skill."""
-SPACES = ("observation", "action")
+PER_SKILL = ("checksums", "sees", "recurrent", "own_success")
+"""Fields with a value for each skill."""
+PLAIN = ("skills", "lengths", *PER_SKILL)
+"""Fields that the header has as they are."""
 RANGES: dict[str, tuple[float, float]] = {
     "end_reason": (1, max(CallEnd)),
     "episode": (0, 2**62 - 1),
@@ -51,7 +52,8 @@ RANGES: dict[str, tuple[float, float]] = {
 """The least and the largest number in a column."""
 
 
-class LoggedRun(TypedDict):
+@dataclass(frozen=True)
+class LoggedRun:
     """The run whose calls a log in its directory holds."""
 
     id: str | None
@@ -59,23 +61,24 @@ class LoggedRun(TypedDict):
     """Checksum of the weights of all its skills."""
 
 
-class CallsHeader(TypedDict):
-    """The JSON header of a log's file."""
+@dataclass(frozen=True, kw_only=True)
+class CallsHeader:
+    """The header of a log's file."""
 
-    kind: str
-    skills: list[str]
-    lengths: list[AtLeastOne]
-    checksums: list[str]
-    sees: list[list[Count] | None]
-    recurrent: list[bool]
-    own_success: list[bool]
+    kind: Literal["calls"] = "calls"
+    skills: tuple[str, ...]
+    lengths: tuple[AtLeastOne, ...]
+    checksums: tuple[str, ...]
+    sees: tuple[tuple[Count, ...] | None, ...]
+    recurrent: tuple[bool, ...]
+    own_success: tuple[bool, ...]
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
-    info: list[str]
-    goals: NotRequired[list[str]]
+    info: tuple[str, ...]
+    goals: tuple[str, ...]
     """The skills that have goals."""
-    code: NotRequired[Texts]
-    run: NotRequired[LoggedRun]
+    code: Texts
+    run: LoggedRun | None = None
 
 
 def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None) -> None:
@@ -87,16 +90,15 @@ def write_calls(path: str | Path, log: CallColumns, run: LoggedRun | None = None
     Raises:
         RunError: the file cannot be written.
     """
-    header = {
-        "kind": KIND,
-        **{name: list(getattr(log, name)) for name in ("skills", "lengths", *PLAIN)},
-        "code": log.code,
-        "sees": [None if places is None else list(places) for places in log.sees],
-        **{f"{what}_space": space_to_json(getattr(log, f"{what}_space")) for what in SPACES},
-        "info": list(log.info),
-        "goals": list(log.goals),
-    }
-    header |= {} if run is None else {"run": run}
+    header = CallsHeader(
+        **{name: getattr(log, name) for name in PLAIN},
+        observation_space=space_to_json(log.observation_space),
+        action_space=space_to_json(log.action_space),
+        info=tuple(log.info),
+        goals=tuple(log.goals),
+        code=log.code,
+        run=run,
+    )
     tensors = {name: to_tensor(value) for name, value in columns_of(log).items()}
     write_tensors(as_path(path, "save(): path"), tensors, header)
 
@@ -109,68 +111,74 @@ def read_calls(path: str | Path) -> dict[str, Any]:
     """
     path = as_path(path, "load(): path")
     tensors, header = read_tensors(path)
-    if header.get("kind") != KIND:
+    if header.get("kind") != CallsHeader.kind:
         raise RunError(f"{path} holds no log of calls; give a file that CallLog.save() wrote")
-    fit(CallsHeader, header, str(path))
+    of: CallsHeader = record_in(CallsHeader, header, path)
     try:
-        spaces = {f"{what}_space": space_from_json(header[f"{what}_space"]) for what in SPACES}
-        return _fields(tensors, header, spaces)
+        spaces = map(space_from_json, (of.observation_space, of.action_space))
+        return _fields(tensors, of, *spaces)
     except (ValueError, SkillweaveError) as error:
         raise RunError(f"{path} is damaged: {error}") from error
 
 
 def _fields(
-    tensors: dict[str, Tensor], header: dict[str, Any], spaces: dict[str, gym.Space[Any]]
+    tensors: dict[str, Tensor],
+    header: CallsHeader,
+    observation: gym.Space[Any],
+    action: gym.Space[Any],
 ) -> dict[str, Any]:
     """Return the checked fields; a ValueError says what is wrong."""
-    skills, lengths = header["skills"], header["lengths"]
+    skills, lengths = header.skills, header.lengths
     if not skills or len(set(skills)) != len(skills) or not all(map(NAME.fullmatch, skills)):
         raise ValueError("its skills have no names, or two the same")
-    if lengths != sorted(set(lengths)):
+    if list(lengths) != sorted(set(lengths)):
         raise ValueError("its lengths do not rise")
-    if any(len(header[k]) != len(skills) for k in (*PLAIN, "sees")):
+    plain = {name: getattr(header, name) for name in PLAIN}
+    if any(len(plain[name]) != len(skills) for name in PER_SKILL):
         raise ValueError("its header does not have an entry for each skill")
-    places = obs_codec(spaces["observation_space"]).size
-    if any(place >= places for seen in header["sees"] for place in seen or ()):
+    places = obs_codec(observation).size
+    if any(place >= places for seen in header.sees for place in seen or ()):
         raise ValueError(f"'sees' has places beyond the {places} of an observation")
-    goals = tuple(header.get("goals", ()))
-    if not set(goals) <= set(skills):
+    if not set(header.goals) <= set(skills):
         raise ValueError("it has goals of other skills")
-    columns = _columns(tensors, header | {"goals": goals}, spaces)
+    columns = _columns(tensors, header, observation, action)
     offset = columns["offset"]
     if offset[0] != 0 or offset[-1] != len(columns["reward"]) or (offset[1:] <= offset[:-1]).any():
         raise ValueError("'offset' is out of range")
     return {
         **{name: columns[name] for name in (*PER_CALL, *PER_STEP, "offset")},
-        **spaces,
-        **{name: tuple(header[name]) for name in ("skills", "lengths", *PLAIN)},
-        "sees": tuple(None if p is None else tuple(p) for p in header["sees"]),
-        "info": {key: columns[INFO + key] for key in header["info"]},
-        "goals": {name: columns[GOAL + name] for name in goals},
-        "code": header.get("code", {}),
+        **plain,
+        "observation_space": observation,
+        "action_space": action,
+        "info": {key: columns[INFO + key] for key in header.info},
+        "goals": {name: columns[GOAL + name] for name in header.goals},
+        "code": header.code,
     }
 
 
 def _columns(
-    tensors: dict[str, Tensor], header: dict[str, Any], spaces: dict[str, gym.Space[Any]]
+    tensors: dict[str, Tensor],
+    header: CallsHeader,
+    observation: gym.Space[Any],
+    action: gym.Space[Any],
 ) -> dict[str, Array]:
     """Return the columns, each of the type, shape and range that it must have."""
     of = {name: tuple(x.shape) for name, x in tensors.items()}
     calls, steps = (math.prod(of.get(name, ())) for name in ("choice", "reward"))
-    choices = len(header["skills"]) * max(1, len(header["lengths"]))
-    observation, acts = spaces["observation_space"], obs_dtype(spaces["action_space"])
+    choices = len(header.skills) * max(1, len(header.lengths))
+    acts = obs_dtype(action)
     next_obs = obs_dtype(observation), (steps, *obs_shape(observation))
     # Of a goal and a value of `info` the size is free, and the type of numbers that `info` holds.
-    sizes = {name: math.prod(of.get(GOAL + name, ())[-1:]) for name in header["goals"]}
+    sizes = {name: math.prod(of.get(GOAL + name, ())[-1:]) for name in header.goals}
     row = np.dtype(call_fields(observation, choices, sizes))
-    fields = ((name, row[name]) for name in row.names or ())
+    columns = ((name, row[name]) for name in row.names or ())
     table: dict[str, tuple[Any, tuple[int, ...]]] = {
-        **{name: (field.base, (calls, *field.shape)) for name, field in fields},
+        **{name: (of_row.base, (calls, *of_row.shape)) for name, of_row in columns},
         "offset": (np.int64, (calls + 1,)),
         "reward": (np.float32, (steps,)),
         "next_obs": next_obs,
-        "action": (acts if acts.fields else None, (steps, *obs_shape(spaces["action_space"]))),
-        **{INFO + key: (None, (steps, *of.get(INFO + key, ())[1:])) for key in header["info"]},
+        "action": (acts if acts.fields else None, (steps, *obs_shape(action))),
+        **{INFO + key: (None, (steps, *of.get(INFO + key, ())[1:])) for key in header.info},
     }
     limits = RANGES | {"choice": (0, choices - 1), "offset": (0, steps)}
     if tensors.keys() != table.keys():
@@ -200,7 +208,7 @@ def _column(
         raise ValueError(f"{name!r} is {x.dtype} {x.shape}")
     if fields:
         x = x.view(dtype).reshape(shape[0])
-    for numbers in [x[field] for field in fields] if fields else [x]:
+    for numbers in [x[part] for part in fields] if fields else [x]:
         if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
             raise ValueError(f"{name!r} is not finite")
         if numbers.size and not (low <= numbers.min() and numbers.max() <= high):

@@ -20,9 +20,9 @@ from skillweave.collecting.user_code import (
 )
 from skillweave.envs.make import EnvSpec
 from skillweave.errors import DeclarationError, RunError
-from skillweave.planning.blame import BlamedCalls
 from skillweave.planning.call_file import read_calls, write_calls
 from skillweave.planning.columns import PER_CALL, PER_STEP
+from skillweave.planning.handover import LinkedCalls
 from skillweave.policies.files import checksum
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import without_goal
@@ -32,7 +32,7 @@ LEARNING = "learning"
 """In place of a checksum: the skill learnt while its calls were recorded."""
 
 
-class CallLog(BlamedCalls):
+class CallLog(LinkedCalls):
     """C calls of skills, in the order of their starts, and the T steps inside them.
 
     Attributes:
@@ -218,7 +218,7 @@ def skill_checksums(skills: SkillSet, learning: Collection[str] = ()) -> tuple[s
             continue
         source = source_of(policy)
         # A script is "__main__" while it runs, and has its own name where it is read as a recipe.
-        acts = source.get("sha256") or str(source.get("name")).partition(".")[2]
+        acts = source.sha256 or str(source.name).partition(".")[2]
         reflexes = [reflex.name for reflex in skills.reflexes]
         goals = skills.skills[i].goal_space
         own = [] if goals is None else [str(goals)]

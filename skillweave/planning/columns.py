@@ -17,7 +17,7 @@ from skillweave.collecting.user_code import Texts
 from skillweave.errors import DeclarationError
 from skillweave.experience import INFO
 from skillweave.messages import shortened, suggest
-from skillweave.policies.core import CallEnd
+from skillweave.policies.core import CallEnd, Choices
 from skillweave.spaces import obs_codec, obs_dtype, obs_shape, to_tensor
 from skillweave.types import Array, Step
 
@@ -60,7 +60,7 @@ def call_fields(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CallColumns:
+class CallColumns(Choices):
     """C calls and the T steps inside them; ``CallLog`` describes the columns."""
 
     skills: tuple[str, ...]
@@ -104,14 +104,9 @@ class CallColumns:
         return len(self.reward)
 
     @property
-    def choices(self) -> int:
-        """The number of choices: each skill with each length."""
-        return len(self.skills) * max(1, len(self.lengths))
-
-    @property
     def skill(self) -> Array:
         """The skill of each call, (C,) int64."""
-        skill: Array = self.choice // max(1, len(self.lengths))
+        skill: Array = self.skill_of(self.choice)
         return skill
 
     @property

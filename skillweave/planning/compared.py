@@ -13,7 +13,7 @@ from skillweave.messages import short, suggest
 from skillweave.planning.columns import CallColumns
 from skillweave.planning.lacking import read_log
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import FeatureMap, Standard, nearest
+from skillweave.planning.neighbors import FeatureMap, Standard, evenly, nearest
 from skillweave.spaces import obs_codec
 from skillweave.types import Array
 
@@ -110,7 +110,7 @@ def _help(
     rows = np.flatnonzero((log.skill == skill) & ~log.was_cut)  # a time limit cuts anywhere
     if len(rows) < FEWEST:
         return True
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST)).astype(np.int64)]
+    rows = evenly(rows, MOST)
     moved = end[rows][:, rest].astype(np.float64) - start[rows][:, rest]
     goal = log.goals.get(log.skills[skill])
     own = np.zeros((len(rows), 0)) if goal is None else goal[rows]
@@ -136,10 +136,7 @@ def _pays_by(
     known = read_log(task, log)
     read = np.concatenate([known.events, known.values], 1)
     odd = (read != np.median(read, 0)).any(1)  # seldom steps, as those that pay, count as much
-    rows = np.concatenate([
-        some[np.linspace(0, len(some) - 1, min(len(some), MOST // 2)).astype(np.int64)]
-        for some in map(np.flatnonzero, (odd, ~odd))
-    ])  # fmt: skip
+    rows = np.concatenate([evenly(np.flatnonzero(some), MOST // 2) for some in (odd, ~odd)])
     at = after[rows]
     return len(rows) > FEWEST and _predict(at[:, rest], at[:, [*rest, *more]], read[rows])
 

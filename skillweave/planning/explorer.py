@@ -8,10 +8,9 @@ import numpy as np
 
 from skillweave.arguments import checked_names
 from skillweave.planning.calls import CallLog
-from skillweave.planning.graph import CallGraph
+from skillweave.planning.graph import CallGraph, planning_states
 from skillweave.planning.machine import RewardMachine
 from skillweave.planning.neighbors import check_features
-from skillweave.planning.states import planning_states
 from skillweave.policies.core import Memory, Policy, Turn
 from skillweave.schema import AtLeastOne, Check, Fraction, Positive, fitted
 from skillweave.types import Array

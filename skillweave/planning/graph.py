@@ -18,18 +18,30 @@ from typing import Any
 import numpy as np
 
 from skillweave.collecting.skill_set import SkillSet
-from skillweave.errors import RunError
+from skillweave.errors import DeclarationError, RunError
 from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.compared import feature_maps
 from skillweave.planning.goal import GoalTask
 from skillweave.planning.machine import RewardMachine
-from skillweave.planning.neighbors import Standard, tie_order
-from skillweave.planning.states import exact_states
+from skillweave.planning.neighbors import Standard, evenly, tie_order
 from skillweave.policies.core import CallEnd
-from skillweave.policies.plan import Levels, Near, OptionGroup, Options, Readings
+from skillweave.policies.plan import (
+    MOST_COUNTERS,
+    Levels,
+    Near,
+    OptionGroup,
+    Options,
+    Readings,
+)
 from skillweave.types import Array
 
+LEVELS = 128
+"""The most levels of a counter."""
+FEWEST_LEVELS = 8
+ENOUGH_STATES = 256
+"""Counters have fewer levels where there would be more states."""
+MOST_STATES = 3_000
 PIECE = 5
 """Steps of a piece, where that does not give too many."""
 MOST_PIECES = 10_000
@@ -119,7 +131,7 @@ class CallGraph:
                 f"the log has {len(log):,} calls; the plan uses {MOST_CALLS:,} of them, at equal "
                 "distances"
             )
-            log = log.take(np.linspace(0, len(log) - 1, MOST_CALLS).astype(np.int64))
+            log = log.take(evenly(np.arange(len(log)), MOST_CALLS))
         self.log, self.neighbors, self.skills = log, neighbors, skills
         self.pieces = pieces = _pieces(log, skills)
         self.maps = feature_maps(log, features, np.concatenate([log.start, log.end]), task)
@@ -177,7 +189,7 @@ class CallGraph:
             aims: of each skill, the standardised goals of all calls; None: it has none.
         """
         for choice in range(self.log.choices):
-            skill = choice // max(1, len(self.log.lengths))
+            skill = self.log.skill_of(choice)
             own, rows = aims[skill], np.flatnonzero(self.pieces.choice == choice)
             call = self.pieces.call[rows]
             features = self.maps[skill](starts[rows]) if len(rows) else np.zeros((0, 1), np.float32)
@@ -194,8 +206,8 @@ class CallGraph:
                 group = OptionGroup(
                     choice, count, rows[mine], features[mine], call[mine], goals, float("inf")
                 )
-                if n := len(alike):
-                    some = alike[np.linspace(0, n - 1, min(n, SAMPLED)).astype(np.int64)]
+                if len(alike):
+                    some = evenly(alike, SAMPLED)
                     far = group.near(features[some], self.neighbors, own, call[some])[1]
                     group.usual = float(np.median(far[:, :, -1]))
                 yield group
@@ -394,3 +406,52 @@ def _by_depth(then: Array) -> list[Array]:
     order = rows[np.argsort(depth[rows], kind="stable")]
     bounds = np.flatnonzero(np.diff(depth[order])) + 1
     return [part for part in np.split(order, bounds) if len(part)]
+
+
+# The finite states that a task is planned in
+
+
+def planning_states(task: RewardMachine) -> Levels:
+    """Return M states for planning: those of a machine, each with all levels of its counters.
+
+    Raises:
+        DeclarationError: there would be more than 3,000, or a state has more than four counters.
+    """
+    if task.slots > MOST_COUNTERS:
+        raise DeclarationError(
+            f"the task waits for {task.slots} events that must hold for several steps at once; "
+            f"at most {MOST_COUNTERS} can be planned"
+        )
+    used = task.counter_steps < np.iinfo(np.int64).max
+    most = LEVELS
+    while most > FEWEST_LEVELS and _levels(task, most).prod(1).sum() > ENOUGH_STATES:
+        most //= 2
+    levels, steps = _levels(task, most), np.where(used, task.counter_steps, 1)
+    spacing = np.where(used, (steps - 1) / np.maximum(levels - 1, 1), 1.0)
+    sizes = levels.prod(1)
+    states = Levels(levels, spacing, np.cumsum(sizes) - sizes)
+    if states.count > MOST_STATES:
+        raise DeclarationError(
+            f"the task has {states.count:,} states with the levels of its counters; at most "
+            f"{MOST_STATES:,} can be planned: repeat it less often"
+        )
+    return states
+
+
+def exact_states(states: Levels) -> Array:
+    """Return the task's state that each planning state is, (M, 1 + H)."""
+    q = np.repeat(np.arange(len(states.first)), states.levels.prod(1))
+    place = np.arange(states.count) - states.first[q]
+    exact = np.zeros((states.count, 1 + states.levels.shape[1]), np.int64)
+    exact[:, 0] = q
+    for slot in reversed(range(states.levels.shape[1])):
+        count = states.levels[q, slot]
+        exact[:, 1 + slot] = np.round(place % count * states.spacing[q, slot])
+        place //= count
+    return exact
+
+
+def _levels(task: RewardMachine, most: int) -> Array:
+    """Return the number of levels of each counter, (Q, H); 1 where it is not used."""
+    used = task.counter_steps < np.iinfo(np.int64).max
+    return np.where(used, np.minimum(task.counter_steps, most), 1)

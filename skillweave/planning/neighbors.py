@@ -195,6 +195,12 @@ def tie_order(count: int) -> Array:
     return np.random.default_rng(0).permutation(count).argsort()
 
 
+def evenly(rows: Array, most: int) -> Array:
+    """Return at most ``most`` of the rows (n, …), at equal distances."""
+    found: Array = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+    return found
+
+
 def nearest(points: Array, to: Array, count: int, group: Array) -> tuple[Array, Array]:
     """Return the ``count`` nearest points to each row of ``to``, each of another group.
 

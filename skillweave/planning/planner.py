@@ -19,12 +19,11 @@ from skillweave.notices import notice
 from skillweave.planning.calls import CallLog
 from skillweave.planning.columns import columns_of
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.graph import CallGraph
+from skillweave.planning.graph import CallGraph, planning_states
 from skillweave.planning.lacking import check_possible, obstacle, read_log
 from skillweave.planning.machine import RewardMachine
+from skillweave.planning.mission import Task, as_task
 from skillweave.planning.neighbors import check_features
-from skillweave.planning.states import planning_states
-from skillweave.planning.task import Task, as_task
 from skillweave.policies.files import checksum
 from skillweave.policies.plan import Near
 from skillweave.policies.planned import Planned

@@ -199,7 +199,7 @@ class WithDrawnGoals(Around):
             number, again = self._selector.decide(obs, turn.mask, rng)
         else:
             number = super().act(memory, rows, obs, turn)
-        choice, skill = blank_choices(self._space, number), self._skills.hierarchy.skill_of(number)
+        choice, skill = blank_choices(self._space, number), self._skills.skill_of(number)
         for i, (name, goals) in self._goals.items():
             mine = np.flatnonzero(skill == i)
             if len(mine):

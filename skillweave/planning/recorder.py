@@ -33,14 +33,15 @@ from skillweave.types import Array, Memory, Step
 SUMS = (
     ("number", np.int64),
     ("steps", np.int64),
+    ("task_return", np.float64),
     ("own_return", np.float64),
     ("last_reward", np.float64),
     ("late", np.bool_),
 )
-"""Fields of a call that no log has: its number; its steps; with ``own_rewards`` the sum of its
-skill's own reward, not discounted (the environment's where it has none; NaN where its code is not
-known), and that of its last step; and whether it went on to its limit after it had succeeded, of
-skills with neither an end nor a length of their own."""
+"""Fields of a call that no log has: its number; its steps; with ``own_rewards`` the sum of the
+environment's reward, not discounted, that of its skill's own reward (the environment's where it has
+none; NaN where its code is not known), and this reward of its last step; and whether it went on to
+its limit after it had succeeded, of skills with neither an end nor a length of their own."""
 STEPS = {"next_obs": "next_obs", "action": "env_action", "reward": "env_reward"}
 """By a column of a log's steps, the column of a trace."""
 MOST_BYTES = 4 * 2**30
@@ -315,6 +316,7 @@ class Recorder:
         skills, running = self.skills.skills, trace[self._columns + "skill"]
         elapsed, end = (trace[f"{self._columns}call_{name}"] for name in ("elapsed", "end"))
         own = trace["env_reward"].astype(np.float64)
+        np.add.at(calls["task_return"], at[mine], own[mine])
         for i, skill in enumerate(skills):
             acts = mine & (running == i)
             if isinstance(skill, RecordedSkill):

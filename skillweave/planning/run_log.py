@@ -110,7 +110,7 @@ def save_calls(run: RunDirectory, log: CallLog) -> None:
         elif path.exists():
             log = _joined_or_aside(path, log)
         log = _bounded(log)
-        header = LoggedRun(id=run.manifest.get("id"), skills=_weights(run))
+        header = LoggedRun(id=run.manifest.id, skills=_weights(run))
         write_calls(path, log, header)
     finally:
         lock.release()
@@ -190,9 +190,9 @@ def _misfit(run: RunDirectory) -> str | None:
     if "run" not in header:
         return "was not written by this run"
     of: LoggedRun = fit(LoggedRun, header["run"], str(path), "run")
-    if of["id"] != run.manifest.get("id"):
+    if of.id != run.manifest.id:
         return "belongs to another run"
-    if of["skills"] != _weights(run):
+    if of.skills != _weights(run):
         return "is of the skills before they learnt on"
     return None
 
@@ -200,7 +200,7 @@ def _misfit(run: RunDirectory) -> str | None:
 def _weights(run: RunDirectory) -> str:
     """Return a checksum of the weights of all skills of a run."""
     latest: dict[str, str] = {}
-    for stage in run.manifest["stages"]:
+    for stage in run.manifest.stages:
         one = dict.fromkeys(stage.learns, stage.sha256 or "")
         latest |= stage.policies or one
     skills = sorted((name, sha) for name, sha in latest.items() if name not in (SELECTOR, CRITIC))

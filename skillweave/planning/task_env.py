@@ -11,7 +11,7 @@ import numpy as np
 from skillweave.envs.checks import last_observation
 from skillweave.errors import EnvError
 from skillweave.planning.goal import GoalTask
-from skillweave.planning.task import Task
+from skillweave.planning.mission import Task
 from skillweave.policies.core import OWN_REWARD, OWN_SUCCESS, SUCCESS
 from skillweave.policies.infos import batched_infos
 from skillweave.spaces import obs_dtype, obs_shape

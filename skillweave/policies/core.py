@@ -212,6 +212,30 @@ class Turn:
         )
 
 
+class Choices:
+    """The numbers that a selector chooses: the first skill with each length, then the next skill.
+
+    Without lengths, a number is the place of a skill.
+    """
+
+    skills: Any
+    lengths: Any
+
+    @property
+    def each(self) -> int:
+        """The number of choices of each skill."""
+        return max(1, len(self.lengths))
+
+    @property
+    def choices(self) -> int:
+        """The number of choices."""
+        return len(self.skills) * self.each
+
+    def skill_of(self, choice: Any) -> Any:
+        """Return the places of the skills that choices are of."""
+        return choice // self.each
+
+
 class Policy:
     """Acts in some of N environments; the base of all that do, for those that remember nothing."""
 

@@ -29,6 +29,7 @@ from .core import (
     Array,
     Asks,
     CallEnd,
+    Choices,
     LastCall,
     Memory,
     Policy,
@@ -192,7 +193,7 @@ NEVER = np.iinfo(np.int64).max
 
 
 @dataclass(eq=False)
-class Hierarchy(Policy):
+class Hierarchy(Choices, Policy):
     """Skills in calls, and the selector that starts them where a call has ended.
 
     A choice is a number: of a skill, or of a skill and one of the ``lengths``; where skills have
@@ -229,9 +230,6 @@ class Hierarchy(Policy):
     def __post_init__(self) -> None:
         if any(a >= b for a, b in pairwise((0, *self.lengths))):
             raise PolicyError(f"a hierarchy has the lengths {self.lengths[:5]}, which must rise")
-        self._each = max(1, len(self.lengths))
-        self.choices = len(self.skills) * self._each
-        """The number of choices: the first skill with each length, then the next skill."""
         self.restricts = any(s.initiation or s.policy.restricts for s in self.skills)
         self.holds = any(skill.policy.holds for skill in self.skills)
         self._limits = np.array([NEVER if s.limit is None else s.limit for s in self.skills])
@@ -375,7 +373,7 @@ class Hierarchy(Policy):
                 )
             memory["goal"][str(i)][rows[mine]] = goals[i][mine]
         if self.lengths:
-            memory["length"][rows] = np.array(self.lengths)[choice % self._each]
+            memory["length"][rows] = np.array(self.lengths)[choice % self.each]
         fresh = (memory["skill"][rows] != skill) | self._fresh[skill]
         memory["skill"][rows], memory["elapsed"][rows], memory["end"][rows] = skill, 0, RUNNING
         for i, own in enumerate(self.skills):
@@ -412,10 +410,6 @@ class Hierarchy(Policy):
         for i in self.goals:
             if len(mine := np.flatnonzero(skill == i)):
                 yield i, mine
-
-    def skill_of(self, choice: Array) -> Array:
-        """Return the skills that choices (k,) are of."""
-        return choice // self._each
 
     def goal_of(self, memory: Memory, i: int, rows: Array) -> Array | None:
         """Return the goals of skill ``i`` in ``rows`` (k,); None: it has none."""
@@ -479,7 +473,7 @@ class Hierarchy(Policy):
             may[:, i] = skill.policy.startable(obs) if skill.policy.restricts else True
             if skill.initiation is not None:
                 may[:, i] &= self.ask(skill.initiation, obs, rows, skill.path, "initiation")
-        return may.repeat(self._each, axis=1)
+        return may.repeat(self.each, axis=1)
 
     def startable(self, obs: Array) -> Array:
         """Return where some skill may start, (k,) bool."""

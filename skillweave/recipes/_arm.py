@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave import EnvSpec
-from skillweave.errors import MissingExtra
+from skillweave.errors import needs_extra
 from skillweave.types import Array
 
 NEAR = 0.05
@@ -145,11 +145,9 @@ def make(disturbances: Disturbances = CALM, render_mode: str | None = None) -> g
     Raises:
         MissingExtra: gymnasium-robotics is missing.
     """
-    try:
+    with needs_extra("the robot's arm", "robotics"):
         import gymnasium_robotics
         import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("the robot's arm", "robotics") from error
     gym.register_envs(gymnasium_robotics)
     arm = gym.make(
         "FetchPickAndPlace-v4",

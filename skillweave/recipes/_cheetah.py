@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.errors import DeclarationError, needs_extra
 from skillweave.types import Array
 
 ROUND = 1000.0
@@ -155,10 +155,8 @@ def make(
     Raises:
         MissingExtra: mujoco is missing.
     """
-    try:
+    with needs_extra("the half-cheetah", "mujoco"):
         import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("the half-cheetah", "mujoco") from error
     cheetah = gym.make(
         "HalfCheetah-v5",
         **WITH_X,

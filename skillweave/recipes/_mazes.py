@@ -11,7 +11,7 @@ import numpy as np
 
 from skillweave import EnvSpec, envpool
 from skillweave.envs import PoolWrapper
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.errors import DeclarationError, needs_extra
 from skillweave.types import Array
 
 MAZES = {
@@ -110,11 +110,9 @@ def make(maze: str = "large", render_mode: str | None = None) -> gym.Env[Any, An
     Raises:
         MissingExtra: gymnasium-robotics is missing.
     """
-    try:
+    with needs_extra("PointMaze", "robotics"):
         import gymnasium_robotics
         import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("PointMaze", "robotics") from error
     gym.register_envs(gymnasium_robotics)
     return Maze(gym.make(MAZES[maze], disable_env_checker=True, **ENDS), render_mode)
 

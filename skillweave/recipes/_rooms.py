@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave import EnvSpec, envpool
-from skillweave.errors import DeclarationError, MissingExtra
+from skillweave.errors import DeclarationError, needs_extra
 from skillweave.types import Array
 
 SMALL = (
@@ -139,10 +139,8 @@ class Rooms(gym.Env[Any, Any]):
     """
 
     def __init__(self, rooms: Sequence[str], render_mode: str | None = None) -> None:
-        try:
+        with needs_extra("keys-and-doors", "minigrid"):
             import minigrid  # noqa: F401, it registers the environments
-        except ImportError as error:
-            raise MissingExtra("keys-and-doors", "minigrid") from error
         with warnings.catch_warnings():
             # Of some rooms there is a later version, but not in EnvPool.
             warnings.filterwarnings("ignore", message=".*is out of date.*")

@@ -12,10 +12,11 @@ from urllib.parse import quote
 
 from skillweave.planning.run_log import handover_of
 from skillweave.reporting.report.curves import reached_steps, read_curves
-from skillweave.reporting.report.facts import WHY, facts, plain, settings, skill_rows, stage_rows
+from skillweave.reporting.report.facts import WHY, WORDS, facts, plain, settings, stage_rows
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.hub import public
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
+from skillweave.training.skill_report import cells_of, skill_rows
 
 
 def write_card(
@@ -42,23 +43,23 @@ def write_card(
         _training(run),
         *(_shown(path) for path in figures),
         _folded("All settings", ("setting", "value"), settings(run.manifest)),
-        _folded("Versions", ("of", "version"), run.manifest["versions"]),
+        _folded("Versions", ("of", "version"), run.manifest.versions),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
     """Return the YAML that the hub reads; every value is written as JSON, which is YAML too."""
-    env = run.manifest["env"]
-    kind = "hierarchical-" if run.manifest["kind"] == "hierarchy" else ""
+    env = run.manifest.env
+    kind = "hierarchical-" if run.manifest.hierarchy else ""
     header: dict[str, Any] = {
         "library_name": "skillweave",
         "pipeline_tag": "reinforcement-learning",
         "tags": [f"{kind}reinforcement-learning", "skillweave", env],
     }
     if saved is not None:
-        score = saved.evaluation.to_json()
-        value = f"{score['mean']:.2f} +/- {score['std']:.2f}"
+        score = saved.evaluation
+        value = f"{score.mean:.2f} +/- {score.to_json()['std']:.2f}"
         task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
         metric = {"type": "mean_reward", "name": "mean_reward", "value": value, "verified": False}
         result = {"task": task, "dataset": {"name": env, "type": env}, "metrics": [metric]}
@@ -68,7 +69,7 @@ def _header(run: RunDirectory, name: str, saved: SavedEvaluation | None) -> str:
 
 
 def _about(run: RunDirectory) -> str:
-    what = "hierarchy of skills" if run.manifest["kind"] == "hierarchy" else "plain agent"
+    what = "hierarchy of skills" if run.manifest.hierarchy else "plain agent"
     _, _, *rows = _table(("", ""), facts(run))
     return "\n".join([f"A {what}, trained with Skillweave.", "", "| | |", "|---|---|", *rows])
 
@@ -80,7 +81,7 @@ def _shown(path: str) -> str:
 
 
 def _use(run: RunDirectory, name: str) -> str:
-    code = run.manifest.get("needs_recipe", True)
+    code = run.manifest.needs_recipe
     given = ", hierarchy" if code else ""
     lines = ["## Use", ""]
     if code:
@@ -100,8 +101,8 @@ def _use(run: RunDirectory, name: str) -> str:
         "It needs Skillweave with its extra `hub`. The files are safetensors and JSON: no code "
         "comes with them.",
     ]
-    skills = run.manifest.get("skills", ())
-    if stays := [s for s in skills if s.policy and s.policy["kind"] == "onnx"]:
+    skills = run.manifest.skills
+    if stays := [s for s in skills if s.policy is not None and s.policy.kind == "onnx"]:
         names = ", ".join(text(s.name) for s in stays)
         lines += ["", f"Not here: the ONNX files of {names}, which the hierarchy must bring."]
     return "\n".join(lines)
@@ -118,14 +119,9 @@ def _measured(saved: SavedEvaluation | None) -> str:
     if score.skills:
         ends = (f"ends {w}" for w in WHY.values())
         head = ("skill", "of all steps", "calls", "steps of a call", *ends, "success")
-        rows = [
-            [
-                *(row["name"], row["percent"], row["calls"], row["length"], *row["ends"]),
-                *(row["success"], row["return"]),
-            ]
-            for row in skill_rows(score.skills)
-        ]
-        lines += ["", "What each skill did:", "", *_table((*head, "own return of a call"), rows)]
+        head = (*head, "own return of a call")
+        rows = map(cells_of, skill_rows(score.skills, WORDS))
+        lines += ["", "What each skill did:", "", *_table(head, rows)]
     return "\n".join(lines)
 
 

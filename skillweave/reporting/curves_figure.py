@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError, MissingExtra, RunError
+from skillweave.errors import DeclarationError, RunError, needs_extra
 from skillweave.messages import as_path, short, suggest
 from skillweave.reporting.report.curves import read_curves
 from skillweave.reporting.report.groups import grouped, on_one_grid
@@ -179,13 +179,13 @@ def _curves_of(run: RunDirectory, agent: str | None) -> dict[str, Curve]:
     if agent is not None:
         points_of_stage = {c.stage: c.points for c in all_curves if c.agent == agent}
     else:
-        whole = {e.name for e in run.manifest["stages"] if e.kind in WHOLE}
+        whole = {e.name for e in run.manifest.stages if e.kind in WHOLE}
         points_of_stage = {
             c.stage: c.points for c in all_curves if c.agent == c.stage and c.stage in whole
         }
     before = 0
     parts = list[tuple[int, dict[str, Curve]]]()
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         if entry.name in points_of_stage:
             parts.append((before, points_of_stage[entry.name]))
         # An agent's steps are the steps of the stages in which it learns.
@@ -232,12 +232,10 @@ def _draw(
     width: float,
     height: float | None,
 ) -> tuple[Path, ...]:
-    try:
+    with needs_extra("plotting", "plot"):
         import matplotlib
         from matplotlib.figure import Figure
         from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
-    except ImportError as error:
-        raise MissingExtra("plotting", "plot") from error
     named = len(lines) > 1
     most = math.floor(width * 14)  # letters of a name that fits
     if height is None:

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from skillweave.errors import RunError
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import LineageLine
 
 COMPLEMENT = ("gamma", "gae_lambda")
 """Settings that are drawn as their difference from one."""
 
 
 @dataclass(frozen=True)
-class Born:
-    """A member in a generation."""
-
-    generation: int
-    member: int
-    parent: int | None
-    """Its number in the generation before; its own where it continued."""
-    mutation: str
-    changes: dict[str, Any]
-    fitness: float | None
-    best: bool
-    """It was the best so far."""
-    settings: dict[str, Any]
-
-    def number(self, setting: str) -> float:
-        """Return the value of a setting as it is drawn; of several widths their sum."""
-        value = self.settings[setting]
-        number = sum(value) if isinstance(value, list) else value
-        return 1.0 - number if setting in COMPLEMENT else number
-
-
-@dataclass(frozen=True)
 class Lineage:
     """One stage's population over the generations."""
 
-    born: dict[tuple[int, int], Born]
+    born: dict[tuple[int, int], LineageLine]
     """By generation and number."""
 
     @property
-    def winner(self) -> Born:
+    def winner(self) -> LineageLine:
         """Return the best member of all generations so far."""
         return max((b for b in self.born.values() if b.best), key=lambda b: b.generation)
 
@@ -52,16 +31,16 @@ class Lineage:
         members = self.born.values()
         return [k for k in self.winner.settings if len({str(b.settings[k]) for b in members}) > 1]
 
-    def parent(self, born: Born) -> Born | None:
+    def parent(self, born: LineageLine) -> LineageLine | None:
         """Return a member's parent; None in the first generation."""
         if born.parent is None or born.generation == 0:
             return None
         return self.born.get((born.generation - 1, born.parent))
 
-    def path(self, born: Born) -> list[Born]:
+    def path(self, born: LineageLine) -> list[LineageLine]:
         """Return the line from the first generation to a member."""
-        line: list[Born] = []
-        at: Born | None = born
+        line: list[LineageLine] = []
+        at: LineageLine | None = born
         while at is not None:
             line.append(at)
             at = self.parent(at)
@@ -74,12 +53,10 @@ def read_lineage(run: RunDirectory, stage: str) -> Lineage | None:
     Raises:
         RunError: the file is damaged.
     """
-    names = [f.name for f in fields(Born)]
-    born = {}
+    born: dict[tuple[int, int], LineageLine] = {}
     sorts: dict[str, str] = {}
-    for entry in run.lineage.read():
-        if entry["stage"] == stage:
-            each = Born(**{k: entry[k] for k in names})
+    for each in run.lineage.read():
+        if each.stage == stage:
             its_sorts = {k: _sort(v) for k, v in each.settings.items()}
             sorts = sorts or its_sorts
             if its_sorts != sorts:
@@ -98,6 +75,13 @@ def _sort(value: Any) -> str:
     return "number" if type(value) in (int, float) else type(value).__name__
 
 
+def number_of(born: LineageLine, setting: str) -> float:
+    """Return the value of a setting as it is drawn; of several widths their sum."""
+    value = born.settings[setting]
+    number = sum(value) if isinstance(value, list) else value
+    return 1.0 - number if setting in COMPLEMENT else number
+
+
 def setting_title(setting: str) -> str:
     """Return the title of a setting's axis."""
     if setting == "hidden":
@@ -105,7 +89,7 @@ def setting_title(setting: str) -> str:
     return f"1 − {setting}" if setting in COMPLEMENT else setting
 
 
-def changes_words(born: Born) -> str:
+def changes_words(born: LineageLine) -> str:
     """Return the changed settings of a member in words; empty: none."""
     return ", ".join(
         f"{k.removeprefix('network.')} {short_value(old)} → {short_value(new)}"

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import MissingExtra, RunError
+from skillweave.errors import RunError, needs_extra
 from skillweave.reporting.lineage import (
-    Born,
     Lineage,
     changes_words,
+    number_of,
     read_lineage,
     setting_title,
     short_value,
@@ -18,6 +18,7 @@ from skillweave.reporting.lineage import (
 from skillweave.reporting.palette import color_of, hex_of
 from skillweave.runs.directory import RunDirectory, file_name
 from skillweave.runs.hub import must_be_own
+from skillweave.runs.manifest import LineageLine
 
 FAINT = "#c9c9cf"
 """The colour of members that did not lead to the winner."""
@@ -37,15 +38,13 @@ def plot_run(run: RunDirectory, out: Path | None = None) -> list[Path]:
     Raises:
         RunError: nothing was trained yet, or matplotlib is missing.
     """
-    try:
+    with needs_extra("plotting", "plot"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtra("plotting", "plot") from error
     folder = out or run.path / "plots"
     written = []
     must_be_own(folder)
     metrics = list(run.metrics())
-    for i, stage in enumerate(run.manifest["stages"]):
+    for i, stage in enumerate(run.manifest.stages):
         name = stage.name
         color = hex_of(color_of(i + 1))
         if lineage := read_lineage(run, name):
@@ -89,7 +88,7 @@ def _draw_lineage(make: Any, lineage: Lineage, name: str, color: str) -> Any:
     return figure
 
 
-def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str) -> None:
+def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[LineageLine], color: str) -> None:
     for born in lineage.born.values():
         parent = lineage.parent(born)
         if born.fitness is None:
@@ -128,15 +127,15 @@ def _draw_fitness(axes: Any, lineage: Lineage, path: Sequence[Born], color: str)
 
 
 def _draw_setting(
-    axes: Any, setting: str, lineage: Lineage, path: Sequence[Born], color: str
+    axes: Any, setting: str, lineage: Lineage, path: Sequence[LineageLine], color: str
 ) -> None:
     everyone = list(lineage.born.values())
     words: list[str] = []
     if any(isinstance(b.settings.get(setting), str) for b in everyone):
         words = sorted({b.settings[setting] for b in everyone})
 
-    def value(born: Born) -> float:
-        return words.index(born.settings[setting]) if words else born.number(setting)
+    def value(born: LineageLine) -> float:
+        return words.index(born.settings[setting]) if words else number_of(born, setting)
 
     values = [value(b) for b in everyone]
     for born in everyone:

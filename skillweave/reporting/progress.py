@@ -15,6 +15,7 @@ import numpy as np
 
 from skillweave.reporting.displays import Display, Row, open_display
 from skillweave.runs.manifest import StageEntry
+from skillweave.runs.trackers import Listener
 from skillweave.terminal import printable, say
 from skillweave.training.episodes import INFO
 
@@ -33,7 +34,7 @@ LOG = logging.getLogger("skillweave")
 LOG.addHandler(logging.NullHandler())
 
 
-class Progress:
+class Progress(Listener):
     """A display of each stage's steps, return (mean of the last 100 episodes), speed and time left.
 
     If several policies learn in a stage, each has a line below it: its share of the steps, and its

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from skillweave.errors import DeclarationError, EnvError, MissingExtra, RunError
+from skillweave.errors import DeclarationError, EnvError, RunError, needs_extra
 from skillweave.reporting.palette import OWN_COLORS
 from skillweave.types import Array
 
@@ -176,7 +176,5 @@ def _extent(changed: Array) -> slice:
 
 def extra(module: str) -> Any:
     """Return a module of the extra 'video'; MissingExtra where it is not installed."""
-    try:
+    with needs_extra("drawing captions and writing videos", "video"):
         return importlib.import_module(module)
-    except ImportError as error:
-        raise MissingExtra("drawing captions and writing videos", "video") from error

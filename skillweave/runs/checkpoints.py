@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
@@ -29,7 +28,7 @@ class Checkpoints:
         names = "checkpoint.new", "checkpoint", "checkpoint.previous"
         self._files = [directory / f"{name}.safetensors" for name in names]
 
-    def save(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+    def save(self, tensors: Mapping[str, Tensor], header: Checkpoint) -> None:
         """Write the latest checkpoint; the previous latest one stays beside it.
 
         Raises:

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 from skillweave.messages import shown_path
 from skillweave.runs.checkpoints import Checkpoints
-from skillweave.runs.manifest import RepairEntry
+from skillweave.runs.manifest import Manifest, RepairEntry
 
 Caller = Literal["command line", "hierarchy", "agent", "train_agent"]
 """The user's entry point: a command, or a Python function."""
@@ -28,7 +28,7 @@ class RunLike(Protocol):
     """A run: its directory and its manifest."""
 
     path: Path
-    manifest: dict[str, Any]
+    manifest: Manifest
 
 
 @contextmanager
@@ -48,9 +48,10 @@ def from_command_line() -> bool:
 
 def command_words(name: str, run: RunLike) -> str:
     """Return a command for a run, with the user's file where the command needs it."""
-    needs = "resume_needs_recipe" if name == "resume" else "needs_recipe"
-    recipe = run.manifest.get("recipe") or "FILE.py"
-    needs_file = recipe.endswith(".py") and run.manifest.get(needs, True)
+    recipe = run.manifest.recipe or "FILE.py"
+    manifest = run.manifest
+    needs = manifest.resume_needs_recipe if name == "resume" else manifest.needs_recipe
+    needs_file = recipe.endswith(".py") and needs
     words = f"skillweave {name} {shlex.quote(str(shown_path(run.path)))}"
     return words + (f" --recipe {shlex.quote(recipe)}" if needs_file else "")
 
@@ -62,10 +63,10 @@ def resume_words(run: RunLike, *more: str) -> str:
     """
     if from_command_line():
         return command_words("resume", run)
-    for entry in run.manifest.get("stages", ()):
+    for entry in run.manifest.stages:
         if entry.repair is not None and entry.kept is None:
             return repair_words(entry.repair, run)
-    seed = [f"seed={run.manifest['seed']}"] if run.manifest.get("seed") else []
+    seed = [f"seed={run.manifest.seed}"] if run.manifest.seed else []
     return _call(run, ", ".join([python_string(shown_path(run.path)), *seed, "resume=True", *more]))
 
 
@@ -80,7 +81,7 @@ def repair_words(repair: RepairEntry, run: RunLike) -> str:
 def start_words(run: RunLike) -> str:
     """Return the command or the line of Python that starts a new run from this one's policies."""
     if from_command_line():
-        recipe = run.manifest.get("recipe") or "RECIPE"
+        recipe = run.manifest.recipe or "RECIPE"
         where = shlex.quote(str(shown_path(run.path)))
         return f"skillweave train {shlex.quote(recipe)} --start-from {where}"
     return _call(run, f"start_from={python_string(shown_path(run.path))}")
@@ -91,11 +92,11 @@ def load_words(run: RunLike) -> str:
     if from_command_line():
         return command_words("evaluate", run)
     path = python_string(shown_path(run.path))
-    return f"sw.load({path}, hierarchy)" if run.manifest.get("needs_recipe") else f"sw.load({path})"
+    return f"sw.load({path}, hierarchy)" if run.manifest.needs_recipe else f"sw.load({path})"
 
 
 def _call(run: RunLike, arguments: str) -> str:
-    plain = run.manifest.get("kind") == "agent"
+    plain = run.manifest.hierarchy is None
     caller = _CALLER.get() or ("agent" if plain else "hierarchy")
     flat = ", flat=True" if plain and caller == "hierarchy" else ""
     return f"{_BEGINS[caller]}{arguments}{flat})"
@@ -110,7 +111,7 @@ def saved_words(run: RunLike) -> str:
     """Return the progress that a stopped run has saved, in words."""
     if header := Checkpoints(run.path).latest_header():
         return f"saved at {header.steps:,} steps of {header.stage}"
-    stages = run.manifest["stages"]
+    stages = run.manifest.stages
     for stage in stages:
         if not stage.done and stage.continued:
             return f"saved at {stage.continued[-1]:,} steps of {stage.name}"

@@ -27,14 +27,15 @@ def policy_at_start(run: RunDirectory, skill: str, policy: Policy) -> Policy:
     Raises:
         RunError: the policy has changed, and the run holds no copy.
     """
-    recorded = next((s.policy for s in run.manifest["skills"] if s.name == skill), None)
 
     def read() -> bytes | None:
         assert isinstance(policy, Foreign)
         path = _copy_path(run, skill, policy)
         return read_file(path) if path.exists() else None
 
-    return as_recorded(policy, recorded, read, f"{run.path}: skill {skill!r}")
+    return as_recorded(
+        policy, run.manifest.by_path[skill].policy, read, f"{run.path}: skill {skill!r}"
+    )
 
 
 def _copy_path(run: RunDirectory, skill: str, policy: Foreign) -> Path:

@@ -26,14 +26,14 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import fields, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, TypeVar
 
 from torch import Tensor
 
-from skillweave.algorithms.policy import AgentPolicy, state_from
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy, state_from
 from skillweave.errors import DeclarationError, RunError
 from skillweave.messages import absolute, shown_path
 from skillweave.policies.files import shown
@@ -56,9 +56,9 @@ from skillweave.runs.lock import NAME as LOCK, Lock
 from skillweave.runs.manifest import (
     Checkpoint,
     LineageLine,
+    Manifest,
     MetricsLine,
     StageEntry,
-    as_json,
     identity,
     read_manifest,
     versions,
@@ -119,7 +119,7 @@ class RunDirectory:
     Its ``path`` is absolute: a program may change its working directory while it trains.
     """
 
-    def __init__(self, path: Path, manifest: dict[str, Any]) -> None:
+    def __init__(self, path: Path, manifest: Manifest) -> None:
         self.path = absolute(path)
         self.manifest = manifest
         path = self.path
@@ -135,14 +135,13 @@ class RunDirectory:
     @property
     def num_envs(self) -> int | None:
         """Return the largest number of training environments of all stages; None: no stages."""
-        stages = self.manifest["stages"]
-        return max((s.num_envs for s in stages), default=None)
+        return max((s.num_envs for s in self.manifest.stages), default=None)
 
     @classmethod
     def create(
         cls,
         path: str | Path,
-        manifest: dict[str, Any],
+        manifest: Manifest,
         first: First | None = None,
         *,
         hold: bool = False,
@@ -178,8 +177,10 @@ class RunDirectory:
             if before is not None:
                 cls._clear_dead(path, lock, overwrite)
             created = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-            content = {"versions": versions(), "created": created, "id": identity(manifest)}
-            run = cls(path, content | manifest)
+            run = cls(
+                path,
+                replace(manifest, versions=versions(), created=created, id=identity(manifest)),
+            )
             run._lock = lock
             if first is not None:
                 first(run)
@@ -236,7 +237,7 @@ class RunDirectory:
         self._lock = Lock(self.path)
         try:
             # Another process may have continued it.
-            self.manifest.update(read_manifest(self.path))
+            self.manifest = read_manifest(self.path)
             self._clear()
         except BaseException:
             self.close()
@@ -248,12 +249,12 @@ class RunDirectory:
         for directory in (self.path, *(self.path / name for name in folders)):
             for path in directory.glob(TEMPORARY):
                 remove(path)
-        self._checkpoints.clear([s.name for s in self.manifest["stages"] if s.done])
+        self._checkpoints.clear([s.name for s in self.manifest.stages if s.done])
 
     def save(self) -> None:
         """Write ``run.json``."""
         self.check()
-        write_json(self.path / "run.json", as_json(self.manifest), make_directories=False)
+        write_json(self.path / "run.json", self.manifest, make_directories=False)
 
     def check(self) -> None:
         """Raise a RunError where the directory was deleted during the training."""
@@ -262,31 +263,28 @@ class RunDirectory:
 
     def stage(self, name: str) -> StageEntry:
         """Return the manifest's entry of a stage: budget, algorithm, status, steps, seconds."""
-        entries: list[StageEntry] = self.manifest["stages"]
-        for entry in entries:
+        for entry in self.manifest.stages:
             if entry.name == name:
                 return entry
-        names = ", ".join(entry.name for entry in entries)
+        names = ", ".join(entry.name for entry in self.manifest.stages)
         raise RunError(f"{self.path} has no stage {shown(name)}; it has: {names}")
 
     @property
     def finished(self) -> bool:
         """Return whether every stage is done, and compared at its end where it must be."""
-        done = all(s.done for s in self.manifest["stages"])
+        done = all(s.done for s in self.manifest.stages)
         return done and not self.lacks_comparison
 
     @property
     def has_learnt(self) -> bool:
         """Return whether a new run in its place would lose results of training."""
-        stages = self.manifest["stages"]
-        done = any(s.done or s.continued for s in stages)
+        done = any(s.done or s.continued for s in self.manifest.stages)
         return done or self._checkpoints.any() or any(self.path.glob(f"{FINAL}/*.safetensors"))
 
     @property
     def lacks_comparison(self) -> bool:
         """Return whether the comparison that chooses the best hierarchy is still missing."""
-        stages = self.manifest["stages"]
-        return any(s.kept is None and s.needs_comparison for s in stages)
+        return any(s.kept is None and s.needs_comparison for s in self.manifest.stages)
 
     def save_checkpoint(
         self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None = None
@@ -312,10 +310,12 @@ class RunDirectory:
 
     def _as_checkpoint(
         self, state: Any | None, header: Checkpoint, extra: Mapping[str, Tensor] | None
-    ) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    ) -> tuple[dict[str, Tensor], Checkpoint]:
         tensors = {} if state is None else {f.name: getattr(state, f.name) for f in fields(state)}
         tensors |= {f"extra.{k}": v for k, v in (extra or {}).items()}
-        return tensors, asdict(header) | self.place(header.stage) | self.line_bytes()
+        header = replace(header, run=self.manifest.id)
+        self.record_lines(header)
+        return tensors, header
 
     def drop_checkpoints(self) -> None:
         """Remove the checkpoints of a stage that ``run.json`` marks as done."""
@@ -416,7 +416,7 @@ class RunDirectory:
             tensors, header = policy.to_file()
             path = self.policy_path(stage, name)
             make_directory(path.parent)
-            header |= self.place(stage)
+            header = replace(header, stage=stage, run=self.manifest.id)
             sums[name] = write_tensors(path, tensors, header, make_directories=False)
         if list(sums) == [stage]:
             entry.sha256 = sums[stage]
@@ -425,11 +425,11 @@ class RunDirectory:
 
     def place(self, stage: str) -> dict[str, str]:
         """Return the part of a file's header that names its stage and run."""
-        return {"stage": stage, "run": self.manifest["id"]}
+        return {"stage": stage, "run": self.manifest.id}
 
     def must_be_ours(self, run: str | None, path: Path) -> None:
         """Raise a RunError where ``run``, which a file's header names, is another run."""
-        if run != self.manifest["id"]:
+        if run != self.manifest.id:
             raise RunError(f"{path} belongs to another run")
 
     def load_policies(self, stage: str) -> dict[str, AgentPolicy]:
@@ -454,12 +454,13 @@ class RunDirectory:
         tensors, header, sha256 = read_signed(path)
         if header.get("kind") != "agent":
             raise RunError(f"{path} holds no agent's policy")
-        if (of := header.get("stage")) != stage:
-            raise RunError(f"{path} holds the policy of stage {shown(of)}")
-        self.must_be_ours(header.get("run"), path)
+        of: AgentHeader = record_in(AgentHeader, header, path)
+        if of.stage != stage:
+            raise RunError(f"{path} holds the policy of stage {shown(of.stage)}")
+        self.must_be_ours(of.run, path)
         known = entry.policies.get(name or "", entry.sha256)
         check_unchanged(path, sha256, known)
-        return AgentPolicy.from_file(tensors, header, str(path))
+        return AgentPolicy.from_file(tensors, of, str(path))
 
     def policy_path(self, stage: str, name: str | None = None) -> Path:
         """Return the path of a stage's policy, or of one of its learners."""
@@ -470,26 +471,22 @@ class RunDirectory:
         self.check()
         self._metrics.append([record])
 
-    def line_bytes(self) -> dict[str, int]:
-        """Return the sizes of ``metrics.jsonl`` and ``lineage.jsonl``, for ``rewind``."""
-        return {"metrics_bytes": self._metrics.size, "lineage_bytes": self.lineage.size}
-
-    def record_lines(self, entry: StageEntry) -> None:
-        """Record the sizes of ``line_bytes`` in a stage's entry."""
+    def record_lines(self, entry: StageEntry | Checkpoint) -> None:
+        """Record the sizes of ``metrics.jsonl`` and ``lineage.jsonl``, for ``rewind``."""
         entry.metrics_bytes, entry.lineage_bytes = self._metrics.size, self.lineage.size
 
     def rewind(self, at: Mapping[str, int]) -> list[str]:
-        """Drop the lines after the sizes of ``line_bytes``: training writes them again.
+        """Drop the lines after the sizes of ``record_lines``: training writes them again.
 
         Args:
-            at: sizes that ``line_bytes`` returned; a missing size drops nothing.
+            at: sizes that ``record_lines`` recorded; a missing size drops nothing.
 
         Returns:
             The files that were removed or shortened and lack lines; each is returned once.
         """
         lacking = []
         for key, lines in zip(LINES, (self._metrics, self.lineage), strict=True):
-            entries = [s for s in self.manifest["stages"] if getattr(s, key) is not None]
+            entries = [s for s in self.manifest.stages if getattr(s, key) is not None]
             least = max([at.get(key, 0), *(getattr(entry, key) for entry in entries)])
             lines.rewind(at.get(key))
             if lines.size < least:
@@ -517,9 +514,9 @@ class RunDirectory:
 # Names of files
 
 
-def _check_file_names(manifest: Mapping[str, Any]) -> None:
+def _check_file_names(manifest: Manifest) -> None:
     """Raise a DeclarationError where the name of a policy's file would be too long."""
-    for entry in manifest["stages"]:
+    for entry in manifest.stages:
         for name in (entry.name, *entry.learns):
             file = _policy_file(entry.name, name)
             if len(file) + MORE > LONGEST_NAME:
@@ -575,7 +572,7 @@ def _check_replaceable(path: Path, run: RunDirectory | None) -> None:
 
 def _copies(run: RunDirectory) -> tuple[str, ...]:
     """Return patterns of the files of ready policies in a run."""
-    return tuple(f"{file_name(s.name)}.*" for s in run.manifest.get("skills", ()))
+    return tuple(f"{file_name(s.name)}.*" for s in run.manifest.skills)
 
 
 def _foreign(path: Path, copies: tuple[str, ...]) -> Iterator[Path]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file, parse_json, read_file, shown
-from skillweave.schema import fit
+from skillweave.schema import as_json, fit
 
 SCHEMA = 1
 """Version of all files; readers refuse newer ones."""
@@ -120,14 +120,14 @@ def _sync(directory: Path) -> None:
             os.close(handle)
 
 
-def write_json(path: Path, data: Mapping[str, Any], *, make_directories: bool = True) -> None:
-    """Replace a JSON file; add ``schema`` and a checksum of the content."""
+def write_json(path: Path, data: Any, *, make_directories: bool = True) -> None:
+    """Replace a JSON file by a dataclass or a dict; add ``schema`` and a checksum."""
     write_bytes(path, json_bytes(path, data), make_directories=make_directories)
 
 
-def json_bytes(path: Path, data: Mapping[str, Any]) -> bytes:
+def json_bytes(path: Path, data: Any) -> bytes:
     """Return the bytes that ``write_json`` writes."""
-    plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **data})))
+    plain = _whole(json.loads(_json(path, {"schema": SCHEMA, **as_json(data)})))
     text = _json(path, plain | {"sha256": _json_digest(plain)}, indent=2)
     return text.encode() + b"\n"
 
@@ -192,13 +192,18 @@ def check_schema(data: Mapping[str, Any], where: Path | str) -> None:
 def write_tensors(
     path: Path,
     tensors: Mapping[str, Tensor],
-    header: Mapping[str, Any],
+    header: Any,
     *,
     make_directories: bool = True,
 ) -> str:
-    """Replace a safetensors file with a JSON ``header``; return the checksum of both."""
+    """Replace a safetensors file; return the checksum of tensors and header.
+
+    Args:
+        header: a dataclass, or a dict.
+        make_directories: make those above it, where they are missing.
+    """
     plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    whole = {"schema": SCHEMA, **header}
+    whole = {"schema": SCHEMA, **as_json(header)}
     whole["sha256"] = _digest(_json(path, whole, sort_keys=True), plain)
     # Only one key: safetensors writes several in random order, and equal runs need equal files.
     metadata = {"skillweave": _json(path, whole, sort_keys=True)}
@@ -217,8 +222,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return read_signed(path)[:2]
 
 
-def record_in(kind: Any, header: Mapping[str, Any], path: Path) -> Any:
-    """Return a file's header as a dataclass; a RunError names the file and a wrong field."""
+def record_in(kind: Any, header: Mapping[str, Any], path: Path | str) -> Any:
+    """Return a file's content or header as a dataclass; a RunError names the wrong field."""
     return fit(kind, {k: v for k, v in header.items() if k not in ("schema", "sha256")}, str(path))
 
 

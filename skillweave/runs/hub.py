@@ -14,13 +14,13 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from skillweave.errors import DeclarationError, MissingExtra, RunError, SkillweaveError
+from skillweave.errors import DeclarationError, RunError, SkillweaveError, needs_extra
 from skillweave.messages import short, shortened
 from skillweave.runs.command_words import resume_words
 from skillweave.runs.directory import CALLS, RunDirectory
 from skillweave.runs.files import json_bytes
 from skillweave.runs.links import check_no_links_around
-from skillweave.runs.manifest import as_json
+from skillweave.runs.manifest import Manifest
 
 KINDS = (".safetensors", ".json", ".jsonl", ".md", ".gif", ".mp4", ".png")
 """Suffixes of files that may be in a run on the hub: weights, settings, its card, its pictures."""
@@ -43,10 +43,8 @@ def hub() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
+    with needs_extra("sharing runs", "hub"):
         return importlib.import_module("huggingface_hub")
-    except ImportError as error:
-        raise MissingExtra("sharing runs", "hub") from error
 
 
 def hub_api() -> Any:
@@ -80,32 +78,32 @@ def check_whole(run: RunDirectory) -> None:
         RunError: the run is not finished, or a file is damaged.
     """
     if not run.finished:
-        waiting = [s.name for s in run.manifest["stages"] if not s.done]
+        waiting = [s.name for s in run.manifest.stages if not s.done]
         reason = f"the stage {waiting[0]!r} is not done" if waiting else "it is not compared yet"
         raise RunError(
             f"{run.path} is not finished ({reason}), and only finished runs can be shared. "
             f"Continue it: {resume_words(run)}"
         )
-    for stage in run.manifest["stages"]:
+    for stage in run.manifest.stages:
         run.load_policies(stage.name)
     for lines in (run.metrics(), run.lineage.read()):
         for _ in lines:
             pass
 
 
-def public(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def public(manifest: Manifest) -> Manifest:
     """Return the content of ``run.json`` without the owner's private entries; the id is unchanged.
 
     Private are paths on the owner's machine, and the trackers of the run, which another user's
     training must not write to.
     """
-    content = copy.deepcopy(dict(manifest))
-    if content.get("track"):
-        content["track"] = []
-    policies = [skill.policy or {} for skill in content.get("skills", ())]
-    for holder, key in ((content, "recipe"), *((policy, "file") for policy in policies)):
-        if holder.get(key):
-            holder[key] = PureWindowsPath(holder[key]).name  # it splits at both kinds of slashes
+    content = copy.deepcopy(manifest)
+    content.track = ()
+    if content.recipe:
+        content.recipe = PureWindowsPath(content.recipe).name  # it splits at both kinds of slashes
+    for skill in content.skills:
+        if skill.policy is not None and skill.policy.file:
+            skill.policy.file = PureWindowsPath(skill.policy.file).name
     return content
 
 
@@ -122,7 +120,7 @@ def run_files(run: RunDirectory, calls: bool = False) -> tuple[dict[str, Path | 
         for name in (*LINES, *([CALLS] if calls else []))
         if (run.path / name).exists()
     }
-    files["run.json"] = json_bytes(run.path / "run.json", as_json(public(run.manifest)))
+    files["run.json"] = json_bytes(run.path / "run.json", public(run.manifest))
     stays = []
     for path in sorted((run.path / "policies").glob("[!.]*")):
         if path.suffix == ".safetensors":

@@ -8,12 +8,11 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.errors import DeclarationError, RunError
 from skillweave.paths import SELECTOR, decides, level_of, name_of
 from skillweave.runs.command_words import resume_words
@@ -22,10 +21,11 @@ from skillweave.runs.files import (
     check_unchanged,
     make_directory,
     read_signed,
+    record_in,
     remove,
     write_tensors,
 )
-from skillweave.runs.manifest import StageEntry, Start
+from skillweave.runs.manifest import Manifest, SkillEntry, StageEntry, Start
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Learnt:
     """The other run's ``id``."""
     chooses: Chooses
     """The options that it chooses among, if it is a selector or a critic of skills."""
-    part: Mapping[str, Any] | None = None
-    """Of a skill of a run: its ``recorded_part``; else None."""
+    entry: SkillEntry | None = None
+    """The entry of a skill of a run; else None."""
     code: dict[str, str] = field(default_factory=dict)
     """The other run's texts of its environment and skills."""
 
@@ -62,43 +62,31 @@ def learners_of_run(path: Path) -> dict[str, Learnt]:
     """
     run = RunDirectory.open(path)
     learnt = dict[str, Learnt]()
-    if run.lacks_comparison and all(entry.done for entry in run.manifest["stages"]):
+    if run.lacks_comparison and all(entry.done for entry in run.manifest.stages):
         raise RunError(
             f"start_from: {path} was stopped during the comparison at its end; finish it first: "
             f"{resume_words(run)}"
         )
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         if not entry.done or entry.undone:
             continue
         sums = entry.policies or {entry.name: str(entry.sha256)}
         for name, policy in run.load_policies(entry.name).items():
             sha256 = sums[name]
             steps = (entry.steps or 0) + (learnt[name].steps if name in learnt else 0)
-            chooses, part = options_of(run.manifest, name), recorded_part(run.manifest, name)
-            of_run = run.manifest.get("id"), chooses, part, run.manifest.get("code", {})
+            chooses, skill = options_of(run.manifest, name), run.manifest.by_path.get(name)
+            of_run = run.manifest.id, chooses, skill, run.manifest.code
             learnt[name] = Learnt(policy, sha256, steps, str(path), *of_run)
     return learnt
 
 
-def recorded_part(manifest: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
-    """Return what a skill sees, what it acts on and its correction; None: of no skill."""
-    for skill in manifest.get("skills", ()):
-        if skill.name == name:
-            return {key: getattr(skill, key) for key in ("sees", "acts", "residual")}
-    return None
-
-
-def options_of(manifest: Mapping[str, Any], name: str) -> Chooses:
+def options_of(manifest: Manifest, name: str) -> Chooses:
     """Return the options that a selector or a critic of skills chooses among; else empty."""
     if not decides(name):
         return (), ()
     level = level_of(name)
-    paths = [skill.name for skill in manifest["skills"]]
-    skills = tuple(name_of(path) for path in paths if level_of(path) == level)
-    hierarchy: Mapping[str, Any] = manifest
-    if level:
-        hierarchy = manifest["skills"][paths.index(level)].hierarchy
-    lengths = hierarchy.get("call_lengths", ()) if name_of(name) == SELECTOR else ()
+    skills = tuple(name_of(path) for path in manifest.by_path if level_of(path) == level)
+    lengths = manifest.levels[level].call_lengths if name_of(name) == SELECTOR else ()
     return skills, tuple(lengths)
 
 
@@ -148,12 +136,12 @@ def copy_initial_policies(run: RunDirectory, learnt: Mapping[str, Learnt]) -> No
     The stages record the checksums of the copies.
     """
     try:
-        for entry in run.manifest["stages"]:
+        for entry in run.manifest.stages:
             for name, start in entry.starts.items():
                 tensors, header = learnt[name].policy.to_file()
                 path = _path(run, name)
                 make_directory(path.parent)
-                header |= {"starts": name} | run.place(entry.name)
+                header = replace(header, starts=name, stage=entry.name, run=run.manifest.id)
                 start.copy = write_tensors(path, tensors, header, make_directories=False)
     except BaseException:
         shutil.rmtree(run.path / "starts", ignore_errors=True)
@@ -183,7 +171,7 @@ def initial_policy(
     if header.get("kind") != "agent" or header.get("starts") != name:
         raise RunError(f"{path} does not hold the initial policy of {name!r}")
     check_unchanged(path, sha256, start.copy)
-    policy = AgentPolicy.from_file(tensors, header, str(path))
+    policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, path), str(path))
     if not same_shapes(policy.algorithm, algorithm):
         raise RunError(f"{path} holds other networks than {name!r} has in this run")
     return policy, start.steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from skillweave.errors import RunError
 from skillweave.policies.files import check_file, load_json, shown
 from skillweave.runs.links import own_copy
-from skillweave.schema import fit
+from skillweave.schema import as_json, fit
 
 
 class JsonLines:
@@ -37,13 +37,13 @@ class JsonLines:
         """Return the size of the file in bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
-    def append(self, records: Iterable[Mapping[str, Any]]) -> None:
-        """Append one line per record.
+    def append(self, records: Iterable[Any]) -> None:
+        """Append one line per record, a dataclass or a dict.
 
         Raises:
             RunError: the disk is full or cannot be written.
         """
-        text = "".join(json.dumps(record) + "\n" for record in records)
+        text = "".join(json.dumps(as_json(record)) + "\n" for record in records)
         try:
             if self._file is None:
                 own_copy(self.path)
@@ -74,7 +74,7 @@ class JsonLines:
         except OSError as error:
             raise RunError(f"could not write {self.path}: {error.strerror}") from error
 
-    def read(self) -> Iterator[dict[str, Any]]:
+    def read(self) -> Iterator[Any]:
         """Yield the records, without a last line that is incomplete.
 
         Raises:
@@ -97,9 +97,8 @@ class JsonLines:
                     raise RunError(
                         f"{self.path} is damaged in line {number}: {shown(record)} is no object"
                     )
-                if self._schema is not None:
-                    fit(self._schema, record, f"{self.path}, line {number}")
-                yield record
+                where = f"{self.path}, line {number}"
+                yield record if self._schema is None else fit(self._schema, record, where)
 
     def close(self) -> None:
         """Close the file; the next line opens it again."""

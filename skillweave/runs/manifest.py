@@ -1,6 +1,6 @@
 """The schemas of a run's files: ``run.json``, lines of metrics and of lineages, checkpoints.
 
-To add a field, add a line; with a default, or ``NotRequired``, if not every run has it.
+To add a field, add a line; with a default, if not every run has it.
 """
 
 from __future__ import annotations
@@ -9,18 +9,19 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, Self, TypedDict
 
 from skillweave.algorithms.config import config_from_json
+from skillweave.algorithms.policy import AgentHeader
 from skillweave.errors import EnvError, RunError
 from skillweave.paths import names_in
 from skillweave.policies.files import shown
 from skillweave.runs.comparison import Comparison
-from skillweave.runs.files import read_json
-from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, fit
+from skillweave.runs.files import read_json, record_in
+from skillweave.schema import AtLeastOne, Check, Count, NonNegative, Positive, as_json
 from skillweave.skills.base import NAME
 from skillweave.skills.foreign_policy import Source
 
@@ -38,28 +39,37 @@ NodePath = Annotated[
 """A name behind the names of the hierarchies around it: ``inner/skill``."""
 
 
-class NestedEntry(TypedDict):
-    """The entry of a hierarchy, the run's or a skill's; its skills have entries, too."""
+@dataclass(frozen=True)
+class GuideEntry:
+    """The entry of a guide: its source and its settings."""
 
+    source: Source
+    restrict: bool
+    target_kl: Positive | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelEntry:
+    """The entry of a hierarchy, the outermost one or a skill: its settings, without its skills."""
+
+    learn: Literal["apart", "together", "apart, then together"]
     call_steps: AtLeastOne | None
-    call_lengths: NotRequired[list[AtLeastOne]]
+    call_lengths: tuple[AtLeastOne, ...] = ()
+    """Lengths that the selector chooses from; empty: it chooses none."""
     interrupt: NonNegative | None
     """The gain in value at which a new decision interrupts a call."""
-    learn: Literal["apart", "together", "apart, then together"]
     greedy_skills: bool | None
     """None: measured at the end of learning together (``kept``)."""
     greedy_selector: bool | None
-    selector: NotRequired[Source]
-    """The source of a ready selector; absent if it is trained."""
-    guide: NotRequired[Source]
-    """The source of the ready selector that guides a trained one."""
-    guide_restrict: NotRequired[bool]
-    guide_kl: NotRequired[Positive | None]
-    reflexes: list[str]
-    start_calls: AtLeastOne | list[str] | None
+    start_calls: AtLeastOne | tuple[str, ...] | None
     search_steps: AtLeastOne | None
     episode_calls: AtLeastOne
     call_cost: NonNegative
+    reflexes: list[str]
+    selector: Source | None = None
+    """The source of a ready selector; None: it is trained."""
+    guide: GuideEntry | None = None
+    """The ready selector that guides a trained one."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +90,8 @@ class SkillEntry:
     residual: Any = None
     """The scale of a correction of ``policy``, which is ready, where the skill learns one."""
     policy: Source | None = None
-    hierarchy: NestedEntry | None = None
-    """Its parts, if the skill is a hierarchy."""
+    hierarchy: LevelEntry | None = None
+    """Its settings, if the skill is a hierarchy."""
 
 
 @dataclass(frozen=True)
@@ -310,40 +320,61 @@ class StageEntry:
         return self.kept is not None and self.kept.kept == "before"
 
 
-class Manifest(TypedDict):
-    """``run.json``."""
+@dataclass(kw_only=True)
+class Recorded:
+    """A declaration in a file: in ``run.json``, or in the header of a hierarchy's weights."""
 
-    kind: Literal["hierarchy", "agent"]
     env: Annotated[str, Check("a text of at most 300 characters", lambda x: len(x) <= 300)]
     env_kwargs: dict[str, Any]
-    code: NotRequired[dict[str, str]]
+    code: dict[str, str] = field(default_factory=dict)
     """Texts of the environment and the skills, to be compared (``collecting/user_code.py``)."""
+    recipe: str | None = None
+    hierarchy: LevelEntry | None = None
+    """The outermost hierarchy; None: a plain agent."""
+    skills: list[SkillEntry] = field(default_factory=list)
+    """The skills of all levels; those of a hierarchy follow it."""
+
+    @property
+    def by_path(self) -> dict[str, SkillEntry]:
+        """The skills by path."""
+        return {skill.name: skill for skill in self.skills}
+
+    @property
+    def levels(self) -> dict[str, LevelEntry]:
+        """The hierarchies by path; the outermost one has the path ""."""
+        entries = {"": self.hierarchy} | {skill.name: skill.hierarchy for skill in self.skills}
+        return {path: entry for path, entry in entries.items() if entry is not None}
+
+
+@dataclass(kw_only=True)
+class Manifest(Recorded):
+    """``run.json``."""
+
     seed: Count
-    checkpoint_every: AtLeastOne
-    needs_recipe: bool
     stages: list[StageEntry]
-    created: str
-    versions: dict[str, str]
-    id: str
+    checkpoint_every: AtLeastOne
     eval_every: AtLeastOne | None
     eval_episodes: AtLeastOne
-    keep: NotRequired[Literal["last", "best"]]
+    keep: Literal["last", "best"] = "last"
     """The weights that stages end with."""
-    log_info: NotRequired[list[str]]
+    log_info: tuple[str, ...]
     """Logged keys of ``info``."""
-    log_calls: NotRequired[AtLeastOne]
+    log_calls: AtLeastOne | None = None
     """Steps of the log of calls."""
-    log_calls_info: NotRequired[list[str]]
+    log_calls_info: tuple[str, ...] = ()
     """Keys of ``info`` in it."""
+    track: tuple[str, ...] = ()
+    needs_recipe: bool
     resume_needs_recipe: bool
-    recipe: NotRequired[str | None]
-    track: NotRequired[list[str]]
+    created: str = ""
+    """The time at which the run was made; empty, as the next two, before that."""
+    versions: dict[str, str] = field(default_factory=dict)
+    id: str = ""
 
-
-class HierarchyManifest(Manifest, NestedEntry):
-    """``run.json`` of a hierarchy."""
-
-    skills: list[SkillEntry]
+    @property
+    def kind(self) -> Literal["hierarchy", "agent"]:
+        """The kind of what learns."""
+        return "agent" if self.hierarchy is None else "hierarchy"
 
 
 MetricsLine = TypedDict(
@@ -388,20 +419,25 @@ class BestEntry:
     fitness: float
     number: Count
     generation: Count
-    policy: dict[str, Any]
+    policy: AgentHeader
 
 
-class LineageLine(TypedDict):
+@dataclass(frozen=True)
+class LineageLine:
     """A line of ``lineage.jsonl``: a member in a generation."""
 
     stage: NodePath
     generation: Count
     member: Count
     parent: Count | None
+    """Its number in the generation before; its own where it continued."""
     mutation: str
     changes: dict[str, tuple[Any, Any]]
     fitness: float | None
+    diverged: bool
     best: bool
+    """It was the best so far."""
+    steps: Count
     settings: dict[str, Any]
 
 
@@ -445,63 +481,61 @@ class Checkpoint:
 
 # Reading and writing ``run.json``
 
+ADDED = ("evaluation", "evaluation_sampled", "handover")
+"""Fields that ``Run.info`` adds to a manifest."""
 
-def _manifest_in(data: Mapping[str, Any], file: str) -> dict[str, Any]:
-    """Return a manifest; a RunError names the file and the field where it is wrong."""
-    manifest: dict[str, Any] = fit(Manifest, data, file)
-    if manifest["kind"] == "hierarchy":
-        manifest = fit(HierarchyManifest, data, file)
-    named = ("skills", "stages") if manifest["kind"] == "hierarchy" else ("stages",)
-    for kind in named:
-        names = [entry.name for entry in manifest[kind]]
+
+def manifest_in(data: Mapping[str, Any], file: str = "") -> Manifest:
+    """Return a manifest from JSON; a RunError names the file and the field where it is wrong.
+
+    Fields that ``Run.info`` adds are left out.
+    """
+    own = {k: v for k, v in data.items() if k not in ADDED}
+    manifest: Manifest = record_in(Manifest, own, file)
+    for kind, entries in (("skills", manifest.skills), ("stages", manifest.stages)):
+        names = [entry.name for entry in entries]
         for i, name in enumerate(names):
             if name in names[:i]:
                 raise RunError(f"{file}: {kind}[{i}].name is {shown(name)}, a second time")
-    if manifest["kind"] == "agent" and len(manifest["stages"]) != 1:
+    if manifest.hierarchy is None and len(manifest.stages) != 1:
         raise RunError(
-            f"{file}: stages has {len(manifest['stages'])} entries, but a plain agent has one"
+            f"{file}: stages has {len(manifest.stages)} entries, but a plain agent has one"
         )
-    for i, stage in enumerate(manifest["stages"]):
+    for i, stage in enumerate(manifest.stages):
         where = f"stages[{i}]"
         config_from_json(stage.algorithm, file, f"{where}.algorithm")
         if stage.done and None in (stage.steps, stage.seconds):
             raise RunError(f"{file}: {where} is done, but has no field 'steps' or 'seconds'")
-    if manifest.pop("sha256", None) is None:
-        raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
     return manifest
 
 
-def read_manifest(run: Path) -> dict[str, Any]:
+def read_manifest(run: Path) -> Manifest:
     """Return the checked content of a run's ``run.json``."""
     file = run / "run.json"
-    found: dict[str, Any] = read_json(file, lambda data: _manifest_in(data, str(file)))
-    return found
 
+    def checked(data: dict[str, Any]) -> Manifest:
+        manifest = manifest_in(data, str(file))
+        if "sha256" not in data:
+            raise RunError(f"{file} is damaged: no field 'sha256', the checksum of its content")
+        return manifest
 
-def as_json(value: Any) -> Any:
-    """Return an entry as plain JSON, without fields that are None or empty by default."""
-    if is_dataclass(value):
-        return {
-            f.name: as_json(content)
-            for f in fields(value)
-            if (content := getattr(value, f.name)) not in (None, [], {})
-            or f.default is f.default_factory is MISSING
-        }
-    if isinstance(value, Mapping):
-        return {k: as_json(x) for k, x in value.items()}
-    return [as_json(x) for x in value] if isinstance(value, list | tuple) else value
+    manifest: Manifest = read_json(file, checked)
+    return manifest
 
 
 OF_NO_WEIGHT = ("recipe", "track", "log_info", "log_calls", "log_calls_info", "code")
-"""Entries that do not change what is learnt, or are compared by themselves."""
+"""Fields that do not change what is learnt, or are compared by themselves."""
+OF_A_RUN = ("id", "created", "versions")
+"""Fields that a run gets when it is made."""
 
 
-def identity(manifest: Mapping[str, Any]) -> str:
+def identity(manifest: Manifest) -> str:
     """Return 16 letters that identify a new run.
 
     Runs that must end with the same weights have the same.
     """
-    settings = {k: as_json(v) for k, v in manifest.items() if k not in OF_NO_WEIGHT}
+    left_out = (*OF_NO_WEIGHT, *OF_A_RUN)
+    settings = {k: v for k, v in as_json(manifest).items() if k not in left_out}
     return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[
         :16
     ]

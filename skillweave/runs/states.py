@@ -16,7 +16,7 @@ S = TypeVar("S")
 
 def learns_again(run: RunDirectory, stage: str, name: str) -> bool:
     """Return whether ``name`` also learns in a later stage."""
-    stages = run.manifest["stages"]
+    stages = run.manifest.stages
     at = [entry.name for entry in stages].index(stage)
     return any(name in entry.learns for entry in stages[at + 1 :])
 

@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from skillweave.errors import DeclarationError, MissingExtra, RunError
 from skillweave.messages import error_text, suggest
 from skillweave.policies.core import flat
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.schema import as_json
 from skillweave.terminal import say
 
 MLFLOW_EXPERIMENT = "skillweave"
@@ -34,35 +34,33 @@ MLFLOW_LONGEST_SETTING = 500
 """The most characters of a setting's value in MLflow."""
 
 
-class Tracker(Protocol):
-    """A listener of training that sends its events to another program."""
+class Listener:
+    """Receiver of training's events, which it ignores where a subclass does not define a method."""
 
     def stage(self, name: str, budget: int) -> None:
-        """Report that a stage begins or continues."""
-        ...
+        """Handle the start of a stage, or its continuation."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Report an update."""
-        ...
+        """Handle the report of an update."""
 
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Report the end of a stage."""
-        ...
+        """Handle the end of a stage."""
 
     def message(self, text: str) -> None:
-        """Report a message for users."""
-        ...
+        """Show a message to people."""
+
+
+class Tracker(Listener):
+    """A listener of training that sends its events to another program."""
 
     def film(self, path: Path, steps: int) -> None:
         """Report a film, a GIF or an MP4, after ``steps`` of training."""
-        ...
 
     def close(self) -> None:
         """Release the tracker after the last event."""
-        ...
 
 
-class TensorBoard:
+class TensorBoard(Tracker):
     """A tracker of scalars by environment step, in ``<run>/tensorboard/<stage>``.
 
     Each stage has a folder, because it counts its steps from 0, and a resumed run purges later
@@ -74,9 +72,6 @@ class TensorBoard:
 
         self._path = run.path / "tensorboard"
         self._writers: dict[str, Any] = {}
-
-    def stage(self, name: str, budget: int) -> None:
-        """Do nothing."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Write every metric; a resumed stage's first step replaces all entries from there on."""
@@ -91,9 +86,6 @@ class TensorBoard:
         """Flush the stage's file."""
         if name in self._writers:
             self._writers[name].flush()
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
         """Write a GIF unchanged; skip an MP4, which TensorBoard cannot show."""
@@ -115,7 +107,7 @@ class TensorBoard:
             writer.close()
 
 
-class WandB:
+class WandB(Tracker):
     """A tracker of one Weights & Biases run; offline without a login, for which it never asks.
 
     A resumed run continues it: its id follows from the run's path and time of creation.
@@ -143,12 +135,6 @@ class WandB:
         """Log every metric."""
         self._run.log({f"{name}/{k}": v for k, v in (metrics | {"steps": steps}).items()})
 
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Do nothing."""
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
-
     def film(self, path: Path, steps: int) -> None:
         """Log the film, of which Weights & Biases stores a copy."""
         import wandb
@@ -160,7 +146,7 @@ class WandB:
         self._run.finish()
 
 
-class MLflow:
+class MLflow(Tracker):
     """One MLflow run, at MLFLOW_TRACKING_URI or in MLflow's default store.
 
     A resumed run continues it, and does not send its earlier metrics again.
@@ -186,7 +172,7 @@ class MLflow:
                 "MLFLOW_TRACKING_URI, or train without this tracker"
             ) from error
         self._id: str = mlflow_run.info.run_id
-        stages = [stage.name for stage in run.manifest["stages"]]
+        stages = [stage.name for stage in run.manifest.stages]
         self._sent_steps = {s: mlflow_run.data.metrics.get(f"{s}/steps", -1.0) for s in stages}
 
     def _existing(self, tag: str) -> Any:
@@ -211,17 +197,15 @@ class MLflow:
             tags={MLFLOW_TAG: tag},
             run_name=self._run.path.resolve().name,
         )
-        settings = {k: v for k, v in manifest.items() if not isinstance(v, dict | list)}
-        for stage in manifest["stages"]:
+        fields = {"kind": manifest.kind} | as_json(manifest) | (as_json(manifest.hierarchy) or {})
+        settings = {k: v for k, v in fields.items() if not isinstance(v, dict | list)}
+        for stage in manifest.stages:
             settings |= flat(stage.algorithm, f"{stage.name}.")
         param = importlib.import_module("mlflow.entities").Param
         params = [param(k, str(v)[:MLFLOW_LONGEST_SETTING]) for k, v in settings.items()]
         for i in range(0, len(params), MLFLOW_MOST_SETTINGS):
             self._client.log_batch(created.info.run_id, params=params[i : i + MLFLOW_MOST_SETTINGS])
         return created
-
-    def stage(self, name: str, budget: int) -> None:
-        """Do nothing."""
 
     def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Store every metric, to be sent after about a second."""
@@ -239,9 +223,6 @@ class MLflow:
     def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
         """Send waiting metrics."""
         self._send()
-
-    def message(self, text: str) -> None:
-        """Do nothing: messages are not tracked."""
 
     def film(self, path: Path, steps: int) -> None:
         """Upload the film as an artifact."""
@@ -272,7 +253,7 @@ class MLflow:
 
 def identifier(run: RunDirectory) -> str:
     """Return 16 letters that identify a run, also when it is resumed."""
-    parts = (str(run.path.resolve()), run.manifest["created"], run.manifest.get("id"))
+    parts = (str(run.path.resolve()), run.manifest.created, run.manifest.id)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
@@ -309,7 +290,7 @@ def trackers_of(run: RunDirectory) -> Iterator[tuple[Tracker, ...]]:
     """
     with ExitStack() as stack:
         try:
-            trackers = make_trackers(run.manifest.get("track", ()), run)
+            trackers = make_trackers(run.manifest.track, run)
         except MissingExtra:
             trackers = ()
         for tracker in trackers:
@@ -326,7 +307,7 @@ def track_film(run: RunDirectory, path: Path) -> None:
 
 def steps_of(run: RunDirectory) -> int:
     """Return the environment steps of all stages."""
-    return sum(stage.steps or 0 for stage in run.manifest["stages"])
+    return sum(stage.steps or 0 for stage in run.manifest.stages)
 
 
 def wandb_mode() -> Any:

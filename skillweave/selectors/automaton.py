@@ -118,7 +118,11 @@ class Automaton(ReadySelector):
     @cached_property
     def in_place(self) -> selectors.Automaton:  # type: ignore[override]
         """The rule that acts."""
-        states = {state: self._in_order(names) for state, names in self.states.items()}
+        ordered = (
+            names if isinstance(names, tuple) else tuple(filter(names.__contains__, self.skills))
+            for names in self.states.values()
+        )
+        states = dict(zip(self.states, ordered, strict=True))
         transitions = tuple(
             (
                 *pair,
@@ -133,9 +137,6 @@ class Automaton(ReadySelector):
             for (state, name), goal in self.goals.items()
         )
         return selectors.Automaton(*self._rule_of, states, self.start_state, transitions, goals)
-
-    def _in_order(self, names: tuple[str, ...] | frozenset[str]) -> tuple[str, ...]:
-        return names if isinstance(names, tuple) else tuple(filter(names.__contains__, self.skills))
 
     def source(self) -> dict[str, Any]:
         """Return the checksum of its states and transitions, with only the names of functions."""

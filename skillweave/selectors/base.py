@@ -72,11 +72,6 @@ class ReadySelector(Functional, Foreign):
         return selector
 
     @property
-    def gives_goals(self) -> bool:
-        """Return whether it is declared with goals for skills."""
-        return any(goal is not None for *_, goal in self.named())
-
-    @property
     def goal_spaces(self) -> dict[str, Space[Any]]:
         """Return the spaces of goals of the skills that have some, by name, once it is bound."""
         space = self.action_space

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from gymnasium import Space
@@ -18,7 +18,14 @@ from skillweave.errors import DeclarationError, SkillError
 from skillweave.messages import short
 from skillweave.notebooks import facts, joined
 from skillweave.policies.spaces import Space as Data
-from skillweave.schema import AtLeastOne, NonNegative, Share, annotations_of, fitted
+from skillweave.schema import (
+    AtLeastOne,
+    Check,
+    NonNegative,
+    Share,
+    annotations_of,
+    fitted,
+)
 from skillweave.skills.goal_spaces import alone, draw_from
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.outputs import answer, as_array, called
@@ -34,6 +41,25 @@ DEVICE = re.compile(r"con|prn|aux|nul|com\d|lpt\d", re.IGNORECASE)
 
 
 _OF_TRAINING = ("steps", "task_weight", "target_return", "target_success")
+
+GoalSpace = Annotated[
+    Space[Any],
+    Check(
+        "a Gymnasium space: goal_space = gymnasium.spaces.Box(-1, 1, (2,))",
+        lambda x: isinstance(x, Space),
+    ),
+]
+"""The space of a skill's goals."""
+Color = Annotated[
+    Any,
+    Check(
+        "red, green and blue, each from 0 to 255: color = (230, 80, 60)",
+        lambda x: len(x) == 3,
+        lambda x: bytes(list(x)),  # which takes no other numbers
+    ),
+]
+"""Red, green and blue."""
+_Method = Annotated[Callable[..., Any], Check("a method")]
 
 _PARAMETERS = {
     **dict.fromkeys(("reward", "termination", "success"), ("step",)),
@@ -102,13 +128,13 @@ class Skill:
     algorithm: Any = None
     target_return: float | None = None
     target_success: Share | None = None
-    goal_space: Space[Any] | None = None
+    goal_space: GoalSpace | None = None
     sees: Any = None
     acts: Any = None
     policy: Any = None
     needs_info: Sequence[str] | None = None
     reward_changes: bool = False
-    color: tuple[int, int, int] | None = None
+    color: Color | None = None
 
     methods: ClassVar[tuple[str, ...]] = ("reward", "initiation", "termination", "success")
     of_goals: ClassVar[tuple[str, ...]] = ("goals", "clip_goal")
@@ -189,8 +215,7 @@ class Skill:
     def validate(self) -> None:
         """Raise a DeclarationError that names an error in the declaration."""
         where = f"skill {short(self.name)} ({type(self).__name__})"
-        if not isinstance(self.name, str):
-            raise DeclarationError(f"{where}: the name must be text")
+        fitted(str, self.name, f"{where}: name")
         if not self.name:
             raise DeclarationError(f"{where} has no name: set the class attribute 'name'")
         if not NAME.fullmatch(self.name):
@@ -203,18 +228,19 @@ class Skill:
                 "choose another name"
             )
         kinds = annotations_of(Skill)
+        for field in ("color", "goal_space"):
+            fitted(kinds[field], getattr(self, field), f"{where}: {field}")
         for field in ("max_steps", "call_steps", "needs_info", "reward_changes", *_OF_TRAINING):
             value = getattr(self, field)
             converted = fitted(kinds[field], value, f"{where}: {field}")
             if converted is not value and (is_trained(self) or field not in _OF_TRAINING):
                 with suppress(AttributeError):  # of a property
                     setattr(self, field, converted)
-        if self.color is not None and not _is_color(self.color):
+        if self.goal_space is None and (given := list(filter(self.defines, self.of_goals))):
             raise DeclarationError(
-                f"{where}: color is {short(self.color)}; it must be red, green and blue, each from "
-                "0 to 255: color = (230, 80, 60)"
+                f"{where} has {given[0]}(), but no goals: set goal_space, the space of its goals: "
+                "goal_space = gymnasium.spaces.Box(-1, 1, (2,))"
             )
-        self._check_goals(where)
         if self.sees is not None:
             declared_sees(self.sees, where)
         if self.acts is not None:
@@ -228,10 +254,7 @@ class Skill:
                 stacklevel=2,
             )
         for method in (*self.methods, *self.of_goals):
-            if not callable(getattr(self, method)):
-                raise DeclarationError(
-                    f"{where}: {method} is {short(getattr(self, method))}; it must be a method"
-                )
+            fitted(_Method, getattr(self, method), f"{where}: {method}")
             self._check_parameters(method, where)
 
     def _check_parameters(self, method: str, where: str) -> None:
@@ -252,32 +275,9 @@ class Skill:
                 f"a method of a skill takes (self, {', '.join(names)}){advice if goal else ''}"
             ) from None
 
-    def _check_goals(self, where: str) -> None:
-        """Raise a DeclarationError where its goals are declared in a way that has no meaning."""
-        if self.goal_space is None:
-            if given := [method for method in self.of_goals if self.defines(method)]:
-                raise DeclarationError(
-                    f"{where} has {given[0]}(), but no goals: set goal_space, the space of its "
-                    "goals: goal_space = gymnasium.spaces.Box(-1, 1, (2,))"
-                )
-        elif not isinstance(self.goal_space, Space):
-            raise DeclarationError(
-                f"{where}: goal_space is {short(self.goal_space)}; it must be a Gymnasium space: "
-                "goal_space = gymnasium.spaces.Box(-1, 1, (2,))"
-            )
-
 
 FIELDS = tuple(x for x in Skill.__annotations__ if x not in ("methods", "of_goals", "_path"))
 """The names of a skill's settings."""
-
-
-def _is_color(value: object) -> bool:
-    """Return whether a value is red, green and blue, each from 0 to 255."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if not isinstance(value, tuple | list) or len(value) != 3:
-        return False
-    return all(isinstance(v, int | np.integer) and 0 <= v <= 255 for v in value)
 
 
 def about(skill: Skill) -> str:
@@ -353,7 +353,13 @@ class Reflex:
         holds = self.holds(obs)
         if holds.any():
             action = action.copy()
-            action[holds] = self._actions(obs[holds], space)
+            if callable(self.action):
+                seen, label = obs[holds], f"{self._label}: action()"
+                given = called(self.action, seen, label)
+                action[holds] = space.actions(given, len(seen), label, SkillError)
+                probe(self.action, seen, label, space)
+            else:
+                action[holds] = self.fixed(space)
         return action, holds
 
     def holds(self, obs: Array) -> Array:
@@ -379,15 +385,6 @@ class Reflex:
     @property
     def _label(self) -> str:
         return f"reflex {self.name!r}"
-
-    def _actions(self, obs: Array, space: Data) -> Array:
-        """Return its actions for observations (n, ...)."""
-        n, label = len(obs), f"{self._label}: action()"
-        if not callable(self.action):
-            return np.repeat(self.fixed(space)[None], n, axis=0)
-        actions = space.actions(called(self.action, obs, label), n, label, SkillError)
-        probe(self.action, obs, label, space)
-        return actions
 
 
 def asked(

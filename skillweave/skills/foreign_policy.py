@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NotRequired, Self, TypedDict
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import Space
@@ -58,7 +59,7 @@ class Foreign(Memoryless):
         return bound
 
     def source(self) -> dict[str, Any]:
-        """Return its source as JSON for ``run.json``: at least its kind."""
+        """Return the fields of its ``Source``, at least its kind."""
         content = self.content()
         sha256 = {} if content is None else {"sha256": checksum(content)}
         return {"kind": self.kind, "name": self.name, **sha256}
@@ -148,32 +149,37 @@ def check_spaces(
             watch(act, made_up(observation_space, 2), (), whose, False)
 
 
-class Source(TypedDict):
-    """The source of a ready policy, as JSON."""
+@dataclass
+class Source:
+    """The source of a ready policy."""
 
     kind: str
-    name: NotRequired[str]
-    file: NotRequired[str]
-    sha256: NotRequired[str]
+    name: str | None = None
+    file: str | None = None
+    sha256: str | None = None
     """Checksum of its content, if it can be computed."""
-    mapping: NotRequired[dict[str, Any]]
+    mapping: dict[str, Any] | None = None
     """Its mapping from observations to actions, if it has one."""
 
+    def __str__(self) -> str:
+        sha256 = "" if self.sha256 is None else f" (sha256 {self.sha256[:12]}…)"
+        return f"{self.kind} {(self.file or self.name or '')[:300]}{sha256}"
 
-def source_of(policy: Policy) -> dict[str, Any]:
-    """Return the source of a ready policy as JSON; see ``Source``.
 
-    A policy may have a method ``source`` that returns it, with a checksum; for others it is the
-    name of the class.
+def source_of(policy: Policy) -> Source:
+    """Return the source of a ready policy.
+
+    A policy may have a method ``source`` that returns its fields, with a checksum; for others it
+    is the name of the class.
     """
     method = getattr(policy, "source", None)
-    source: dict[str, Any] = method() if callable(method) else {}
-    return {"kind": "policy", "name": qualified(type(policy))} | source
+    given: dict[str, Any] = method() if callable(method) else {}
+    return Source(**{"kind": "policy", "name": qualified(type(policy))} | given)
 
 
 def as_recorded(
     policy: Policy,
-    recorded: dict[str, Any] | None,
+    recorded: Source | None,
     read: Callable[[], bytes | None],
     where: str,
 ) -> Policy:
@@ -186,22 +192,20 @@ def as_recorded(
     if recorded is None:  # an old run, without sources
         return policy
     now = source_of(policy)
-    if now["kind"] != recorded["kind"]:
-        raise RunError(
-            f"{where} had a policy of kind {_described(recorded)}, but now it is {_described(now)}"
-        )
-    if recorded.get("mapping") != now.get("mapping"):
+    if now.kind != recorded.kind:
+        raise RunError(f"{where} had a policy of kind {recorded}, but now it is {now}")
+    if recorded.mapping != now.mapping:
         if not hasattr(policy, "remapped"):
             raise RunError(f"{where} had a policy with a mapping, but now it has none")
-        policy = policy.remapped(recorded.get("mapping"), where)
-    if recorded.get("sha256") in (None, now.get("sha256")):
+        policy = policy.remapped(recorded.mapping, where)
+    if recorded.sha256 in (None, now.sha256):
         return policy
     if not isinstance(policy, Foreign) or (content := read()) is None:
         raise RunError(
-            f"{where} had the policy {_described(recorded)}, but now it is {_described(now)}: "
-            "another checksum. Restore the policy that it was trained with, or train again"
+            f"{where} had the policy {recorded}, but now it is {now}: another "
+            "checksum. Restore the policy that it was trained with, or train again"
         )
-    if checksum(content) != recorded.get("sha256"):
+    if checksum(content) != recorded.sha256:
         raise RunError(f"{where}: the copy of its policy is damaged: another checksum")
     return policy.restored(content)
 
@@ -211,11 +215,6 @@ def qualified(thing: Any) -> str:
     if not hasattr(thing, "__qualname__"):
         thing = type(thing)
     return f"{thing.__module__}.{thing.__qualname__}"
-
-
-def _described(source: dict[str, Any]) -> str:
-    sha256 = f" (sha256 {source['sha256'][:12]}…)" if "sha256" in source else ""
-    return f"{source['kind']} {(source.get('file') or source.get('name') or '')[:300]}{sha256}"
 
 
 def made_up(space: Space[Any], n: int) -> Array:

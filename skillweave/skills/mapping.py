@@ -7,42 +7,93 @@ applies it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import KW_ONLY, dataclass, field, fields, is_dataclass
 from itertools import count
 from typing import Annotated, Any
 
 import numpy as np
 
-from skillweave.arguments import checked_names
 from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.named import named
 from skillweave.policies.mapped import LONGEST
-from skillweave.schema import Check, check_fields, fitted
+from skillweave.schema import Check, fitted, settings
 
+# Values of fields
+
+
+def floats(value: Any) -> float | tuple[float, ...]:
+    """Return finite numbers as a float, or a tuple of such; raise a ValueError: they are none."""
+    array = np.asarray(value, np.float64)
+    if isinstance(value, str | bool) or array.ndim > 1 or not array.size:
+        raise ValueError
+    if not np.isfinite(array).all():
+        raise ValueError
+    return tuple(array.tolist()) if array.ndim else float(array)
+
+
+def _range(value: Any) -> tuple[float, float]:
+    low, high = np.array(floats(value))
+    if low > high:
+        raise ValueError
+    return float(low), float(high)
+
+
+def _places(value: Any) -> slice | tuple[int, ...]:
+    if isinstance(value, str):  # as files have slices
+        value = slice(*(int(x) if x else None for x in value.split(":")))
+    if isinstance(value, slice):
+        bounds = (value.start, value.stop, value.step)
+        if all(x is None or isinstance(x, int | np.integer) for x in bounds) and value.step != 0:
+            return value
+        raise ValueError
+    places = np.atleast_1d(value)
+    if places.dtype.kind not in "iu" or places.ndim > 1 or not places.size or places.min() < 0:
+        raise ValueError
+    return tuple(places.tolist())
+
+
+def _goal(value: Any) -> Any:
+    return value if callable(value) else tuple(np.atleast_1d(floats(value)).tolist())
+
+
+Numbers = Annotated[Any, Check("a finite number, or a list of such", convert=floats)]
+"""A number, or one for each of several."""
+Range = Annotated[Any, Check("the lowest and the highest number: (-1.0, 1.0)", convert=_range)]
+"""The lowest and the highest number."""
+Places = Annotated[Any, Check("a slice, or a list of places, counted from 0", convert=_places)]
+"""A slice or a tuple of places."""
+GoalValue = (
+    Annotated[
+        Any,
+        Check(
+            "finite numbers, or a function of observations that returns (n, numbers)",
+            convert=_goal,
+        ),
+    ]
+    | None
+)
+"""The goal of a policy."""
 _Steps = Annotated[int, Check(f"at least 1 and at most {LONGEST:,}", lambda x: 1 <= x <= LONGEST)]
+
 
 # Parts of an input
 
 
-@dataclass(frozen=True, kw_only=True)
+@settings
 class Scaling:
     """A scaling of inputs: ``(number - offset) * scale``, then clipped."""
 
-    scale: Any = 1.0
+    _: KW_ONLY
+    scale: Numbers = 1.0
     """A factor, or one for each number."""
-    offset: Any = 0.0
+    offset: Numbers = 0.0
     """A number, or one for each, that is subtracted first: a mean, or a default pose."""
-    clip: Any = None
+    clip: Range | None = None
     """The lowest and the highest number, after scaling."""
 
-    def __post_init__(self) -> None:
-        _check(self, _numbers, "scale", "offset")
-        _check(self, _range, "clip")
 
-
-@checked_names
-@dataclass(frozen=True)
+@settings
 class Part(Scaling):
     """Numbers of the observation as inputs of a policy: ``(number - offset) * scale``, clipped.
 
@@ -61,20 +112,15 @@ class Part(Scaling):
     key: str = ""
     """The part of a Dict or Tuple observation, ``arm.joints`` for one within another; empty: the
     whole observation. Choices become one-hot, images count only where nothing else is in it."""
-    places: Any = None
+    places: Places | None = None
     """Its numbers, counted from 0 in its flat form: a slice, or a list of places in the order in
     which the policy takes them. None: all."""
-    one_hot: bool = field(default=True, kw_only=True)
+    _: KW_ONLY
+    one_hot: bool = True
     """False: a choice stays one number."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_fields(self)
-        _check(self, _places, "places")
 
-
-@checked_names
-@dataclass(frozen=True)
+@settings
 class Goal(Scaling):
     """The place of the goal, a command for example, among the inputs of a policy.
 
@@ -84,20 +130,17 @@ class Goal(Scaling):
         DeclarationError: a setting is wrong; the message names it.
     """
 
-    low: Any = None
+    low: Numbers | None = None
     """The lowest goal, one number or one for each, for which the policy was made; None: any."""
-    high: Any = None
+    high: Numbers | None = None
     """The highest goal."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        _check(self, _numbers, "low", "high")
         if None not in (self.low, self.high) and np.any(np.array(self.low) > self.high):
             raise DeclarationError(f"Goal.low is {short(self.low)}, which is more than Goal.high")
 
 
-@checked_names
-@dataclass(frozen=True)
+@settings
 class LastAction(Scaling):
     """The place of the policy's last output among its inputs; zeros before the first.
 
@@ -108,7 +151,7 @@ class LastAction(Scaling):
     """
 
 
-@dataclass(frozen=True)
+@settings
 class Computed(Scaling):
     """Numbers (n, K) that a function of the user makes of observations (n, *obs_shape)."""
 
@@ -129,8 +172,7 @@ KINDS: dict[str, type[Any]] = {
 # Outputs
 
 
-@checked_names
-@dataclass(frozen=True)
+@settings
 class Acts:
     """A policy's output as an action: clipped, then ``number * scale + offset``.
 
@@ -146,23 +188,20 @@ class Acts:
         DeclarationError: a setting is wrong; the message names it.
     """
 
-    to: Any = None
+    to: Places | None = None
     """The places of the outputs in the environment's action, in its flat form: a slice, or a list
     of places, one for each output. Of Discrete actions: the number, from 0, of each choice of the
     policy. None: all, in their order."""
-    scale: Any = 1.0
+    scale: Numbers = 1.0
     """A factor, or one for each output."""
-    offset: Any = 0.0
+    offset: Numbers = 0.0
     """A number, or one for each output, that is added last: a default pose."""
-    clip: Any = None
+    clip: Range | None = None
     """The lowest and the highest output, before scaling."""
-    rest: Any = None
+    rest: Numbers | None = None
     """The other numbers of the action, where ``to`` is a part of it: a number, or one for each."""
 
     def __post_init__(self) -> None:
-        _check(self, _places, "to")
-        _check(self, _numbers, "scale", "offset", "rest")
-        _check(self, _range, "clip")
         if isinstance(self.to, tuple) and len(set(self.to)) != len(self.to):
             raise DeclarationError(
                 f"Acts.to is {short(self.to)}; each place of an action can be written once"
@@ -213,8 +252,8 @@ class PolicyMapping:
         return [source for source in self.sources() if isinstance(source, Goal)]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "goal", checked_goal(self.goal))
-        for name, kind in (("every", _Steps), ("chunk", _Steps | None)):
+        kinds: dict[str, Any] = {"goal": GoalValue, "every": _Steps, "chunk": _Steps | None}
+        for name, kind in kinds.items():
             object.__setattr__(self, name, fitted(kind, getattr(self, name), name))
         if self.goal is not None and not self.goal_places:
             raise DeclarationError(
@@ -255,27 +294,21 @@ class PolicyMapping:
         """
         code = code or {}
         fitted(Mapping[str, Any], data, "the mapping")
-        for name in ("sees", "scaling"):
-            fitted(Mapping[str, Any], data.get(name, {}), name)
-        sees, goal, acts = (data.get(name) for name in ("sees", "goal", "acts"))
-        if sees is not None:
-            sees = {
-                name: tuple(
-                    _from_json(None, part, code, f"sees[{name!r}][{i}]")
-                    for i, part in enumerate(fitted(list[Any], parts, f"sees[{name!r}]"))
-                )
-                for name, parts in sees.items()
-            }
+        sees = fitted(dict[str, tuple[Any, ...]] | None, data.get("sees"), "sees")
+        for name, parts in (sees or {}).items():
+            where = f"sees[{name!r}]"
+            each = (_from_json(None, x, code, f"{where}[{i}]") for i, x in enumerate(parts))
+            sees[name] = tuple(each)
+        goal, acts = data.get("goal"), data.get("acts")
         if isinstance(goal, Mapping):
             goal = _function(goal.get("function"), code, "goal")
         if acts is not None:
             acts = _from_json(Acts, acts, code, "acts")
         scaling = {
             k: _from_json(Scaling, v, code, f"scaling[{k!r}]")
-            for k, v in data.get("scaling", {}).items()
+            for k, v in fitted(dict[str, Any], data.get("scaling", {}), "scaling").items()
         }
-        states = fitted(list[Any], data.get("state", []), "state")
-        state = tuple(tuple(fitted(list[Any], entry, "state")) for entry in states)
+        state = fitted(tuple[tuple[Any, ...], ...], data.get("state", ()), "state")
         single = data.get("single_state", False)
         every, chunk = data.get("every", 1), data.get("chunk")
         return cls(sees, goal, acts, every, chunk, state, single, scaling)
@@ -363,21 +396,8 @@ def is_places(value: Any) -> bool:
     )
 
 
-def checked_goal(goal: Any) -> Any:
-    """Return a goal as a function or a tuple of numbers; None: there is none.
-
-    Raises:
-        DeclarationError: it is neither.
-    """
-    if goal is None or callable(goal):
-        return goal
-    values = floats(goal)
-    if values is None:
-        raise DeclarationError(
-            f"goal is {short(goal)}; it must be finite numbers, or a function of observations that "
-            "returns (n, numbers)"
-        )
-    return values if isinstance(values, tuple) else (values,)
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def check_in_range(goal: tuple[float, ...], places: Sequence[Any]) -> None:
@@ -440,7 +460,9 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     elif isinstance(state, list | tuple) and state:
         single = not isinstance(state[0], list | tuple)
         shapes = (tuple(state),) if single else tuple(tuple(shape) for shape in state)
-        if all(_is_shape(shape) for shape in shapes):
+        sizes = [n for shape in shapes for n in shape if n is not None]
+        one_axis = all(shape.count(None) == 1 for shape in shapes)
+        if one_axis and all(_is_whole(n) and n >= 1 for n in sizes):
             return shapes, single
     raise DeclarationError(
         f"state is {short(state)}; it must be a shape with None as the axis of the environments, "
@@ -449,81 +471,7 @@ def _checked_state(state: Any) -> tuple[tuple[Any, ...], bool]:
     )
 
 
-def _is_shape(shape: tuple[Any, ...]) -> bool:
-    sizes = [n for n in shape if n is not None]
-    return len(sizes) == len(shape) - 1 and all(_is_whole(n) and n >= 1 for n in sizes)
-
-
-# Values of fields
-
-
-def _check(settings: Any, convert: Callable[[Any, str], Any], *names: str) -> None:
-    """Convert fields; one that is None by default may be None."""
-    kind = type(settings)
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None or getattr(kind, name) is not None:
-            where = f"{kind.__name__}.{name} is {short(value)}; it must be"
-            object.__setattr__(settings, name, convert(value, where))
-
-
-def floats(value: Any) -> float | tuple[float, ...] | None:
-    """Return finite numbers as a float, or a tuple of such; None: they are none."""
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        return None
-    if isinstance(value, str | bool) or array.ndim > 1 or not array.size:
-        return None
-    if not np.isfinite(array).all():
-        return None
-    return tuple(array.tolist()) if array.ndim else float(array)
-
-
-def _numbers(value: Any, where: str) -> float | tuple[float, ...]:
-    numbers = floats(value)
-    if numbers is None:
-        raise DeclarationError(f"{where} a finite number, or a list of such")
-    return numbers
-
-
-def _range(value: Any, where: str) -> tuple[float, ...]:
-    ends = floats(value)
-    if not isinstance(ends, tuple) or len(ends) != 2 or ends[0] > ends[1]:
-        raise DeclarationError(f"{where} the lowest and the highest number: (-1.0, 1.0)")
-    return ends
-
-
-def _places(value: Any, where: str) -> slice | tuple[int, ...]:
-    if isinstance(value, str):  # as files have slices
-        value = _slice_of(value)
-    if isinstance(value, slice):
-        bounds = (value.start, value.stop, value.step)
-        if all(x is None or isinstance(x, int | np.integer) for x in bounds) and value.step != 0:
-            return value
-    elif _is_whole(value) or isinstance(value, range | list | tuple | np.ndarray):
-        places = np.atleast_1d(value) if isinstance(value, np.ndarray) else value
-        places = [places] if _is_whole(places) else list(places)
-        if places and all(_is_whole(x) and x >= 0 for x in places):
-            return tuple(int(x) for x in places)
-    raise DeclarationError(f"{where} a slice, or a list of places, counted from 0")
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
 # Files
-
-
-def _slice_of(text: str) -> slice | None:
-    """Return the slice that ``to_json`` wrote; None: it is no slice."""
-    bounds = text.split(":")
-    try:
-        values = [int(x) if x else None for x in bounds]
-    except ValueError:
-        return None
-    return slice(*values) if len(bounds) in (2, 3) else None
 
 
 def to_json(value: Any, names: Mapping[int, str] | None = None) -> Any:

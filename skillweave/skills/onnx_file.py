@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import Space
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError, MissingExtra, PolicyError, RunError
+from skillweave.errors import DeclarationError, PolicyError, RunError, needs_extra
 from skillweave.messages import short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Policy as InPlace
@@ -77,10 +77,8 @@ class OnnxPolicy(MappedPolicy):
 
     @cached_property
     def _session(self) -> Any:
-        try:
+        with needs_extra("an ONNX file", "onnx"):
             return open_session(self.data, self.name)
-        except ImportError as error:
-            raise MissingExtra("an ONNX file", "onnx") from error
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in vars(self).items() if k != "_session"}
@@ -212,11 +210,9 @@ def from_onnx(
             "from_onnx(): state gives shapes; name the inputs and outputs of the file: "
             "state={'h_in': 'h_out'}"
         )
-    try:
+    with needs_extra("an ONNX file", "onnx"):
         import onnx
         import onnx.numpy_helper
-    except ImportError as error:
-        raise MissingExtra("an ONNX file", "onnx") from error
     check_file(Path(path))
     try:
         model = onnx.load(str(path))

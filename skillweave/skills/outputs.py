@@ -213,7 +213,9 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
         return "; its argument is read-only: change a copy"
     if "truth value of an array" in text:
         return "; combine arrays by & and |, with each side in parentheses; use np.where for if"
-    if "positional argument" in text and "given" in text and _not_entered(error):
+    frames = error.__traceback__
+    entered = frames is None or frames.tb_next is not None  # else none of its lines ran
+    if "positional argument" in text and "given" in text and not entered:
         what = "(self, step)" if step else "(self, obs)"
         return f"; a method of a skill takes {what}, another function only the last of these"
     if step and ("not subscriptable" in text or name in dir(np.ndarray)):
@@ -233,12 +235,6 @@ def _advice(error: BaseException, function: Any, argument: Any, ids: Array | Non
     if isinstance(error, IndexError) and step:
         return f"; step.next_obs has the shape {argument.next_obs.shape}"
     return ""
-
-
-def _not_entered(error: BaseException) -> bool:
-    """Return whether a function was called with wrong arguments, so none of its lines ran."""
-    frames = error.__traceback__
-    return frames is not None and frames.tb_next is None
 
 
 def blame(error: BaseException, who: str) -> NoReturn:

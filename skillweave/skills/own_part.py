@@ -24,6 +24,7 @@ from skillweave.messages import short, shortened, suggest
 from skillweave.policies.mapped import Input
 from skillweave.policies.parts import Correction, Part
 from skillweave.policies.spaces import Space as Data, space_of
+from skillweave.schema import as_json
 from skillweave.skills.foreign_policy import source_of
 from skillweave.skills.goal_spaces import leaf_at
 from skillweave.skills.mapping import (
@@ -111,20 +112,19 @@ def part_to_json(skill: Any, rest: Any, who: str) -> dict[str, Any]:
     return content
 
 
-def part_from_json(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes ``sees`` and ``acts`` that ``part_to_json`` wrote, where it has some.
+def part_from_json(sees: Any, acts: Any) -> dict[str, Any]:
+    """Return the attributes ``sees`` and ``acts`` as ``part_to_json`` wrote them; None: has none.
 
     Raises:
         DeclarationError: a value is wrong, or needs a function.
     """
-    found: dict[str, Any] = {}
-    if "sees" in content:
-        inputs = PolicyMapping.from_json({"sees": content["sees"]}).sees or {}
-        found["sees"] = inputs[""] if set(inputs) == {""} else inputs
-    if "acts" in content:
-        acts = content["acts"]
-        found["acts"] = Acts(to=acts).to if isinstance(acts, str) else tuple(acts)
-    return found
+    attributes: dict[str, Any] = {}
+    if sees is not None:
+        inputs = PolicyMapping.from_json({"sees": sees}).sees or {}
+        attributes["sees"] = inputs[""] if set(inputs) == {""} else inputs
+    if acts is not None:
+        attributes["acts"] = Acts(to=acts).to if isinstance(acts, str) else tuple(acts)
+    return attributes
 
 
 # The rest of the action
@@ -337,7 +337,7 @@ class OwnPart:
     def to_json(self) -> dict[str, Any]:
         """Return what was declared as JSON."""
         content = part_to_json(self._skill, self._rest, self.who)
-        return content if self.base is None else content | {"policy": source_of(self.base)}
+        return content if self.base is None else content | {"policy": as_json(source_of(self.base))}
 
     def _fit_sees(self, sees: Any) -> dict[str, Any]:
         """Return what it sees, as of ``Part``."""

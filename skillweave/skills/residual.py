@@ -7,7 +7,7 @@ arXiv:1812.03201.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from gymnasium import Space
@@ -18,10 +18,24 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.policies.parts import Correction
 from skillweave.policies.spaces import space_of
+from skillweave.schema import Check, check_fields
 from skillweave.skills.learnable import Learnable
 from skillweave.skills.mapping import floats
 
 TAKES = "a function of observations, from_sb3(...), from_onnx(...), or another ready policy"
+
+
+def _scale(value: Any) -> Any:
+    scale = np.array(floats(value))
+    if scale.min() <= 0:
+        raise ValueError
+    return scale.tolist()
+
+
+Scale = Annotated[
+    Any, Check("a number over 0, or one for each number of the action", convert=_scale)
+]
+"""The size of a correction."""
 
 
 @checked_names
@@ -58,7 +72,7 @@ class Residual:
     policy: Any
     """The ready policy: a function of observations, ``from_sb3(...)``, ``from_onnx(...)``,
     ``from_torch(...)``, ``load_policy(...)``, or any ``Policy``; its actions are of a Box."""
-    scale: Any = 0.2
+    scale: Scale = 0.2
     """The largest correction, as a share of half of an action's range: 1 may undo any action. One
     number, or one for each number of the action. Where an action has no bounds, it is in the
     action's own unit."""
@@ -73,13 +87,7 @@ class Residual:
                 "the policy as it is: leave out learn, or let the skill learn on with the policy "
                 "itself, without Residual"
             )
-        scale = floats(self.scale)
-        if scale is None or np.min(scale) <= 0:
-            raise DeclarationError(
-                f"Residual.scale is {short(self.scale)}; it must be a number over 0, or one for "
-                "each number of the action"
-            )
-        object.__setattr__(self, "scale", np.array(scale).tolist())
+        check_fields(self)
 
     def __repr__(self) -> str:
         return f"Residual({short(self.policy, 60)}, scale={self.scale})"

@@ -12,7 +12,7 @@ from gymnasium import Env, Space
 from gymnasium.spaces import Box, Dict, MultiBinary
 
 from skillweave.arguments import checked_names
-from skillweave.errors import DeclarationError, MissingExtra, PolicyError
+from skillweave.errors import DeclarationError, PolicyError, needs_extra
 from skillweave.messages import error_text, short, shortened
 from skillweave.notices import notice
 from skillweave.policies.core import Turn
@@ -232,10 +232,8 @@ def from_sb3(
 
 def _loaded(file: Path, algorithm: str | type | None) -> tuple[Any, str]:
     """Return the model in a trusted file, and the file's checksum."""
-    try:
+    with needs_extra("a Stable-Baselines3 model", "sb3"):
         import stable_baselines3
-    except ImportError as error:
-        raise MissingExtra("a Stable-Baselines3 model", "sb3") from error
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     kind: Any = algorithm

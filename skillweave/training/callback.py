@@ -15,6 +15,7 @@ from skillweave.errors import DeclarationError
 from skillweave.messages import short
 from skillweave.runs.command_words import resume_words, saved_words
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.trackers import Listener
 from skillweave.tracebacks import place
 
 
@@ -48,7 +49,7 @@ Callback = Callable[[TrainEvent], Any]
 """A function of one event; where it returns False, the stage ends."""
 
 
-class TrainCallback:
+class TrainCallback(Listener):
     """The listener that calls a user's function.
 
     Args:
@@ -73,12 +74,6 @@ class TrainCallback:
     def checkpoint(self, name: str, steps: int, metrics: Mapping[str, float | None]) -> None:
         """Call the function with a checkpoint."""
         self._call("checkpoint", name, steps, metrics)
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Do nothing: the end of a stage is no event."""
-
-    def message(self, text: str) -> None:
-        """Do nothing: a message is no event."""
 
     def _call(
         self,
@@ -110,7 +105,7 @@ class TrainCallback:
         steps: int,
         metrics: Mapping[str, float | None],
     ) -> TrainEvent:
-        stages = self._run.manifest["stages"]
+        stages = self._run.manifest.stages
         done = [s for s in stages if s.done]
         budget = self._run.stage(name).budget
         passed = sum(s.budget for s in done) + min(steps, budget)
@@ -119,7 +114,7 @@ class TrainCallback:
             stage=name,
             steps=steps,
             budget=budget,
-            total_steps=sum(s.steps for s in done) + steps,
+            total_steps=sum(s.steps or 0 for s in done) + steps,
             progress=passed / sum(s.budget for s in stages),
             metrics={k: float(v) for k, v in metrics.items() if v is not None},
             run_dir=self._run.path,

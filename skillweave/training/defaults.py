@@ -58,5 +58,5 @@ class TrainDefaults(CallReports):
         )
 
     def entries(self, kind: type[Reports]) -> dict[str, Any]:
-        """Return the entries of a run's manifest for the options of a ``kind``."""
+        """Return the fields of a run's manifest for the options of a ``kind``."""
         return {f.name: getattr(self, f.name) for f in fields(kind)}

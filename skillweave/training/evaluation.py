@@ -34,12 +34,18 @@ from skillweave.terminal import printable
 from skillweave.training.play import Played, SeededEpisodes, play
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.training.skill_report import (
+    TITLES,
     SkillReport,
     all_steps,
+    call_line,
+    cells_of,
+    hints,
+    reflex_lines,
     skill_reports,
+    skill_rows,
+    skill_table,
     weak_handovers,
 )
-from skillweave.training.skill_text import call_line, hints, reflex_lines, skill_rows, skill_table
 from skillweave.types import Array, Policy
 
 FIRST_SEED = 1_000_000
@@ -48,6 +54,9 @@ USUAL_ENVS = 16
 """Environments side by side in an evaluation where ``num_envs`` is not given."""
 SEEMS_ENDLESS = 1_000
 """Steps of an episode without a known limit after which an evaluation says where it will be cut."""
+
+NOT_LOGGED = "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
+SCORE_ALONE = 'evaluate(skill="go_to") scores a skill alone'
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,8 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        return self._logged()[""]
+        calls: CallLog = self._kept("logs", NOT_LOGGED)[""]
+        return calls
 
     @property
     def inner_calls(self) -> dict[str, CallLog]:
@@ -96,7 +106,7 @@ class Evaluation:
         Raises:
             DeclarationError: no calls were logged.
         """
-        return {path: log for path, log in self._logged().items() if path}
+        return {path: log for path, log in self._kept("logs", NOT_LOGGED).items() if path}
 
     @property
     def goals(self) -> Array:
@@ -105,7 +115,9 @@ class Evaluation:
         Raises:
             DeclarationError: no skill with goals acted alone.
         """
-        return self._of_alone("goals", "no skill with goals acted alone in this evaluation")
+        missing = "no skill with goals acted alone in this evaluation"
+        goals: Array = self._kept("goals", f"{missing}: {SCORE_ALONE}")
+        return goals
 
     @property
     def reached(self) -> Array:
@@ -116,21 +128,15 @@ class Evaluation:
         Raises:
             DeclarationError: no skill that defines success acted alone.
         """
-        return self._of_alone("reached", "no skill that defines success acted alone")
+        missing = "no skill that defines success acted alone"
+        reached: Array = self._kept("reached", f"{missing}: {SCORE_ALONE}")
+        return reached
 
-    def _of_alone(self, name: str, missing: str) -> Array:
-        found: Array | None = vars(self).get(f"_{name}")
-        if found is None:
-            raise DeclarationError(f'{missing}: evaluate(skill="go_to") scores a skill alone')
-        return found
-
-    def _logged(self) -> dict[str, CallLog]:
-        logs: dict[str, CallLog] | None = vars(self).get("_logs")
-        if logs is None:
-            raise DeclarationError(
-                "no calls were logged in this evaluation: evaluate(log_calls=True) logs them"
-            )
-        return logs
+    def _kept(self, name: str, missing: str) -> Any:
+        """Return what is not saved with the scores; where it is ``missing``, raise an error."""
+        if (kept := vars(self).get(f"_{name}")) is None:
+            raise DeclarationError(missing)
+        return kept
 
     @property
     def mean(self) -> float:
@@ -206,8 +212,8 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         """Return the same as ``for_people``, for notebooks."""
-        head, *rows = skill_rows(self.skills)
-        tables = [table(head, rows)] if rows else []
+        rows = [*map(cells_of, skill_rows(self.skills))]
+        tables = [table(TITLES, rows)] if rows else []
         lines = [*reflex_lines(self.reflexes, sum(self.lengths)), *self._hints()]
         return joined([paragraph(self), *tables, *map(paragraph, lines)])
 
@@ -215,11 +221,13 @@ class Evaluation:
         j = self.to_json()
         digits = 2 if max(map(abs, self.returns)) < 10 else 1  # many are shares: 0 to 1
         mean, std, low, high, iqm = (
-            f"{value:.{digits}f}" for value in (j["mean"], j["std"], *j["ci95"], j["iqm"])
+            f"{value:.{digits}f}" for value in (self.mean, j["std"], *j["ci95"], j["iqm"])
         )
-        line = f"{mean} ± {std} over {j['episodes']} episodes (95 % CI {low} to {high}, IQM {iqm})"
-        if j["solved_fraction"] is not None:
-            line += f", {j['solved_fraction']:.0%} at {self.threshold:g} or more"
+        line = (
+            f"{mean} ± {std} over {len(self.returns)} episodes (95 % CI {low} to {high}, IQM {iqm})"
+        )
+        if self.solved_fraction is not None:
+            line += f", {self.solved_fraction:.0%} at {self.threshold:g} or more"
         if self.success_rate is not None:
             line += f", {self.success_rate:.0%} succeed"
         line += f", {j['length_mean']:.0f} steps an episode"

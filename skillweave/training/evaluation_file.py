@@ -8,16 +8,16 @@ it never replaces the score.
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
-from typing import Any, NotRequired, TypedDict
+from dataclasses import dataclass
+from typing import Any
 
 from skillweave.errors import RunError
 from skillweave.paths import names_in
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.files import read_json, write_json
+from skillweave.runs.files import read_json, record_in, write_json
 from skillweave.runs.hub import must_be_own
 from skillweave.runs.trackers import steps_of, trackers_of
-from skillweave.schema import Count, fit
+from skillweave.schema import Count
 from skillweave.training.evaluation import Evaluation
 
 SCORE = "evaluation.json"
@@ -26,28 +26,20 @@ CHARTS = {"usage": "share", "call_length": "length_mean", "success": "success_ra
 """Charts of each skill for trackers, and the key of its report that each shows."""
 
 
-class EvaluationFile(TypedDict):
-    """Content of the file."""
+@dataclass(frozen=True)
+class SavedEvaluation:
+    """An evaluation that was saved in a run: the content of its file."""
 
-    run: NotRequired[str]
     made: str
     seed: Count
     deterministic: bool
     evaluation: Evaluation
-
-
-@dataclass(frozen=True)
-class SavedEvaluation:
-    """An evaluation that was saved in a run."""
-
-    made: str
-    seed: int
-    deterministic: bool
-    evaluation: Evaluation
+    run: str | None = None
+    """The run's ``id``."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary as plain JSON, with time, seed and kind of the evaluation."""
-        header = {"made": self.made, "seed": self.seed, "deterministic": self.deterministic}
+        header = {k: value for k, value in vars(self).items() if k != "evaluation"}
         return header | self.evaluation.to_json()
 
 
@@ -63,16 +55,9 @@ def save_evaluation(
             the run is one of ``from_hub``.
     """
     must_be_own(run.path)
-    content = EvaluationFile(
-        made=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        seed=seed,
-        deterministic=deterministic,
-        evaluation=evaluation,
-    )
-    if "id" in run.manifest:
-        content["run"] = run.manifest["id"]
-    plain = {**content, "evaluation": asdict(evaluation)}
-    write_json(run.path / _name(deterministic), plain, make_directories=False)
+    made = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    saved = SavedEvaluation(made, seed, deterministic, evaluation, run.manifest.id)
+    write_json(run.path / _name(deterministic), saved, make_directories=False)
     _track(run, evaluation)
 
 
@@ -105,12 +90,10 @@ def load_evaluation(run: RunDirectory, *, deterministic: bool = True) -> SavedEv
     path = run.path / _name(deterministic)
     if not path.exists():
         return None
-    content: EvaluationFile = read_json(path, lambda data: fit(EvaluationFile, data, str(path)))
-    names = {entry.name for entry in run.manifest.get("skills", [])}
-    ours = content.get("run") == run.manifest.get("id")
-    top_level = {names_in(name)[0] for name in content["evaluation"].skills}
-    if not ours or not top_level <= names:  # a ready hierarchy's own skills are not the run's
+    saved: SavedEvaluation = read_json(path, lambda data: record_in(SavedEvaluation, data, path))
+    names = {entry.name for entry in run.manifest.skills}
+    top_level = {names_in(name)[0] for name in saved.evaluation.skills}
+    # A ready hierarchy's own skills are not the run's.
+    if saved.run != run.manifest.id or not top_level <= names:
         raise RunError(f"{path} belongs to another run; delete it, and evaluate again")
-    return SavedEvaluation(
-        content["made"], content["seed"], content["deterministic"], content["evaluation"]
-    )
+    return saved

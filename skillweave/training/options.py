@@ -7,11 +7,8 @@ its help everywhere. This module imports nothing, so that help is instant.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
-
-RECORDED: dict[str, Any] = {"recorded": True}
-"""Metadata of an option that a run records in its manifest."""
+from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +31,7 @@ class Starting:
     overwrite: bool = False
     """Replace the run in this directory, also a finished one; not with resume. Files there that no
     run writes stay."""
-    seed: int = field(default=0, metadata=RECORDED)
+    seed: int = 0
     """The root of every random stream."""
 
 

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 
+from skillweave.algorithms.policy import AgentPolicy
+from skillweave.collecting.acting import Acting, Request
 from skillweave.collecting.collector import RETURN, SUCCESS, Collector
+from skillweave.envs.checks import longest_evaluation
+from skillweave.envs.engine import Engine, GymnasiumEngine, RawStep, episode_seed
+from skillweave.envs.infos import allowed_rows
 from skillweave.errors import SkillweaveError, reworded
-from skillweave.seeding import Seeds
+from skillweave.ops.threads import torch_threads
+from skillweave.seeding import Seeds, global_generators
 from skillweave.training.learner import crossed
 from skillweave.training.learning_task import LearningTask
 from skillweave.types import Array
@@ -44,13 +51,11 @@ class PeriodicEvaluation:
         self.after = 0.0
         """Seconds of the training before it."""
         self._arena: Collector | None = None
-        if every is not None:
-            self._arena = self._make_arena(learning_task, min(episodes, num_envs))
-
-    @staticmethod
-    def _make_arena(learning_task: LearningTask, num_envs: int) -> Collector:
+        if every is None:
+            return
+        num_envs = min(episodes, num_envs)
         try:
-            return learning_task.collector(num_envs, None)
+            self._arena = learning_task.collector(num_envs, None)
         except SkillweaveError as error:
             raise reworded(
                 error,
@@ -104,3 +109,72 @@ class PeriodicEvaluation:
         """Release the environments."""
         if self._arena is not None:
             self._arena.close()
+
+
+def episodes_of(
+    policy: AgentPolicy,
+    eval_envs: Collector,
+    seeds: Seeds,
+    first: int = 0,
+    count: int | None = None,
+) -> Array:
+    """Play one greedy episode in each environment; return rows like ``Collected.episodes``.
+
+    Args:
+        first: the number of the first episode. An episode's start depends on its number alone, so
+            several rounds in few environments have the same starts as one round in many.
+        count: the number of environments, the first of ``eval_envs``; None: all.
+
+    Returns:
+        (n, 4), n at least 1; environments in which a skill could never start are left out.
+    """
+    algorithm, engine = policy.algorithm, eval_envs.engine
+    if first or count not in (None, eval_envs.num_envs):
+        engine = cast(Engine, _Round(engine, first, count or eval_envs.num_envs))
+    # Each round has its own random streams.
+    acting_seeds, global_seeds = (
+        seeds / k / first if first else seeds / k for k in ("act", "global")
+    )
+    player = eval_envs.like(engine, Acting([(algorithm, 1)], engine.num_envs))
+    params = algorithm.acting_params_of(policy.weights)
+    gamma = np.array([algorithm.config.gamma])
+    request = Request(0, (params,), gamma, acting_seeds, greedy=True)
+    longest = longest_evaluation(engine.time_limit)
+    # Several threads wait for each other, forever on a busy machine.
+    with torch_threads(1), global_generators(global_seeds):
+        episodes: Array = player.play(request, seeds / "start", longest)
+    has_started: Array = ~np.isnan(episodes[:, RETURN])
+    return episodes[has_started]
+
+
+class _Round:
+    """The first ``num_envs`` environments of an engine, for episodes from number ``first`` on.
+
+    Where environments take seeds, episodes start as in an engine that has one environment for
+    each. Pools take none.
+    """
+
+    def __init__(self, engine: Engine, first: int, num_envs: int) -> None:
+        self._engine = engine
+        self._first = first
+        self.num_envs = num_envs
+        self._rows = np.arange(num_envs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._engine, name)
+
+    def reset(self, seed: int) -> Array:
+        """Start the episodes from one seed; return observations (num_envs, *obs_shape)."""
+        engine, first = self._engine, self._first
+        if not isinstance(engine, GymnasiumEngine):
+            return engine.reset((Seeds(seed) / first).integer())[: self.num_envs]
+        seeds = [episode_seed(seed, first + row, 0) for row in range(self.num_envs)]
+        return engine.reset_some(self._rows, seeds)
+
+    def step(self, action: Array, ids: Array | None = None) -> RawStep:
+        """Act in environments ``ids``; None: in all of this round."""
+        return self._engine.step(action, self._rows if ids is None else ids)
+
+    def mask(self) -> Array | None:
+        """Return the allowed actions (num_envs, A) bool; None: all are, always."""
+        return allowed_rows(self._engine.mask(), self._rows)

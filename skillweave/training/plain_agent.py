@@ -16,6 +16,7 @@ from skillweave.envs.make import EnvSpec, Spaces
 from skillweave.paths import AGENT
 from skillweave.runs.command_words import Caller
 from skillweave.runs.directory import RunDirectory
+from skillweave.runs.manifest import Manifest
 from skillweave.schema import AtLeastOne, Share, check_fields
 from skillweave.spaces import action_codec
 from skillweave.training.checks import EnvValue, check_env, check_rollout
@@ -140,7 +141,7 @@ class PlainAgent(Declared):
             )
         ]
 
-    def manifest(self, seed: int, how: TrainDefaults | None = None) -> dict[str, Any]:
+    def manifest(self, seed: int, how: TrainDefaults | None = None) -> Manifest:
         """Return the content of a new run's ``run.json``, for this ``seed``.
 
         ``how``: evaluation and checkpoints; None: ``train_defaults``.
@@ -148,19 +149,18 @@ class PlainAgent(Declared):
         how = how or self.train_defaults
         (stage,) = self.stages()
         code = stage.acts_by_code or not self.spec.is_data
-        return {
-            "kind": "agent",
-            "env": self.spec.name,
-            "env_kwargs": self.spec.json_kwargs,
-            "code": environment_texts(self.spec),
-            "seed": seed,
+        return Manifest(
+            env=self.spec.name,
+            env_kwargs=self.spec.json_kwargs,
+            code=environment_texts(self.spec),
+            seed=seed,
+            stages=[stage.entry()],
+            needs_recipe=code,
+            resume_needs_recipe=code or stage.learns_by_code or self.spec.engine != "auto",
             **how.entries(Reports),
-            "needs_recipe": code,
-            "resume_needs_recipe": code or stage.learns_by_code or self.spec.engine != "auto",
-            "stages": [stage.entry()],
-        }
+        )
 
 
 def load_agent_of(run: RunDirectory) -> AgentPolicy:
     """Return the policy of a finished run of a plain agent."""
-    return run.load_policy(run.manifest["stages"][0].name)
+    return run.load_policy(run.manifest.stages[0].name)

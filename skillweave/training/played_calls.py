@@ -1,9 +1,9 @@
-"""The calls of episodes that are played, for evaluations and reports."""
+"""The calls of played episodes, for evaluations and reports, and these episodes themselves."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -14,13 +14,15 @@ from skillweave.collecting.skill_set import SkillSet, skills_below
 from skillweave.envs.make import EnvSpec
 from skillweave.paths import AGENT, join, level_of, names_in
 from skillweave.planning.calls import CallLog
-from skillweave.planning.recorder import Recorder, TraceFeed, calls_in, goals_in, levels_below
+from skillweave.planning.columns import GOAL, OF_CALL
+from skillweave.planning.recorder import SUMS, Recorder, TraceFeed, calls_in, goals_in, levels_below
 from skillweave.policies.core import EPISODE, LIMIT, OWN, RUNNING, end_with_episode
 from skillweave.policies.parts import OWN_GOAL
 from skillweave.skills import Reflex, Skill, asked
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.goal_spaces import shown_goal
 from skillweave.training.play import Played
-from skillweave.types import Memory, Policy
+from skillweave.types import Array, Memory, Policy
 
 WAITS, IS_DONE = -1, -2
 """In place of the steps of the call of a skill that acts alone."""
@@ -105,6 +107,14 @@ class PlayedCalls:
             for calls in levels.values():
                 calls["start"] = starts | (calls["elapsed"] == 1)
         self._feed.add(played.rows, step, levels)
+
+    def skills(self, path: str = "") -> dict[str, Skill]:
+        """Return the skills of a level and of those below it, by path: each before its own."""
+        found = {}
+        for skill in self._levels[path][0].skills:
+            found[name := join(path, skill.name)] = skill
+            found |= self.skills(name) if name in self._levels else {}
+        return found
 
     def recorders(self) -> dict[str, Recorder]:
         """Return the recorder of each level, by its path; all steps so far are recorded."""
@@ -198,3 +208,72 @@ class PlayedCalls:
                 holds = np.flatnonzero(reflex.holds(played.step.obs[rows]) & ~acted[rows])
                 self.reflexes[self._named_at(path, reflex)] += len(holds)
                 acted[rows[holds]] = True
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode, with all that it takes to play it again."""
+
+    seed: int
+    actions: Array  # (T, *action_shape)
+    rewards: Array  # (T,) float32, the environment's
+    calls: Array
+    """(C,) rows in the order of their starts; see ``PlayedEpisodes``."""
+    cut: bool = False
+    """True if it was cut at the step limit without an end."""
+
+    @property
+    def total(self) -> float:
+        """Its return."""
+        return float(self.rewards.sum(dtype=np.float64))
+
+
+class PlayedEpisodes:
+    """Episodes that were played, call by call: those of the skills that are no hierarchies.
+
+    A call is a row of its recorder, with ``skill``, a row of ``labels``, and ``goal``, its goal in
+    words, empty where it has none; without the numbers of goals and ``may_follow``. The whole
+    episode of a plain agent is a call.
+
+    Args:
+        played: with the skills' own rewards.
+        seeds: of the episodes, in order.
+    """
+
+    def __init__(self, played: PlayedCalls, seeds: Sequence[int]) -> None:
+        recorders = played.recorders()
+        leaves = {k: skill for k, skill in played.skills().items() if k not in recorders}
+        self.labels = tuple(leaves)
+        self.skills = tuple(leaves.values()) if played.declared else ()
+        self.judged = tuple(skill.defines("success") for skill in leaves.values())
+        """Of each label, whether its skill defines ``success``."""
+        log = recorders[""].log()
+        episode = log.episode[log.owner]
+        rows = np.lexsort((log.age[log.owner] + log.elapsed, episode))
+        numbers = np.arange(1, len(seeds))
+        steps = np.split(rows, np.searchsorted(episode[rows], numbers))
+        calls = np.concatenate([_level_calls(*level, self.labels) for level in recorders.items()])
+        calls = calls[np.lexsort((calls["age"], calls["episode"]))]
+        split = np.split(calls, np.searchsorted(calls["episode"], numbers))
+        self.episodes = [
+            Episode(seed, log.action[of], log.reward[of], split[i], i in played.cut)
+            for i, (seed, of) in enumerate(zip(seeds, steps, strict=True))
+        ]
+
+
+def _level_calls(path: str, recorder: Recorder, labels: Sequence[str]) -> Array:
+    """Return the calls of one level, as in ``PlayedEpisodes``."""
+    rows = recorder.rows()
+    kept = [(name, rows.dtype[name]) for name in (*dict((*SUMS, *OF_CALL)), "start")]
+    calls = np.zeros(len(rows), [*kept, ("skill", np.int64), ("goal", object)])
+    for name, _ in kept:
+        calls[name] = rows[name]
+    calls["skill"], calls["goal"] = -1, ""
+    for i, skill in enumerate(recorder.skills.skills):
+        if (name := join(path, skill.name)) in labels:
+            mine = np.flatnonzero(recorder.skills.skill_of(rows["choice"]) == i)
+            calls["skill"][mine] = labels.index(name)
+            if (goals := recorder.goals.get(skill.name)) is not None:
+                numbers = rows[GOAL + skill.name][mine]
+                calls["goal"][mine] = [*map(shown_goal, goals.space.of_numbers(numbers))]
+    return calls[calls["skill"] >= 0]

@@ -1,13 +1,14 @@
-"""Reports of a policy's skills in an evaluation: their steps, calls, ends and rewards."""
+"""Reports of a policy's skills in an evaluation (steps, calls, ends, rewards), and text on them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from skillweave.messages import aligned
 from skillweave.paths import join, level_of
 from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import Handover, pair_counts
@@ -16,6 +17,7 @@ from skillweave.policies.core import CallEnd
 from skillweave.schema import Count
 from skillweave.skills import is_trained
 from skillweave.skills.base import RecordedSkill
+from skillweave.skills.learnable import learn_on
 from skillweave.training.played_calls import PlayedCalls
 from skillweave.types import Array
 
@@ -98,11 +100,8 @@ def skill_reports(calls: PlayedCalls) -> dict[str, SkillReport]:
     """
     found: dict[str, SkillReport] = {}
     for recorder in calls.recorders().values():
-        reports = _level_reports(calls, recorder)
-        place = [*found].index(join(calls.prefix, recorder.path)) + 1 if recorder.path else 0
-        items = [*found.items()]
-        found = dict([*items[:place], *reports.items(), *items[place:]])
-    return found
+        found |= _level_reports(calls, recorder)
+    return {name: found[name] for path in calls.skills() if (name := join(calls.prefix, path))}
 
 
 def _level_reports(calls: PlayedCalls, recorder: Recorder) -> dict[str, SkillReport]:
@@ -173,7 +172,7 @@ def _with_before(recorder: Recorder) -> tuple[Array, Array, Array]:
     """
     rows = recorder.rows()
     rows = rows[np.lexsort((rows["order"], rows["episode"]))]
-    skill = rows["choice"] // max(1, len(recorder.skills.lengths))
+    skill = recorder.skills.skill_of(rows["choice"])
     goes_on = rows["episode"] == np.roll(rows["episode"], 1)
     goes_on[:1] = False
     return rows, skill, np.where(goes_on, np.roll(skill, 1) + 1, 0)
@@ -196,3 +195,204 @@ def all_steps(skills: Mapping[str, SkillReport]) -> int:
     """Return the environment steps of all skills, each step counted once."""
     top = [name for name in skills if level_of(name) not in skills]
     return sum(skills[name].steps for name in top)
+
+
+TITLES = ("skill", "share", "calls", "length", *ENDS.values(), "success", "return")
+"""Titles of a table of skills, whose rows ``cells_of`` returns."""
+
+
+def _percent(value: float | None) -> str:
+    return "–" if value is None else f"{value:.0%}"
+
+
+def _number(value: float | None, scale: float | None = None) -> str:
+    return "–" if value is None else f"{value:,.1f}"
+
+
+Words = tuple[Callable[[float | None], str], Callable[..., str], str]
+"""Functions that write a share, and a number to the scale of those beside it; and words after the
+share of calls that ended by themselves in the episode's last step."""
+IN_TEXT: Words = (_percent, _number, "last step")
+
+
+def skill_rows(skills: Mapping[str, SkillReport], words: Words = IN_TEXT) -> list[dict[str, Any]]:
+    """Return a row for each skill, in words but for ``share``, a number."""
+    percent, number, _ = words
+    total = all_steps(skills)
+    longest = max([10, *(report.length_mean or 0 for report in skills.values())])
+    return [
+        {
+            "name": name,
+            "share": (share := report.steps / total if total else 0.0),
+            "percent": percent(share),
+            "calls": f"{report.calls:,}",
+            "length": number(report.length_mean, longest),
+            "ends": end_cells(report.ended, report.own_with_episode, report.calls, words),
+            "success": percent(report.success_rate),
+            "return": number(report.return_mean),
+        }
+        for name, report in skills.items()
+    ]
+
+
+def end_cells(
+    reasons: Mapping[str, int], own_with_episode: int, calls: int, words: Words
+) -> list[str]:
+    """Return the shares of the ends of calls; without ``reasons`` or calls, they are unknown."""
+    percent, _, last = words
+    cells = [percent(reasons[why] / calls if reasons and calls else None) for why in ENDS.values()]
+    if own_with_episode:
+        cells[0] += f" ({percent(own_with_episode / calls)} {last})"
+    return cells
+
+
+def cells_of(row: Mapping[str, Any]) -> list[str]:
+    """Return the cells of a row of ``skill_rows``, in the order of ``TITLES``."""
+    parts = (row["name"], row["percent"], row["calls"], row["length"])
+    return [*parts, *row["ends"], row["success"], row["return"]]
+
+
+def skill_table(skills: Mapping[str, SkillReport]) -> str:
+    """Return the reports as an aligned table for people, a line for each skill."""
+    return aligned([TITLES, *map(cells_of, skill_rows(skills))], left=1)
+
+
+def call_line(name: str, report: SkillReport) -> str:
+    """Return a part of a sentence on the calls of a skill that acts alone."""
+    if not report.calls:
+        return f"{name} could start nowhere by its initiation()"
+    results = []
+    if report.return_mean is not None:
+        results.append(f"{report.return_mean:,.1f} by its own reward")
+    if report.success_rate is not None:
+        results.append(f"{report.success_rate:.0%} succeed")
+    called = f"{name} alone: {report.calls:,} calls of {report.length_mean:,.0f} steps"
+    return ", ".join([called, *results])
+
+
+def hints(skills: Mapping[str, SkillReport]) -> list[str]:
+    """Return a sentence on each probable mistake."""
+    return [*idle_calls(skills), *late_calls(skills), *hasty_calls(skills)]
+
+
+def reflex_lines(reflexes: Mapping[str, int], total: int) -> list[str]:
+    """Return a line for each reflex, with the share of ``total`` steps in which it acted."""
+    return [
+        f"reflex {name} acted in {steps:,} of {total:,} steps ({steps / total:.1%})"
+        for name, steps in reflexes.items()
+    ]
+
+
+def idle_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """Return a sentence on each skill with mostly idle calls, while its others take time.
+
+    A skill whose calls all take a step or two, as a move does, is left out; so is one that could
+    not be kept from starting: it has goals, or is the only one.
+    """
+    sentences = []
+    levels = [level_of(name) for name in skills]
+    for name, report in skills.items():
+        others = report.calls - report.idle
+        if report.has_goals or levels.count(level_of(name)) == 1:
+            continue
+        if report.idle > others and report.steps - report.idle > 2 * others:
+            sentences.append(
+                f"{report.idle:,} of {report.calls:,} calls of {name!r} ended after one step, "
+                "right after a call of it had ended. If its work is done there, let its "
+                "initiation() be False there; some other skill must be able to start."
+            )
+    return sentences
+
+
+def late_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """Return a sentence on each skill with a quarter of its calls late, or more."""
+    return [
+        f"{report.late:,} of {report.calls:,} calls of {name!r} went on to their limit after they "
+        "had succeeded. If its work is done then, let its termination() be True where success() "
+        "is; if it is meant to last, give it max_steps."
+        for name, report in skills.items()
+        if 4 * report.late >= report.calls > 0
+    ]
+
+
+def hasty_calls(skills: Mapping[str, SkillReport]) -> list[str]:
+    """Return a sentence on each skill with half of its calls hasty, or more.
+
+    A move of one step with its own cost is included.
+    """
+    sentences = []
+    for name, report in skills.items():
+        if 2 * report.hasty >= report.calls > 0:
+            failed = "" if report.succeeded is None else ", without success"
+            sentences.append(
+                f"{report.hasty:,} of {report.calls:,} calls of {name!r} ended by its "
+                f"termination() within two steps{failed}, and their last reward was below 0. "
+            )
+            if report.learns:
+                sentences[-1] += (
+                    "Where a step costs and an end pays nothing, it is best to end at once: pay "
+                    "for success, or let success alone end it."
+                )
+            else:
+                sentences[-1] += "Let success alone end it."
+            if not report.has_goals:
+                sentences[-1] += (
+                    " If it was called where its work was done, let its initiation() be False "
+                    "there."
+                )
+    return sentences
+
+
+def useless_skills(
+    skills: Mapping[str, SkillReport], episodes: int, *, selector_learns: bool
+) -> list[str]:
+    """Return a sentence on each skill that was never called, or whose calls never succeeded.
+
+    Args:
+        episodes: the number of episodes that were played.
+        selector_learns: False: it is ready, so no setting changes what it chooses.
+    """
+    sentences = []
+    for name, report in skills.items():
+        if not report.calls:
+            further = ", give it more steps" if report.learns else ""
+            further += (
+                ", or raise together.epsilon_final"
+                if selector_learns
+                else ", or let the selector choose it"
+            )
+            sentences.append(
+                f"Skill {name!r} was never chosen in {episodes} episodes. If the task needs it, "
+                f"see that its initiation() is True where the other skills end{further}; else "
+                "leave it out."
+            )
+        elif report.succeeded == 0:
+            advice = (
+                "Give it more steps or longer calls (call_steps), or a reward that leads there"
+                if report.learns
+                else f"Give it longer calls (call_steps), or let it learn: {learn_on(name)}"
+            )
+            sentences.append(
+                f"None of {report.calls:,} calls of skill {name!r} ended with success() true. "
+                f"{advice}."
+            )
+    return sentences
+
+
+def stuck_selector(exploring: float, alone: float, skills: Mapping[str, SkillReport]) -> str:
+    """Return a sentence on a selector that did clearly better while it explored.
+
+    Args:
+        exploring: mean return of the latest training episodes.
+        alone: the best mean return without choices at random.
+        skills: of episodes with a greedy selector.
+    """
+    name, report = max(skills.items(), key=lambda item: item[1].calls)
+    share = report.calls / max(1, sum(one.calls for one in skills.values()))
+    done = "" if report.has_goals else "let its initiation() be False where its work is done, "
+    return (
+        "The latest training episodes, with some calls chosen at random, had a mean return of "
+        f"{exploring:.4g}; without such calls the best is {alone:.4g}. A greedy selector calls "
+        f"{name!r} in {share:.0%} of its decisions, for {report.length_mean or 0.0:.1f} steps "
+        f"each: {done}let each call cost a little (Selection(call_cost=0.001)), or give more steps."
+    )

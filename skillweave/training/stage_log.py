@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from skillweave.runs.directory import LINES, RunDirectory
 from skillweave.runs.initial_policies import remove_initial_policies
 from skillweave.runs.manifest import Best, Checkpoint, Reached, StageEntry, Stopped
 from skillweave.runs.states import drop_states, learns_again, save_state
+from skillweave.runs.trackers import Listener
 from skillweave.training.callback import TrainCallback
 from skillweave.training.episodes import EpisodeTally
 from skillweave.training.keep_best import KeepBest
@@ -30,26 +31,6 @@ SLOW_SECONDS = 10.0
 T = TypeVar("T")
 LARGEST_SPARE = 100 * 2**20
 """Most bytes of replay buffers that a finished stage keeps; without them it fills new ones."""
-
-
-class Listener(Protocol):
-    """Receiver of training's events: a progress bar, TensorBoard, Weights & Biases."""
-
-    def stage(self, name: str, budget: int) -> None:
-        """Handle the start of a stage, or its continuation."""
-        ...
-
-    def tick(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Handle the report of an update."""
-        ...
-
-    def done(self, name: str, steps: int, seconds: float, metrics: dict[str, float]) -> None:
-        """Handle the end of a stage."""
-        ...
-
-    def message(self, text: str) -> None:
-        """Show a message to people."""
-        ...
 
 
 def success_rate(entry: StageEntry | None) -> float:

@@ -48,7 +48,7 @@ class StageRun:
 
     def stages_before(self, name: str) -> list[StageEntry]:
         """Return the entries of finished stages in which a learner has learnt."""
-        stages = self.run.manifest["stages"]
+        stages = self.run.manifest.stages
         return [s for s in stages if name in s.learns and s.done]
 
     def steps_before(self, name: str) -> int:
@@ -79,7 +79,7 @@ class StageRun:
     def best(self) -> KeepBest:
         """A new store of the best weights."""
         of = "return" if self.target is None else self.target.of
-        return KeepBest(of, self.run.manifest.get("keep") == "best")
+        return KeepBest(of, self.run.manifest.keep == "best")
 
 
 class StageLearner(Protocol):

@@ -19,22 +19,25 @@ from skillweave.collecting.group import MakeCollector
 from skillweave.collecting.interrupts import deferred
 from skillweave.collecting.placement import MakeCollectors, make_collectors
 from skillweave.errors import DeclarationError
+from skillweave.notices import notice
 from skillweave.ops.device import resolve_device
+from skillweave.paths import names_in
+from skillweave.planning.recorder import Recorder
+from skillweave.planning.run_log import save_calls
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.initial_policies import initial_policy, remove_initial_policies
 from skillweave.runs.manifest import Checkpoint, StageEntry
+from skillweave.runs.trackers import Listener
 from skillweave.seeding import Seeds, global_generators, seed_global_generators
 from skillweave.training.episodes import Episodes, Tick
-from skillweave.training.eval_envs import episodes_of
 from skillweave.training.learner import Learner, Stack, keep_to_guide
 from skillweave.training.learning_task import LearningTask
-from skillweave.training.logged_calls import begin_calls, save_logged
 from skillweave.training.loop import Progress, Saved, begin_episodes, resume, train
-from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 from skillweave.training.rehearsal import rehearse, remove_rehearsal
 from skillweave.training.replay_learner import ReplayLearner, learner_of
 from skillweave.training.stage import Policies, Stage
-from skillweave.training.stage_log import Listener, StageLog, resumed
+from skillweave.training.stage_log import StageLog, resumed
 from skillweave.training.stage_run import MakeLearner, StageRun, begin_as
 from skillweave.types import Array, Policy, prefixed, unprefixed
 
@@ -60,8 +63,6 @@ class OneAgent:
         """Make the environments and the agent; return the agent's state."""
         stage, config, learning_task = self.stage, self.stage.config, self.stage.learning_task
         manifest = stage.run.manifest
-        every = manifest.get("eval_every")
-        episodes = manifest.get("eval_episodes", 0)
         fresh = self.make_agents()
         workers = stage.entry.workers
         make = partial(_seeded, self.maker(), stage.seeds / "global")
@@ -70,7 +71,11 @@ class OneAgent:
         )
         self._resources.callback(self.collectors.close)
         self.evaluation = PeriodicEvaluation(
-            learning_task, stage.seeds, every, episodes, config.num_envs
+            learning_task,
+            stage.seeds,
+            manifest.eval_every,
+            manifest.eval_episodes,
+            config.num_envs,
         )
         self._resources.callback(self.evaluation.close)
         self.episodes = Episodes(learning_task.log_info)
@@ -214,7 +219,7 @@ class OneAgent:
                 self.stage.seeds,
                 self.stage.budget,
                 resume_from=self.at,
-                checkpoint_every=int(self.stage.run.manifest["checkpoint_every"]),
+                checkpoint_every=self.stage.run.manifest.checkpoint_every,
                 on_tick=on_tick,
                 on_checkpoint=on_checkpoint,
                 on_calls=None if self.stage.recorder is None else self.stage.recorder.add,
@@ -319,9 +324,9 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
         remove_initial_policies(run, stage.name)  # the run may have been killed just before
         remove_rehearsal(run, entry)
         return run.load_policies(stage.name)
-    seeds = Seeds(int(run.manifest["seed"])) / stage.name
+    seeds = Seeds(run.manifest.seed) / stage.name
     learning_task = stage.learning_task(earlier)
-    if keys := run.manifest.get("log_info"):
+    if keys := run.manifest.log_info:
         learning_task = replace(learning_task, log_info=tuple(keys))
     learning_task, recorder = begin_calls(run, entry, learning_task)
     learner = course.make_learner(StageRun(entry, run, seeds, learning_task, earlier, recorder))
@@ -344,3 +349,43 @@ def train_stage(stage: Stage, course: Course, earlier: Policies) -> dict[str, Ag
     if recorder is not None:
         save_logged(run, entry, recorder, policies)
     return policies
+
+
+def begin_calls(
+    run: RunDirectory, entry: StageEntry, learning_task: LearningTask
+) -> tuple[LearningTask, Recorder | None]:
+    """Return a stage's task, and the recorder of its calls; None: no calls are logged."""
+    steps, called = run.manifest.log_calls, learning_task.called
+    if steps is None or called is None:
+        return learning_task, None
+    info, num_envs = run.manifest.log_calls_info, entry.num_envs
+    spaces = called.spec.spaces.observation, called.spec.spaces.action
+    recorder = Recorder(called.skills, spaces, num_envs, info=info, latest=steps, spec=called.spec)
+    return replace(learning_task, log_calls=info), recorder
+
+
+def save_logged(
+    run: RunDirectory, entry: StageEntry, recorder: Recorder, policies: Mapping[str, Policy]
+) -> None:
+    """Write the calls of a finished stage into its run.
+
+    Args:
+        policies: that the stage has trained, by path.
+    """
+    skills = recorder.skills
+    learning = {names_in(path)[0] for path in entry.learns} & {s.name for s in skills.skills}
+    recorder.skills = replace(
+        skills,
+        policies=tuple(
+            policies.get(skill.name, policy)
+            for skill, policy in zip(skills.skills, skills.policies, strict=True)
+        ),
+    )
+    log = recorder.log(learning)
+    if len(log):
+        save_calls(run, log)
+    else:
+        notice(
+            f"stage {entry.name!r}: no whole call was recorded in the latest "
+            f"{recorder.latest:,} steps (log_calls), so the run has no log of them"
+        )

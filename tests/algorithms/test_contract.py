@@ -37,13 +37,13 @@ from skillweave.algorithms.config import (
     OnPolicy,
     SelfImitationPPO,
 )
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.algorithms.ppo import PPOAlgorithm, next_values
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.learners import Alone
 from skillweave.errors import DeclarationError, RunError
 from skillweave.networks.config import CNN, RNN, Network
-from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.seeding import Seeds
 
 # The table: an algorithm's settings, what it sees, how it acts, how long it learns
@@ -200,7 +200,8 @@ def test_a_policy_in_a_file_acts_as_it_did(case, tmp_path):
     algorithm, state, env = case.learn()
     policy = AgentPolicy.of(algorithm, state)
     write_tensors(tmp_path / "agent", *policy.to_file())
-    loaded = AgentPolicy.from_file(*read_tensors(tmp_path / "agent"), "agent")
+    tensors, header = read_tensors(tmp_path / "agent")
+    loaded = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, "agent"), "agent")
     assert loaded.observation_space == policy.observation_space
     assert loaded.action_space == policy.action_space
     obs = env.show(np.arange(8) % 4)

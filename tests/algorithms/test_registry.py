@@ -16,11 +16,11 @@ from toys import Countdown, Echo, Masked, learn, own_algorithm as example
 from skillweave import PPO, SAC, Apart, Hierarchy, Network, Skill, train_agent
 from skillweave.algorithms import Algorithm, config as table, register_algorithm
 from skillweave.algorithms.config import OnPolicy, config_from_json, config_to_json, named_config
-from skillweave.algorithms.policy import AgentPolicy
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy
 from skillweave.algorithms.registry import make_algorithm
 from skillweave.errors import DeclarationError, RunError
 from skillweave.evolution import Evolution, Mutations
-from skillweave.runs.files import read_tensors, write_tensors
+from skillweave.runs.files import read_tensors, record_in, write_tensors
 from skillweave.seeding import Seeds
 
 BOX, LINE = gym.spaces.Box(-1, 1, (2,), np.float32), gym.spaces.Discrete(2)
@@ -53,7 +53,8 @@ def test_it_learns_to_answer_what_it_sees_and_its_file_acts_the_same(asks, updat
     action, _ = policy.act({}, env.show(shown))
     assert env.error(shown, action).mean() < 0.1
     write_tensors(tmp_path / "agent", *policy.to_file())
-    loaded = AgentPolicy.from_file(*read_tensors(tmp_path / "agent"), "agent")
+    tensors, header = read_tensors(tmp_path / "agent")
+    loaded = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, "agent"), "agent")
     assert np.array_equal(loaded.act({}, env.show(shown))[0], action)
 
 

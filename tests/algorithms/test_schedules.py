@@ -29,7 +29,8 @@ from skillweave.algorithms.policy import make_algorithm
 from skillweave.cli.overrides import apply_overrides
 from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution, Mutations, Range
-from skillweave.runs.manifest import as_json, read_manifest
+from skillweave.runs.manifest import read_manifest
+from skillweave.schema import as_json
 from skillweave.seeding import Seeds
 
 KINDS = (PPO, SelfImitationPPO, SkillCritic, DQN, SAC, TD3)
@@ -157,7 +158,7 @@ def test_a_stopped_run_has_the_same_rates_as_one_that_was_not(tmp_path, config, 
     assert rates
     assert all(schedule(0.0) <= rate <= schedule(1.0) * 1.0001 for rate in rates)
     assert rates[0] > rates[len(rates) // 2 - 1]
-    assert read_manifest(run.path)["resume_needs_recipe"]  # of the skill in any case
+    assert read_manifest(run.path).resume_needs_recipe  # of the skill in any case
 
 
 def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, monkeypatch):
@@ -165,7 +166,7 @@ def test_a_plain_agents_function_is_needed_to_resume_and_not_to_load(tmp_path, m
         config = replace(ON, learning_rate=rate)
         run = sw.train_agent("CartPole-v1", config, 100, tmp_path / str(needs), quiet=True)
         manifest = read_manifest(run.path)
-        assert (manifest["resume_needs_recipe"], manifest["needs_recipe"]) == (needs, False)
+        assert (manifest.resume_needs_recipe, manifest.needs_recipe) == (needs, False)
     from skillweave import named
 
     monkeypatch.setattr(named, "_KNOWN", {})

@@ -436,7 +436,7 @@ def test_where_a_run_is_needed_its_result_does_not_count_before_it_is_over(tmp_p
     first = suite().tasks[0]
     assert bench._found(first, FLAT, 512, keep=True) is not None
     stages = [SimpleNamespace(done=True), SimpleNamespace(done=False)]
-    half = SimpleNamespace(manifest={"stages": stages})
+    half = SimpleNamespace(manifest=SimpleNamespace(stages=stages))
     with monkeypatch.context() as changed:
         changed.setattr(agents.RunDirectory, "open", lambda path: half)
         assert bench._found(first, FLAT, 512, keep=True) is None

@@ -6,10 +6,9 @@ import itertools
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-from small_runs import stage_entry
+from small_runs import small_manifest, stage_entry
 
 from skillweave import Hierarchy, Skill
 from skillweave.cli.main import main
@@ -99,7 +98,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_recipe_evolves_and_says_how_it_went(run: Path):
-    stages = {p.name: p for p in RunDirectory.open(run).manifest["stages"]}
+    stages = {p.name: p for p in RunDirectory.open(run).manifest.stages}
     assert {n: p.budget for n, p in stages.items()} == {
         "left": 3 * 128, "right": 2 * 128, "selector": 3 * 128,
     }  # fmt: skip
@@ -148,7 +147,7 @@ def test_a_run_without_populations_shows_how_its_agents_learnt(tmp_path):
 
 def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
     stage = stage_entry("inner/hop")
-    directory = RunDirectory.create(tmp_path / "run", {"kind": "hierarchy", "stages": [stage]})
+    directory = RunDirectory.create(tmp_path / "run", small_manifest(stage))
     for steps in (100, 200):
         directory.log({"stage": "inner/hop", "steps": steps, "return": 1.0})
     directory.close()
@@ -156,8 +155,7 @@ def test_who_is_below_a_skill_is_drawn_as_well(tmp_path):
 
 
 def test_nothing_to_draw_and_a_damaged_lineage_are_said(run: Path, tmp_path):
-    manifest: dict[str, Any] = dict(RunDirectory.open(run).manifest)
-    empty = RunDirectory.create(tmp_path / "empty", manifest)
+    empty = RunDirectory.create(tmp_path / "empty", RunDirectory.open(run).manifest)
     with pytest.raises(RunError, match="nothing to draw"):
         plot_run(empty)
     (empty.path / "lineage.jsonl").write_text('{"stage": "left"}\n')

@@ -191,12 +191,13 @@ def test_a_checkpoint_is_the_agent_it_was(kind, tmp_path):
 
 
 def test_a_checkpoint_is_a_native_policy(tmp_path):
-    from skillweave.algorithms.policy import AgentPolicy
-    from skillweave.runs.files import read_tensors
+    from skillweave.algorithms.policy import AgentHeader, AgentPolicy
+    from skillweave.runs.files import read_tensors, record_in
 
     agent = KINDS["ppo"]()
     agent.saveCheckpoint(tmp_path / "agent.pt")
-    policy = AgentPolicy.from_file(*read_tensors(tmp_path / "agent.pt"), "agent.pt")
+    tensors, header = read_tensors(tmp_path / "agent.pt")
+    policy = AgentPolicy.from_file(tensors, record_in(AgentHeader, header, "agent.pt"), "agent.pt")
     action, _ = policy.act({}, OBS)
     np.testing.assert_array_equal(action, agent.native.numpy_actor.output(OBS).argmax(-1))
 

@@ -10,7 +10,7 @@ from skillweave.envs.checks import LAST_OBSERVATIONS
 from skillweave.envs.infos import batched_infos, info_numbers, reported_success
 from skillweave.envs.make import make_engine
 from skillweave.planning import Mission
-from skillweave.planning.task import as_task
+from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import Tasked
 
 FORMS = {"one": np.copy, "batch": lambda obs: obs[None], "list": lambda obs: [obs]}

@@ -15,7 +15,7 @@ from torch.distributions import Categorical, Normal
 
 import skillweave as sw
 from skillweave.envs.checks import CheckedEnv
-from skillweave.envs.infos import checked_mask, random_actions
+from skillweave.envs.infos import random_actions
 from skillweave.errors import DeclarationError, EnvError, SkillError
 from skillweave.networks.heads import head_of
 from skillweave.policies.spaces import space_of
@@ -48,13 +48,13 @@ class Masked(Reach):
     def _draw(self) -> Any:
         found = super()._draw()
         if self.form == "flat":
-            self.info = {"action_mask": checked_mask(self.allowed(), self.action_space)}
+            self.info = {"action_mask": space_of(self.action_space).allowed(self.allowed())}
         elif self.form == "parts":
             self.info = {"action_mask": self.allowed()}
         return found
 
     def step(self, action: Any) -> Any:
-        mask = checked_mask(self.allowed(), self.action_space)
+        mask = space_of(self.action_space).allowed(self.allowed())
         assert mask[_numbers(action, self.action_space)].all(), (action, self.steps)
         return super().step(action)
 
@@ -90,7 +90,7 @@ def test_random_actions_are_allowed(kind):
     space, rng = SPACES[kind], np.random.default_rng(0)
     env = Masked(kind, "method")
     env.reset(seed=0)
-    mask = np.tile(checked_mask(env.allowed(), space), (20, 1))
+    mask = np.tile(space_of(space).allowed(env.allowed()), (20, 1))
     for action in random_actions(space, 20, rng, mask):
         assert space.contains(env_form(space, action))
         assert mask[0][_numbers(env_form(space, action), space)].all()
@@ -181,11 +181,11 @@ def test_a_wrong_mask_names_its_part(mask, says, tmp_path):
 def test_a_mask_of_a_tuple_may_be_one_list():
     space = gym.spaces.Tuple((gym.spaces.Discrete(2), gym.spaces.Discrete(3)))
     expected = [True, False, True, True, False]
-    assert checked_mask([1, 0, 1, 1, 0], space).tolist() == expected
-    assert checked_mask([[1, 0], (1, 1, 0)], space).tolist() == expected
-    assert checked_mask((None, [1, 1, 0]), space).tolist() == [True, True, True, True, False]
+    assert space_of(space).allowed([1, 0, 1, 1, 0]).tolist() == expected
+    assert space_of(space).allowed([[1, 0], (1, 1, 0)]).tolist() == expected
+    assert space_of(space).allowed((None, [1, 1, 0])).tolist() == [True, True, True, True, False]
     with pytest.raises(ValueError, match=r"has the parts \['0', '1', '2'\], but .* have '0', '1'"):
-        checked_mask(([1, 0], [1, 1, 1], [1]), space)
+        space_of(space).allowed(([1, 0], [1, 1, 1], [1]))
 
 
 def test_real_numbers_have_no_mask(tmp_path):

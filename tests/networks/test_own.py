@@ -326,9 +326,9 @@ def test_a_run_says_that_it_needs_code_and_loads_with_its_declaration(tmp_path, 
     agent = sw.Agent("CartPole-v1", replace(ON, network=Network((8,), encoder=Features)), 200)
     run = agent.train(tmp_path / "run", quiet=True)
     manifest = read_manifest(run.path)
-    assert manifest["needs_recipe"]
-    assert manifest["resume_needs_recipe"]
-    assert manifest["stages"][0].algorithm["network"]["encoder"] == f"{__name__}:Features"
+    assert manifest.needs_recipe
+    assert manifest.resume_needs_recipe
+    assert manifest.stages[0].algorithm["network"]["encoder"] == f"{__name__}:Features"
     obs = np.ones((2, 4), np.float32)
     want = run.policy.act({}, obs)[0]
     assert np.array_equal(agent.load(run.path).policy.act({}, obs)[0], want)

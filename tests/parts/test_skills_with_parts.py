@@ -16,7 +16,7 @@ from skillweave.errors import DeclarationError, PolicyError, RunError, SkillErro
 from skillweave.evolution import Evolution
 from skillweave.hierarchy.roles import roles_of
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.schema import as_json
 
 often = reports_every(40)
 OFF = {"num_envs": 4, "batch_size": 16, "learning_starts": 20, "buffer_size": 500}

@@ -39,8 +39,8 @@ from skillweave.planning import (
     held,
     record_calls,
 )
+from skillweave.planning.graph import LEVELS, exact_states, planning_states
 from skillweave.planning.neighbors import nearest, tie_order
-from skillweave.planning.states import LEVELS, exact_states, planning_states
 from skillweave.policies.core import CallEnd
 from skillweave.policies.plan import nearest_corner
 from skillweave.selectors import LastCall

@@ -34,7 +34,7 @@ from skillweave.planning import (
     join,
     reached,
 )
-from skillweave.planning.task import as_task
+from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import Tasked, TaskEnv
 
 

@@ -36,7 +36,7 @@ from skillweave.errors import DeclarationError, EnvError, SkillweaveError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.networks.config import RNN, Network
 from skillweave.planning import CallLog, GoalTask, Mission, Planner, held
-from skillweave.planning.task import as_task
+from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import OwnView, Tasked
 from skillweave.policies.core import CallEnd
 from skillweave.selectors import LastCall

@@ -158,7 +158,7 @@ def test_what_a_run_learnt_is_loaded_and_written_to_one_file(tmp_path, whole, ki
 
 def test_skills_learn_where_a_ready_selector_calls_them(whole):
     _, path = whole("automaton")
-    (entry,) = RunDirectory.open(path).manifest["stages"]
+    (entry,) = RunDirectory.open(path).manifest.stages
     assert entry.learns == ["get_key", "open", "skill_critic"]
     told = [name for line in lines(path) for name in line]
     assert "get_key.samples" in told

@@ -101,8 +101,8 @@ def test_skills_are_trained_apart_and_the_selector_is_not(trained):
     manifest = json.loads((trained.path / "run.json").read_text())
     assert [s["name"] for s in manifest["stages"]] == ["learnt"]
     assert [s["status"] for s in manifest["stages"]] == ["done"]
-    assert manifest["selector"]["kind"] == "automaton"
-    assert len(manifest["selector"]["sha256"]) == 64
+    assert manifest["hierarchy"]["selector"]["kind"] == "automaton"
+    assert len(manifest["hierarchy"]["selector"]["sha256"]) == 64
     assert manifest["needs_recipe"]
     assert manifest["resume_needs_recipe"]
     assert {p.name for p in (trained.path / "policies").iterdir()} == {"learnt.safetensors"}

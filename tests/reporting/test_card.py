@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
+from small_runs import level_entry, small_manifest
 
 from skillweave.reporting.card import text, write_card
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.manifest import SkillEntry, StageEntry
+from skillweave.skills.foreign_policy import Source
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.evaluation_file import save_evaluation
 from skillweave.training.skill_report import SkillReport
@@ -24,14 +26,16 @@ STAGE = StageEntry(
 @pytest.fixture
 def run(tmp_path: Path) -> RunDirectory:
     skill = SkillEntry("land", 10)
-    hop = SkillEntry("hop", 5, policy={"kind": "onnx", "file": "hop.onnx"})
-    manifest = {
-        "kind": "hierarchy", "env": "CartPole-v1", "env_kwargs": {}, "seed": 3,
-        "checkpoint_every": 100, "eval_every": None, "eval_episodes": 20,
-        "resume_needs_recipe": True,
-        "needs_recipe": True, "recipe": "/home/ada/secret/my_recipe.py", "call_steps": 7,
-        "greedy_skills": True, "skills": [skill, hop], "stages": [STAGE],
-    }  # fmt: skip
+    hop = SkillEntry("hop", 5, policy=Source("onnx", file="hop.onnx"))
+    manifest = small_manifest(
+        STAGE,
+        seed=3,
+        needs_recipe=True,
+        resume_needs_recipe=True,
+        recipe="/home/ada/secret/my_recipe.py",
+        hierarchy=level_entry(call_steps=7),
+        skills=[skill, hop],
+    )
     return RunDirectory.create(tmp_path / "run", manifest)
 
 
@@ -89,8 +93,8 @@ def test_it_says_how_to_load_it_and_what_is_not_there(run: RunDirectory) -> None
 
 
 def test_nothing_of_a_run_is_read_as_markdown_or_html(run: RunDirectory) -> None:
-    run.manifest["env_kwargs"] = {"x": "<script>alert(1)</script>|[a](http://b)\n# c"}
-    run.manifest["env"] = '"\n---\n<b>'
+    run.manifest.env_kwargs = {"x": "<script>alert(1)</script>|[a](http://b)\n# c"}
+    run.manifest.env = '"\n---\n<b>'
     page = card(run)
     assert "<script" not in page
     assert "](http" not in page
@@ -98,5 +102,5 @@ def test_nothing_of_a_run_is_read_as_markdown_or_html(run: RunDirectory) -> None
         "# cart", "## Use", "## Measured", "## Training",
     ]  # fmt: skip
     assert page.count("\n---\n") == 1  # the header's end
-    assert json.loads(page.splitlines()[3].partition(": ")[2])[-1] == run.manifest["env"]
+    assert json.loads(page.splitlines()[3].partition(": ")[2])[-1] == run.manifest.env
     assert text("a|b *c*\n<d>") == r"a\|b \*c\* &lt;d&gt;"

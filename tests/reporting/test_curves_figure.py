@@ -29,9 +29,9 @@ def write_run(base: Path, to: Path, seed: int, returns: Sequence[float], agent: 
     """Copy a run as if it had another seed and other metrics."""
     shutil.copytree(base, to)
     run = RunDirectory.open(to)
-    run.manifest["seed"] = seed
+    run.manifest.seed = seed
     lines = []
-    for stage in run.manifest["stages"]:
+    for stage in run.manifest.stages:
         own = returns if stage.name == agent else [0.0] * 4
         for update, (steps, value) in enumerate(zip(STEPS, own, strict=True), 1):
             # Skills have half as many steps.

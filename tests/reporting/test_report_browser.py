@@ -252,7 +252,7 @@ def test_a_call_is_shown_with_its_goal(browser: Any, pages: dict[str, Path]) -> 
     call = opened.page.locator("#timelines .call").first
     call.click()
     episode = json.loads(opened.page.locator("#data").text_content())["episodes"][0]
-    goal = episode["goals"][0]
+    goal = episode["calls"]["goal"][0]
     assert goal.startswith("(")
     pairs = opened.page.locator("#call div").all_text_contents()
     assert f"Goal{goal}" in pairs

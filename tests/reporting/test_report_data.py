@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from reporting.cart import RECIPE
-from reporting.walkway import CALLS, Moody, Walkway, declare
+from reporting.walkway import CALLS, Moody, Walkway, declare, told
 
 from skillweave import EnvSpec, SkillweaveError
 from skillweave.cli import main
@@ -24,8 +24,7 @@ from skillweave.reporting.report.film import HOLD, episode_shot, make_film
 from skillweave.reporting.report.groups import grouped, on_one_grid, over_seeds
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import episode_seeds, evaluate
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import Episode, PlayedEpisodes
+from skillweave.training.played_calls import Episode, PlayedCalls, PlayedEpisodes
 
 
 def test_transitions_by_hand(tmp_path: Path) -> None:
@@ -50,13 +49,10 @@ def logged(tmp_path: Path, episodes: int = 2, env: Any = Walkway) -> PlayedEpiso
 
 def test_calls_by_hand(tmp_path: Path) -> None:
     log = logged(tmp_path)
-    assert log.labels == ("go", "stay")
+    assert (log.labels, log.judged) == (("go", "stay"), (True, False))
     for i, episode in enumerate(log.episodes):
-        told = [
-            (c.skill, c.start, c.steps, c.why, c.reward, c.own, c.succeeded) for c in episode.calls
-        ]
-        assert told == CALLS
-        assert [c.obs.tolist() for c in episode.calls] == [[0, 0], [2, 2], [2, 5], [4, 7]]
+        assert told(episode.calls) == CALLS
+        assert episode.calls["start"].tolist() == [[0, 0], [2, 2], [2, 5], [4, 7]]
         assert episode.rewards.tolist() == [1, 2, 2, 2, 2, 3, 4, 5, 6]
         assert (episode.total, episode.seed, episode.cut) == (27, episode_seeds(0, 2)[i], False)
 
@@ -65,22 +61,22 @@ def test_many_calls_are_shown_in_part(tmp_path: Path, monkeypatch: pytest.Monkey
     log = logged(tmp_path, 3)
     shown, missing = calls.episode_data(log, None)
     assert ([e["number"] for e in shown], missing) == ([1, 2, 3], [])
-    assert shown[0]["calls"] == [list(call) for call in CALLS]
+    assert told(shown[0]["calls"]) == CALLS
     monkeypatch.setattr(calls, "MOST_CALLS", 5)
     monkeypatch.setattr(calls, "MOST_CALLS_OF_ONE", 3)
     shown, missing = calls.episode_data(log, None)
-    assert [len(e["calls"]) for e in shown] == [3]
+    assert [told(e["calls"]) for e in shown] == [CALLS[:3]]
     assert missing == [
         "Of the 4 calls of episode 1, 3 are shown.",
         "1 of 3 episodes are shown, as all have too many calls.",
     ]
 
 
-def test_decisions_are_coordinates_the_skill_and_its_success(tmp_path: Path) -> None:
+def test_decisions_are_coordinates_and_calls(tmp_path: Path) -> None:
     found = calls.decision_data(logged(tmp_path, 1))
     assert found["names"] == ["obs[0]", "obs[1]", "step of the episode"]
-    rows = [[0, 0, 0, 0, False], [2, 2, 2, 1, None], [2, 5, 5, 0, False], [4, 7, 7, 0, True]]
-    assert found["rows"] == rows
+    assert found["rows"] == [[0, 0, 0], [2, 2, 2], [2, 5, 5], [4, 7, 7]]
+    assert told(found["calls"]) == CALLS
 
 
 def test_coordinates_of_unlike_observations() -> None:
@@ -95,7 +91,8 @@ def test_coordinates_of_unlike_observations() -> None:
 
 def test_filmed_are_the_worst_the_median_and_the_best() -> None:
     episodes = [
-        Episode(i, np.zeros(1), np.array([r])) for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])
+        Episode(i, np.zeros(1), np.array([r]), np.zeros(0))
+        for i, r in enumerate([5.0, 1.0, 9.0, 3.0, 7.0])
     ]
     assert calls.chosen_episodes(episodes, 3) == [1, 0, 2]
     assert calls.chosen_episodes(episodes, 1) == [1]
@@ -211,7 +208,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_groups_are_seeds_and_are_named_by_what_tells_them_apart(folder: Path) -> None:
     runs = [RunDirectory.open(folder / name) for name in "abc"]
     first, second = grouped(runs)
-    assert [r.manifest["seed"] for r in first.runs] == [0, 1]
+    assert [r.manifest.seed for r in first.runs] == [0, 1]
     assert (first.key, first.name) == ("A", "cart, call_steps 5")
     assert (second.key, second.name) == ("B", "cart, call_steps 3")
     assert [g.name for g in grouped(runs[:2])] == ["cart"]

@@ -75,9 +75,9 @@ def test_each_call_has_its_goal_in_words(tmp_path: Path) -> None:
     played = play_episodes(run.policy, run.declaration.spec, 12, 0, 0, True, 4)
     seen = set()
     for shown, episode in zip(played.section.data["episodes"], played.log.episodes, strict=True):
-        for words, call in zip(shown.get("goals", [""] * 99), episode.calls, strict=False):
-            skill = played.log.labels[call.skill]
-            goal = shown_goal(call.obs.clip(-1, 1)) if skill == "two" else "3"
+        for words, call in zip(shown["calls"]["goal"], episode.calls, strict=True):
+            skill = played.log.labels[call["skill"]]
+            goal = shown_goal(call["start"].clip(-1, 1)) if skill == "two" else "3"
             assert words == ("" if skill == "rest" else goal)
             seen.add(skill)
     assert seen == {"two", "number", "rest"}
@@ -143,9 +143,9 @@ def test_films_of_handovers_and_choices_name_goals(tmp_path: Path) -> None:
 
     played = play_episodes(run.policy, spec, 4, 0, 0, True, 2)
     decisions = decision_data(played.log)
-    called = [call for episode in played.log.episodes for call in episode.calls]
-    assert decisions["goals"] == [call.goal for call in called]
-    assert len(decisions["goals"]) == len(decisions["rows"])
+    goals = [goal for episode in played.log.episodes for goal in episode.calls["goal"]]
+    assert decisions["calls"]["goal"] == goals
+    assert len(goals) == len(decisions["rows"])
     fields = [
         [f["field"] for f in choices(["two"], ["red"], goals=g)["encoding"]["tooltip"]]
         for g in (True, False)

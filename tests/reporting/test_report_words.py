@@ -9,21 +9,20 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare
+from reporting.walkway import CALLS, Go, Stay, Walkway, choose, declare, told
 from small_runs import stage_entry
 
 from skillweave import EnvSpec, Hierarchy, Reflex, Run, Skill
 from skillweave.errors import DeclarationError
 from skillweave.reporting.report import calls
 from skillweave.reporting.report.compare import write_comparison
-from skillweave.reporting.report.facts import about, number, percent, reflex_rows
+from skillweave.reporting.report.facts import about, number, percent
 from skillweave.reporting.report.single import score_words
 from skillweave.reporting.report.verdict import no_verdict, verdict
 from skillweave.runs.directory import RunDirectory
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import save_evaluation
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
 from skillweave.training.skill_report import SkillReport
 from skillweave.types import Array
 
@@ -173,8 +172,6 @@ def test_reflexes_are_counted_by_hand(tmp_path: Path) -> None:
     assert found.lengths == (8, 8, 8)
     assert found.reflexes == {"hurry": 0, "later": 3, "never": 0}
     assert "reflex later acted in 3 of 24 steps (12.5%)" in found.for_people()
-    rows = reflex_rows(found.reflexes, sum(found.lengths))
-    assert [(r["name"], r["steps"], r["percent"]) for r in rows][1] == ("later", "3", "12 %")
     assert found.to_json()["reflexes"]["later"] == {"steps": 3, "share": 3 / 24}
     # A skill alone is overridden, too.
     assert run.evaluate(1, skill="go").reflexes["later"] == 1
@@ -242,7 +239,7 @@ def test_named_observations_name_axes_and_what_each_call_saw(tmp_path: Path) -> 
     assert calls.seen(log.episodes[0].calls, names)[0] == names
     (shown,), _ = calls.episode_data(log, None)
     assert "seen" not in shown
-    assert shown["calls"] == [list(call) for call in CALLS]
+    assert told(shown["calls"]) == CALLS
 
 
 def test_names_that_do_not_fit_are_said_and_not_used(tmp_path: Path) -> None:

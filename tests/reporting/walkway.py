@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from skillweave import EnvSpec, Hierarchy, Skill
+from skillweave.policies.core import CallEnd
 from skillweave.types import Array
 
 
@@ -81,14 +82,19 @@ def choose(obs: Array) -> Array:
     return np.where((obs[:, 0] == 2) & (obs[:, 1] == 2), "stay", "go")
 
 
+FIELDS = ("skill", "age", "steps", "end_reason", "task_return", "own_return", "succeeded")
 CALLS = [
-    # skill, start, steps, why, reward, own reward, success
-    (0, 0, 2, "own", 3.0, 4.0, False),
-    (1, 2, 3, "limit", 6.0, 6.0, None),
-    (0, 5, 2, "own", 7.0, 4.0, False),
-    (0, 7, 2, "own", 11.0, 4.0, True),
+    (0, 0, 2, CallEnd.OWN, 3.0, 4.0, False),
+    (1, 2, 3, CallEnd.LIMIT, 6.0, 6.0, False),
+    (0, 5, 2, CallEnd.OWN, 7.0, 4.0, False),
+    (0, 7, 2, CallEnd.OWN, 11.0, 4.0, True),
 ]
 """The calls of each episode, by hand."""
+
+
+def told(calls: Any) -> list[tuple[Any, ...]]:
+    """Return ``FIELDS`` of calls, as in ``CALLS``."""
+    return list(zip(*(np.asarray(calls[name]).tolist() for name in FIELDS), strict=True))
 
 
 def declare(env: Any = Walkway) -> Hierarchy:

@@ -1,12 +1,11 @@
 """What people are told to type works: it names the file with their code."""
 
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from small_runs import stage_entry
+from small_runs import small_manifest, stage_entry
 
 from skillweave.runs.checkpoints import Checkpoints
 from skillweave.runs.command_words import command_words, saved_words
@@ -26,23 +25,27 @@ from skillweave.runs.manifest import Checkpoint
 def test_commands_name_the_users_file_where_it_is_needed(
     recipe, needs, resume_needs, evaluate, resume
 ):
-    told = {"recipe": recipe, "needs_recipe": needs, "resume_needs_recipe": resume_needs}
+    told = small_manifest(recipe=recipe, needs_recipe=needs, resume_needs_recipe=resume_needs)
     run = SimpleNamespace(path=Path("runs/a"), manifest=told)
     assert command_words("evaluate|render", run) == f"skillweave evaluate|render runs/a{evaluate}"
     assert command_words("resume", run) == f"skillweave resume runs/a{resume}"
 
 
 def test_paths_with_spaces_are_quoted():
-    run = SimpleNamespace(path=Path("my runs/a"), manifest={"recipe": "my file.py"})
+    run = SimpleNamespace(
+        path=Path("my runs/a"),
+        manifest=small_manifest(recipe="my file.py", resume_needs_recipe=True),
+    )
     assert command_words("resume", run) == "skillweave resume 'my runs/a' --recipe 'my file.py'"
 
 
 def test_what_is_saved_is_what_a_resumed_run_goes_on_from(tmp_path):
     stages = [stage_entry("left"), stage_entry("right", "training")]
-    run, kept = SimpleNamespace(path=tmp_path, manifest={"stages": stages}), Checkpoints(tmp_path)
+    run = SimpleNamespace(path=tmp_path, manifest=small_manifest(*stages))
+    kept = Checkpoints(tmp_path)
     assert saved_words(run) == "saved after left"
     for steps in (100, 200):
-        kept.save({}, asdict(Checkpoint("right", 1, steps, 0, 0.0, {})))
+        kept.save({}, Checkpoint("right", 1, steps, 0, 0.0, {}))
     assert saved_words(run) == "saved at 200 steps of right"
     names = "checkpoint", "checkpoint.new", "checkpoint.previous"
     latest, fresh, before = (tmp_path / f"{name}.safetensors" for name in names)

@@ -10,16 +10,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from small_runs import level_entry, small_manifest
 from torch import Tensor
 
 from skillweave.algorithms.config import PPO, config_to_json
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import AgentHeader, AgentPolicy, make_algorithm
 from skillweave.errors import RunError, SkillweaveError
 from skillweave.networks.config import Network
 from skillweave.runs.directory import RunDirectory
@@ -28,6 +29,7 @@ from skillweave.runs.manifest import (
     BestEntry,
     Checkpoint,
     Generation,
+    Manifest,
     MemberEntry,
     Origin,
     SkillEntry,
@@ -39,35 +41,17 @@ from skillweave.seeding import Seeds
 ALGORITHM = json.loads(json.dumps(config_to_json(PPO())))
 
 
-def manifest() -> dict[str, Any]:
-    return {
-        "kind": "hierarchy",
-        "env": "CartPole-v1",
-        "env_kwargs": {},
-        "seed": 7,
-        "checkpoint_every": 100,
-        "skills": [SkillEntry("landing", None)],
-        "call_steps": 10,
-        "learn": "apart",
-        "interrupt": None,
-        "greedy_skills": True,
-        "greedy_selector": True,
-        "start_calls": None,
-        "search_steps": None,
-        "episode_calls": 1,
-        "call_cost": 0.0,
-        "reflexes": [],
-        "eval_every": None,
-        "eval_episodes": 20,
-        "needs_recipe": False,
-        "resume_needs_recipe": False,
-        "stages": [
-            StageEntry("landing", "skill", ["landing"], None, 10, ALGORITHM, None, "training"),
-            StageEntry(
-                "selector", "selector", ["selector"], "selector", 10, ALGORITHM, None, "waiting"
-            ),
-        ],
-    }
+def manifest(seed: int = 7, **fields: Any) -> Manifest:
+    return small_manifest(
+        StageEntry("landing", "skill", ["landing"], None, 10, ALGORITHM, None, "training"),
+        StageEntry(
+            "selector", "selector", ["selector"], "selector", 10, ALGORITHM, None, "waiting"
+        ),
+        seed=seed,
+        hierarchy=level_entry(),
+        skills=[SkillEntry("landing", None)],
+        **fields,
+    )
 
 
 @dataclass
@@ -118,17 +102,16 @@ def assert_same(a: Learnt, b: Learnt) -> None:
 
 def test_a_new_run_can_be_opened_and_says_what_made_it(run: RunDirectory) -> None:
     found = RunDirectory.open(run.path).manifest
-    assert {k: found[k] for k in manifest()} == manifest()
-    assert found["schema"] == 1
-    assert found["created"]
-    assert found["versions"] == versions()
+    assert found.created
+    assert found.versions == versions()
+    assert replace(found, created="", versions={}, id="") == manifest()
 
 
 def test_an_existing_run_is_never_overwritten(run: RunDirectory) -> None:
     save(run, 1)
     before = (run.path / "run.json").read_bytes()
     with pytest.raises(RunError, match=r"unfinished run, saved at 10 steps") as caught:
-        RunDirectory.create(run.path, manifest() | {"seed": 8})
+        RunDirectory.create(run.path, manifest(8))
     assert f'hierarchy.train("{run.path}", seed=7, resume=True)' in str(caught.value)
     assert (run.path / "run.json").read_bytes() == before
 
@@ -157,7 +140,9 @@ def test_opening_a_directory_without_a_run_says_which_file_is_missing(tmp_path: 
     assert str(tmp_path / "run.json") in str(caught.value)
 
 
-@pytest.mark.parametrize("field", sorted(set(manifest()) - {"reflexes"}))
+@pytest.mark.parametrize(
+    "field", [f.name for f in fields(Manifest) if f.default is f.default_factory is MISSING]
+)
 def test_a_run_without_one_of_its_fields_is_damaged_and_the_field_is_named(
     run: RunDirectory, field: str
 ) -> None:
@@ -350,7 +335,8 @@ def test_metrics_come_back_in_order(run: RunDirectory) -> None:
 
 def test_a_run_without_metrics_has_none(run: RunDirectory) -> None:
     assert list(run.metrics()) == []
-    assert run.line_bytes()["metrics_bytes"] == 0
+    run.record_lines(entry := run.stage("landing"))
+    assert entry.metrics_bytes == 0
     run.rewind({"metrics_bytes": 0})
     assert not (run.path / "metrics.jsonl").exists()
 
@@ -417,7 +403,7 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
         (lambda m: m.update(stages=5), "stages is 5; it must be a list"),
         (lambda m: m["stages"][0].pop("status"), "damaged: stages[0] has no field 'status'"),
         (lambda m: m["stages"][0].update(learns=[]), "stages[0].learns is []; it must be at least"),
-        (lambda m: m.update(kind="agent"), "stages has 2 entries, but a plain agent has one"),
+        (lambda m: m.pop("hierarchy"), "stages has 2 entries, but a plain agent has one"),
         (lambda m: m["stages"][0].update(status="done"), "stages[0] is done, but has no field 's"),
         (lambda m: m["stages"][1].update(name="landing"), "stages[1].name is 'landing', a second"),
         (
@@ -429,7 +415,12 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
             lambda m: m.update(checkpoint_every=[[]]),
             "checkpoint_every is [[]]; it must be a whole number",
         ),
-        (lambda m: m.update(kind="x" * 10_000), "kind is 'xxx"),
+        (lambda m: m.update(keep="x" * 10_000), "keep is 'xxx"),
+        (
+            lambda m: m["hierarchy"].update(call_steps=0),
+            "hierarchy.call_steps is 0; it must be at least 1, or None",
+        ),
+        (lambda m: m.update(call_steps=10), "has no field call_steps: made by a newer version?"),
         (
             lambda m: m["stages"][0]["algorithm"].update(gamma="a"),
             "stages[0].algorithm.gamma is 'a'; it must be a number, between 0 and 1",
@@ -453,7 +444,7 @@ def test_a_manifest_edited_by_hand_is_refused_with_or_without_its_checksum(
     run: RunDirectory,
 ) -> None:
     path = run.path / "run.json"
-    data = json.loads(path.read_text()) | {"call_steps": 11}
+    data = json.loads(path.read_text()) | {"seed": 11}
     path.write_text(json.dumps(data))
     with pytest.raises(RunError, match="checksum"):
         RunDirectory.open(run.path)
@@ -474,7 +465,7 @@ def test_a_run_json_that_is_no_plain_file_is_refused(tmp_path: Path) -> None:
 
 def finished(run: RunDirectory, *policies: AgentPolicy) -> None:
     """Every stage of the run, done."""
-    for entry, policy in zip(run.manifest["stages"], policies, strict=True):
+    for entry, policy in zip(run.manifest.stages, policies, strict=True):
         run.save_policies(entry.name, {entry.name: policy})
         end(run, entry.name)
     run.save()
@@ -497,7 +488,7 @@ def test_a_policy_of_another_run_is_refused(
     run: RunDirectory, policy: AgentPolicy, tmp_path: Path
 ) -> None:
     finished(run, policy, other(policy))
-    theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
+    theirs = RunDirectory.create(tmp_path / "other", manifest(8))
     finished(theirs, other(policy, 2), other(policy, 3))
     run.policy_path("landing").write_bytes(theirs.policy_path("landing").read_bytes())
     with pytest.raises(RunError, match="belongs to another run"):
@@ -519,9 +510,9 @@ def test_a_policy_that_the_run_did_not_end_with_is_refused(
 def test_equal_runs_have_the_same_identity_and_equal_files(
     run: RunDirectory, policy: AgentPolicy, tmp_path: Path
 ) -> None:
-    again = RunDirectory.create(tmp_path / "again", manifest() | {"recipe": "elsewhere.py"})
-    other_seed = RunDirectory.create(tmp_path / "seed", manifest() | {"seed": 8})
-    assert again.manifest["id"] == run.manifest["id"] != other_seed.manifest["id"]
+    again = RunDirectory.create(tmp_path / "again", manifest(recipe="elsewhere.py"))
+    other_seed = RunDirectory.create(tmp_path / "seed", manifest(8))
+    assert again.manifest.id == run.manifest.id != other_seed.manifest.id
     for one in (run, again):
         finished(one, policy, policy)
     for stage in ("landing", "selector"):
@@ -529,7 +520,7 @@ def test_equal_runs_have_the_same_identity_and_equal_files(
 
 
 def test_a_checkpoint_of_another_run_is_refused(run: RunDirectory, tmp_path: Path) -> None:
-    theirs = RunDirectory.create(tmp_path / "other", manifest() | {"seed": 8})
+    theirs = RunDirectory.create(tmp_path / "other", manifest(8))
     save(theirs, 1)
     shutil.copy(theirs.path / "checkpoint.safetensors", run.path)
     with pytest.raises(RunError, match="belongs to another run"):
@@ -719,7 +710,7 @@ def test_a_populations_checkpoint_without_one_of_its_fields_is_refused(
     run: RunDirectory, field: str
 ) -> None:
     member = MemberEntry(0, 1, ALGORITHM, Origin(changes={"gamma": (0.9, 0.99)}))
-    population = Generation(0, 1, 0, 1, [member], BestEntry(1.0, 0, 0, {}))
+    population = Generation(0, 1, 0, 1, [member], BestEntry(1.0, 0, 0, AgentHeader({}, {}, {})))
     saved = Checkpoint("landing", 1, 1, 0, 0.0, {}, population=population)
     run.save_checkpoint(learnt(1), saved)
     found = run.load_checkpoint(Learnt, "landing")

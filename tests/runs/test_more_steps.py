@@ -78,7 +78,7 @@ def by_kind(name: str) -> Any:
 
 def stages(run: Run | Path) -> dict[str, StageEntry]:
     path = run.path if isinstance(run, Run) else run
-    return {s.name: s for s in RunDirectory.open(path).manifest["stages"]}
+    return {s.name: s for s in RunDirectory.open(path).manifest.stages}
 
 
 def assert_metrics_rise(path: Path) -> None:

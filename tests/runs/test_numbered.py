@@ -118,7 +118,7 @@ def dead_run(path: Path) -> None:
 def test_a_run_that_has_learnt_nothing_is_replaced() -> None:
     dead_run(Path("run"))
     (Path("run") / ".policy.x.tmp").write_bytes(b"half")
-    before = RunDirectory.open("run").manifest["id"]
+    before = RunDirectory.open("run").manifest.id
     run = declare().train("run", seed=5, quiet=True)
     assert run.info()["id"] != before
     assert run.info()["seed"] == 5

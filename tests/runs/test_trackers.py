@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_runs import stage_entry
+from small_runs import small_manifest, stage_entry
 
 from skillweave.errors import MissingExtra, SkillweaveError
 from skillweave.runs.directory import RunDirectory
@@ -19,7 +19,7 @@ from skillweave.runs.trackers import TRACKERS, make_trackers, track_film, tracke
 
 @pytest.fixture
 def run(tmp_path: Path) -> RunDirectory:
-    return RunDirectory.create(tmp_path / "run", {"env": "CartPole-v1", "seed": 0, "stages": []})
+    return RunDirectory.create(tmp_path / "run", small_manifest())
 
 
 def test_no_trackers_are_made_where_none_are_named(run: RunDirectory) -> None:
@@ -113,8 +113,8 @@ def test_a_resumed_run_goes_on_in_the_same_run_of_wandb(
     asked: list[dict[str, Any]] = []
     monkeypatch.setattr(wandb, "init", lambda **how: asked.append(how))
     make_trackers(("wandb",), run)
-    make_trackers(("wandb",), RunDirectory(run.path, dict(run.manifest)))
-    content = {"env": "CartPole-v1", "seed": 0, "stages": []}
+    make_trackers(("wandb",), RunDirectory(run.path, run.manifest))
+    content = small_manifest()
     make_trackers(("wandb",), RunDirectory.create(tmp_path / "other", content))
     first, again, other = asked
     assert first["id"] == again["id"] != other["id"]
@@ -132,8 +132,8 @@ def test_a_saved_evaluation_draws_what_each_skill_did(run: RunDirectory) -> None
 
     land = SkillReport(steps=30, calls=10, succeeded=4, ended={}, return_sum=None)
     hover = SkillReport(steps=10, calls=2, succeeded=None, ended={}, return_sum=None)
-    run.manifest["track"] = ["tensorboard"]
-    run.manifest["stages"] = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
+    run.manifest.track = ("tensorboard",)
+    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     for returns in ((1.0, 1.0), (1.0, 2.0)):  # the later one takes the place of the first
         found = Evaluation(returns, (20, 20), None, {"land": land, "hover": hover})
         save_evaluation(run, found, 0, True)
@@ -160,8 +160,8 @@ def test_tensorboard_shows_a_film(run: RunDirectory) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    run.manifest["track"] = ["tensorboard"]
-    run.manifest["stages"] = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
+    run.manifest.track = ("tensorboard",)
+    run.manifest.stages = [stage_entry("land", steps=500), stage_entry("selector", steps=200)]
     film = gif(run.path / "hierarchy.gif")
     track_film(run, film)
     track_film(run, run.path / "other.mp4")  # it cannot show those, and says nothing
@@ -244,10 +244,10 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     uri = f"sqlite:///{tmp_path}/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     monkeypatch.chdir(tmp_path)
-    run.manifest["track"] = ["mlflow"]
+    run.manifest.track = ("mlflow",)
     stage = stage_entry("landing", "training", steps=300)
     stage.algorithm["gamma"] = 0.9
-    run.manifest["stages"] = [stage]
+    run.manifest.stages = [stage]
     (killed,) = make_trackers(("mlflow",), run)
     for steps in (100, 200, 300):
         killed.tick("landing", steps, 1.0, {"return": steps / 100})
@@ -271,7 +271,7 @@ def test_mlflow_goes_on_in_the_same_run_and_shows_each_step_once(
     assert (found.info.run_name, found.info.status) == ("run", "FINISHED")
     (film,) = client.list_artifacts(found.info.run_id, "films/400")
     assert film.path == "films/400/agent.gif"
-    content = {"env": "CartPole-v1", "seed": 0, "stages": []}
+    content = small_manifest()
     make_trackers(("mlflow",), RunDirectory.create(tmp_path / "other", content))[0].close()
     assert len(client.search_runs([experiment])) == 2
 

@@ -422,20 +422,20 @@ def test_sources_say_where_policies_come_from(zip_file, tmp_path):
     pytest.importorskip("onnxruntime")
     file = onnx_file(tmp_path / "x.onnx")
     found = [source_of(p) for p in (from_function(lean), from_torch(linear()), from_onnx(file))]
-    assert [s["kind"] for s in found] == ["function", "torch", "onnx"]
-    assert found[0]["name"].endswith("test_foreign_policy.lean")
-    assert found[1]["name"] == "torch.nn.modules.linear.Linear"
-    assert found[2]["file"] == str(file)
+    assert [s.kind for s in found] == ["function", "torch", "onnx"]
+    assert found[0].name.endswith("test_foreign_policy.lean")
+    assert found[1].name == "torch.nn.modules.linear.Linear"
+    assert found[2].file == str(file)
     zipped = source_of(from_sb3(zip_file, "ppo", trust=True))
-    assert (zipped["kind"], zipped["name"], zipped["file"]) == ("sb3", "PPO", str(zip_file))
-    assert [len(s.get("sha256", "")) for s in (*found, zipped)] == [0, 64, 64, 64]
+    assert (zipped.kind, zipped.name, zipped.file) == ("sb3", "PPO", str(zip_file))
+    assert [len(s.sha256 or "") for s in (*found, zipped)] == [0, 64, 64, 64]
 
 
 def test_a_copy_that_is_damaged_missing_or_of_another_shape_is_said():
     then, now = fit(from_torch(linear())), fit(from_torch(linear(2 * WEIGHT)))
 
     def load(policy, content):
-        return as_recorded(policy, then.source(), lambda: content, "runs/x: skill 'x'")
+        return as_recorded(policy, source_of(then), lambda: content, "runs/x: skill 'x'")
 
     assert load(now, then.content()).source() == then.source()
     assert now.source() != then.source()

@@ -14,7 +14,8 @@ from skills.mapped_models import ACTION, SPACE, fit, observations, onnx_model, w
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError
-from skillweave.skills.foreign_policy import as_recorded, fitted, source_of
+from skillweave.schema import as_json
+from skillweave.skills.foreign_policy import Source, as_recorded, fitted, source_of
 from skillweave.skills.goals import Goals
 from skillweave.skills.mapping import PolicyMapping
 from skillweave.spaces import obs_codec, obs_dtype, to_tensor
@@ -463,15 +464,16 @@ def test_what_a_run_has_recorded_is_what_acts_whatever_the_recipe_maps_now() -> 
     module = torch.nn.Linear(3, 5)
     then = fit(sw.from_torch(module, sees=sw.Part("gyro", scale=2.0)))
     now = fit(sw.from_torch(module, sees=sw.Part("gyro", scale=3.0), every=2))
-    recorded = json.loads(json.dumps(source_of(then)))
-    assert recorded["mapping"]["sees"][""][0]["scale"] == 2.0
+    recorded = Source(**json.loads(json.dumps(as_json(source_of(then)))))
+    assert recorded.mapping is not None
+    assert recorded.mapping["sees"][""][0]["scale"] == 2.0
     obs = observations(3, 1)[0]
     restored: Any = as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")
     np.testing.assert_array_equal(
         restored.act(restored.start(3), obs)[0], then.act(then.start(3), obs)[0]
     )
     plain = fit(sw.from_torch(torch.nn.Linear(3, 5)), Box(-1, 1, (3,), np.float32))
-    assert "mapping" not in source_of(plain)
-    recorded["mapping"]["sees"][""][0] = {"source": "function", "function": "gone:f"}
+    assert source_of(plain).mapping is None
+    recorded.mapping["sees"][""][0] = {"source": "function", "function": "gone:f"}
     with pytest.raises(RunError, match=r"runs/x: skill 'walk': its policy had another mapping"):
         as_recorded(now, recorded, lambda: None, "runs/x: skill 'walk'")

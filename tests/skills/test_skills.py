@@ -256,7 +256,7 @@ def test_a_reflex_is_a_function_with_a_name(condition, name, says):
 @pytest.mark.parametrize(
     ("attribute", "value", "says"),
     [
-        ("name", 5, "skill 5 .*name must be text"),
+        ("name", 5, "skill 5 .*name is 5; it must be a text"),
         ("reward", 3, "reward is 3; it must be a method"),
     ],
 )

@@ -171,9 +171,7 @@ def test_false_ends_a_population_after_its_generation(workers: int, tmp_path: Pa
     assert entry["status"] == "done"
     assert 700 <= entry["stopped"]["steps"] == entry["steps"]
     assert entry["winner"]["generations"] < 4
-    generations = {
-        line["generation"] for line in RunDirectory.open(tmp_path / "run").lineage.read()
-    }
+    generations = {line.generation for line in RunDirectory.open(tmp_path / "run").lineage.read()}
     assert len(generations) == entry["winner"]["generations"], "no generation is left half done"
     assert len(run.evaluate(2).returns) == 2
 

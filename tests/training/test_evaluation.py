@@ -393,7 +393,7 @@ def test_without_a_limit_the_environments_own_counts_or_the_longest_episode(monk
         ({"episodes": "x"}, "episodes is 'x'; it must be a whole number"),
         ({"seed": None}, "seed is None"),
         ({"seed": -1}, "seed is -1; it must be at least 0"),
-        ({"seed": 10**30}, r"seed is 10+; it must be below 2\^43"),
+        ({"seed": 10**30}, r"seed is 10+; it must be below 2\^63"),
         ({"max_steps": 0}, "max_steps is 0; it must be at least 1"),
         ({"num_envs": True}, "num_envs is True"),
     ],

@@ -128,7 +128,7 @@ def test_every_stage_keeps_its_best_and_says_so(
     run = new_run(hierarchy(learn), tmp_path / "run", how=defaults)
     training.train(hierarchy(learn), run, (heard,))
     run.close()
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         found = evaluations(run.path, entry.name)
         best = max(found, key=lambda steps: (found[steps], steps))
         assert entry.best == Best(best, "return", found[best])
@@ -173,7 +173,7 @@ def test_a_resumed_run_keeps_the_same(
     assert stops >= 2
     assert_same(tmp_path / "run", tmp_path / "whole")
     runs = [RunDirectory.open(tmp_path / name) for name in ("run", "whole")]
-    kept = [[entry.best for entry in run.manifest["stages"]] for run in runs]
+    kept = [[entry.best for entry in run.manifest.stages] for run in runs]
     assert kept[0] == kept[1]
 
 

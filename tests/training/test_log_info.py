@@ -9,7 +9,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_runs import OFF, ON, Heard, assert_same, interrupt_at_checkpoint, lines, new_run
+from small_runs import (
+    OFF,
+    ON,
+    Heard,
+    assert_same,
+    interrupt_at_checkpoint,
+    lines,
+    new_run,
+    small_manifest,
+    stage_entry,
+)
 from toys import Ledger
 
 from skillweave import (
@@ -32,7 +42,7 @@ from skillweave.evolution import Evolution
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import identity, read_manifest
+from skillweave.runs.manifest import Manifest, identity, read_manifest
 from skillweave.skills.info_words import info_keys
 
 
@@ -272,9 +282,9 @@ def test_logging_changes_no_weights_and_no_identity(tmp_path: Path) -> None:
 
 
 def test_identity_counts_what_is_kept() -> None:
-    manifest = {"keep": "last", "log_info": ["a"], "seed": 0}
-    assert identity(manifest) == identity(manifest | {"log_info": []})
-    assert identity(manifest) != identity(manifest | {"keep": "best"})
+    manifest = small_manifest(stage_entry("agent"), log_info=("a",))
+    assert identity(manifest) == identity(replace(manifest, log_info=()))
+    assert identity(manifest) != identity(replace(manifest, keep="best"))
 
 
 def test_numbers_of_an_info() -> None:
@@ -352,16 +362,16 @@ def test_the_command_line_logs_and_keeps(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     assert main([*words, "-o", str(first), "--log-info", "place", *best]) == 0
     assert "info/place" in lines(first)[-1]
-    (stage,) = manifest_of(first)["stages"]
+    (stage,) = manifest_of(first).stages
     assert stage.best.steps <= stage.steps
     more = ["--set", "train.keep=best", "--set", "train.log_info=place, other"]
     assert main([*words, "-o", str(second), *best[2:], *more]) == 0
-    assert manifest_of(second)["log_info"] == ["place", "other"]
-    assert manifest_of(second)["keep"] == "best"
+    assert manifest_of(second).log_info == ("place", "other")
+    assert manifest_of(second).keep == "best"
     assert main([*words, "-o", str(tmp_path / "third"), "--keep", "best"]) != 0
 
 
-def manifest_of(path: Path) -> dict[str, Any]:
+def manifest_of(path: Path) -> Manifest:
     return read_manifest(path)
 
 

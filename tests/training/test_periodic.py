@@ -26,8 +26,7 @@ from skillweave.envs import checks
 from skillweave.runs.directory import RunDirectory
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
-from skillweave.training.eval_envs import episodes_of
-from skillweave.training.periodic import PeriodicEvaluation
+from skillweave.training.periodic import PeriodicEvaluation, episodes_of
 
 SMALL = Network((8,), "relu")
 

@@ -28,8 +28,8 @@ from skillweave.collecting.skill_set import SkillSet
 from skillweave.hierarchy.policy import HierarchyPolicy, SkillAlone
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.evaluation import FIRST_SEED
-from skillweave.training.skill_report import SkillReport
-from skillweave.training.skill_text import (
+from skillweave.training.skill_report import (
+    SkillReport,
     hints,
     idle_calls,
     skill_rows,
@@ -196,7 +196,7 @@ def test_the_table_for_people():
         "stand    25%      0       –    –      –            –        –        –       –",
     ]
     both = replace(some["go"], own_with_episode=120)
-    assert skill_rows({"go": both})[1][4] == "25% (10% last step)"
+    assert skill_rows({"go": both})[0]["ends"][0] == "25% (10% last step)"
 
 
 class Far(Steady):

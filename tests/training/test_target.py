@@ -241,8 +241,8 @@ def test_a_skill_without_success_has_no_target_success() -> None:
 def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> None:
     h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
     content = training.manifest(h, seed=0, flat=True)
-    plan(content["stages"], Evolution(2, 2, 1))
-    run = RunDirectory.create(tmp_path / "run", content | {"recipe": None})
+    plan(content.stages, Evolution(2, 2, 1))
+    run = RunDirectory.create(tmp_path / "run", content)
     try:
         with pytest.raises(SkillweaveError, match="'agent' evolves: it needs a population"):
             training.train(h, run)
@@ -252,15 +252,15 @@ def test_a_stage_that_evolves_is_not_trained_by_one_agent(tmp_path: Path) -> Non
 
 def test_a_stage_says_who_learns_and_who_decides(tmp_path: Path) -> None:
     h = Hierarchy(WALK, [Start()], algorithm=SMALL, selector=SMALL, learn="apart")
-    entries = training.manifest(h, seed=0, flat=False)["stages"]
+    entries = training.manifest(h, seed=0, flat=False).stages
     assert [(e.name, e.kind, e.learns, e.decides) for e in entries] == [
         ("start", "skill", ["start"], None),
         ("selector", "selector", ["selector"], "selector"),
     ]
     told = training.manifest(h, seed=0, flat=True)
-    assert told["kind"] == "agent"
-    assert "skills" not in told
-    assert [(e.name, e.kind, e.learns, e.decides) for e in told["stages"]] == [
+    assert told.kind == "agent"
+    assert not told.skills
+    assert [(e.name, e.kind, e.learns, e.decides) for e in told.stages] == [
         ("agent", "agent", ["agent"], None)
     ]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from skillweave.envs.obs_names import ObsNames
 from skillweave.reporting.report.film import Film
-from skillweave.training.played_episodes import Call, Episode, PlayedEpisodes
+from skillweave.training.played_calls import Episode, PlayedEpisodes
 from skillweave.types import Array
 
 MOST_COORDINATES = 16
@@ -72,18 +72,18 @@ def _episode(
         "cut": episode.cut,
         "frame": first,
         "totals": [rounded(total) for total in sums],
-        "calls": [
-            [
-                *(c.skill, c.start, c.steps, c.why, rounded(c.reward)),
-                *(None if c.own is None else rounded(c.own), c.succeeded),
-            ]
-            for c in calls
-        ],
+        "calls": page_calls(calls),
     }
     _, observed = seen(calls, named)
-    entry |= {"seen": observed} if observed else {}
-    goals = [c.goal for c in calls]
-    return entry | ({"goals": goals} if any(goals) else {})
+    return entry | ({"seen": observed} if observed else {})
+
+
+def page_calls(calls: Array) -> dict[str, list[Any]]:
+    """Return calls for the page's script: by the name of each field, the values; None: unknown."""
+    columns = {name: calls[name] for name in calls.dtype.names or () if name != "start"}
+    return {
+        k: [*map(rounded, x)] if x.dtype.kind == "f" else x.tolist() for k, x in columns.items()
+    }
 
 
 def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
@@ -110,43 +110,43 @@ def names_misfit(obs: Array, names: ObsNames | None) -> str | None:
 
 
 def decision_data(log: PlayedEpisodes, named: ObsNames | None = None) -> dict[str, Any]:
-    """Return the decisions by observation: names of coordinates, and a row for each decision.
+    """Return the decisions: names of coordinates, a row of these for each, and its call.
 
-    A row is the coordinates, then the skill, then whether its call succeeded (None: not known).
-    Only coordinates that vary are there; the episode's step is the last one. Each row has its goal
-    in words; empty: it has none.
+    Only coordinates that vary are there; the episode's step is the last one.
     """
-    calls = [call for episode in log.episodes for call in episode.calls]
+    calls = np.concatenate([episode.calls for episode in log.episodes])
     every = -(-len(calls) // MOST_DECISIONS)
     calls = calls[::every]
-    columns = varying(coordinates(np.stack([call.obs for call in calls]), named))
+    columns = varying(coordinates(calls["start"], named))
     if columns:
-        columns["step of the episode"] = np.array([float(call.start) for call in calls])
-    rows = [
-        [*(rounded(v[i]) for v in columns.values()), call.skill, call.succeeded]
-        for i, call in enumerate(calls if columns else ())
-    ]
-    goals = [call.goal for call in calls]
-    return {"names": list(columns), "rows": rows, "goals": goals, "every": every}
+        columns["step of the episode"] = calls["age"]
+    return {
+        "names": list(columns),
+        "rows": rows_of(columns),
+        "calls": page_calls(calls),
+        "every": every,
+    }
 
 
-def seen(calls: Sequence[Call], named: ObsNames | None) -> tuple[list[str], list[list[float]]]:
+def seen(calls: Array, named: ObsNames | None) -> tuple[list[str], list[list[float | None]]]:
     """Return the names of the numbers observed at the starts of calls, and their values.
 
     Both are empty if observations have no names, or more numbers than fit on the page.
     """
-    if named is None or not calls:
-        return [], []
-    columns = coordinates(np.stack([call.obs for call in calls]), named)
+    columns = {} if named is None else coordinates(calls["start"], named)
     columns = {name: v for name, v in columns.items() if not name.startswith("obs[")}
     columns = {} if len(columns) > MOST_COORDINATES else columns
-    rows = [[rounded(v[i]) for v in columns.values()] for i in range(len(calls))]
-    return list(columns), rows if columns else []
+    return list(columns), rows_of(columns)
 
 
-def rounded(value: float) -> float:
-    """Return a number as the page's data hold it: five significant digits."""
-    return float(f"{value:.5g}")
+def rows_of(columns: Mapping[str, Array]) -> list[list[float | None]]:
+    """Return columns of numbers as rows for the page."""
+    return [[*map(rounded, row)] for row in zip(*columns.values(), strict=True)]
+
+
+def rounded(value: float) -> float | None:
+    """Return a number as the page's data hold it: five significant digits; None: unknown, NaN."""
+    return None if np.isnan(value) else float(f"{value:.5g}")
 
 
 def varying(columns: Mapping[str, Array]) -> dict[str, Array]:

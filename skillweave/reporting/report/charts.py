@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from skillweave.reporting.lineage import Born, Lineage, changes_words, setting_title
+from skillweave.reporting.lineage import Lineage, changes_words, number_of, setting_title
 from skillweave.reporting.palette import RGB, is_light
+from skillweave.runs.manifest import LineageLine
 
 Spec = dict[str, Any]
 STEPS = "environment steps"
@@ -219,13 +220,13 @@ def _setting(name: str, lineage: Lineage, color: str) -> Spec:
     everyone = list(lineage.born.values())
     words = any(isinstance(b.settings[name], str) for b in everyone)
 
-    def rows(members: Sequence[Born]) -> list[dict[str, Any]]:
-        values = [b.settings[name] if words else b.number(name) for b in members]
+    def rows(members: Sequence[LineageLine]) -> list[dict[str, Any]]:
+        values = [b.settings[name] if words else number_of(b, name) for b in members]
         return [{"x": b.generation + 1, "y": v} for b, v in zip(members, values, strict=True)]
 
     y: dict[str, Any] = {"field": "y", "type": "nominal", "title": None}
     if not words:
-        values = [b.number(name) for b in everyone]
+        values = [number_of(b, name) for b in everyone]
         log = min(values) > 0 and max(values) > 5 * min(values)
         y = number_axis("y", "", scale={"type": "log"} if log else {}, axis={"tickCount": 4})
     bold = marks("line", point={"size": 35, "color": color}, strokeWidth=2, color=color)
@@ -237,7 +238,7 @@ def _setting(name: str, lineage: Lineage, color: str) -> Spec:
     return chart(f"{setting_title(name)} by generation", 150, encoding=encoding, layer=layers)
 
 
-def what_changed(born: Born) -> str:
+def what_changed(born: LineageLine) -> str:
     """Return a member's mutation in words."""
     if not born.changes:
         return {"none": "nothing", "start": "–", "goes on": "goes on"}.get(

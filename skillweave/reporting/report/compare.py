@@ -130,7 +130,7 @@ def _missing(runs: Sequence[RunDirectory], saved: Saved) -> list[str]:
 
 
 def _group_words(group: Group, summary: OverSeeds | None, say: Say) -> dict[str, Any]:
-    seeds = ", ".join(str(run.manifest["seed"]) for run in group.runs)
+    seeds = ", ".join(str(run.manifest.seed) for run in group.runs)
     words = {"key": group.key, "name": group.name, "seeds": seeds, "count": len(group.runs)}
     if summary is None:
         return words | {"iqm": None}
@@ -143,7 +143,7 @@ def _score_rows(
 ) -> dict[str, Any]:
     """Return the rows of the chart of scores: a dot for each run, a bar for each group."""
     dots = [
-        {"group": group.key, "x": score.evaluation.mean, "seed": run.manifest["seed"]}
+        {"group": group.key, "x": score.evaluation.mean, "seed": run.manifest.seed}
         for group in groups
         for run in group.runs
         if (score := saved[run.path]) is not None
@@ -207,19 +207,19 @@ def _run_row(
     group: Group, run: RunDirectory, saved: SavedEvaluation | None, say: Say
 ) -> dict[str, str]:
     score = None if saved is None else saved.evaluation.to_json()
-    stages = run.manifest["stages"]
+    stages = run.manifest.stages
     return {
         "run": facts.name_of(run),
         "group": group.key,
-        "seed": str(run.manifest["seed"]),
+        "seed": str(run.manifest.seed),
         "status": "finished" if run.finished else "not finished",
         "steps": f"{sum(s.steps or 0 for s in stages):,}",
         "seconds": f"{sum(s.seconds or 0.0 for s in stages):,.0f}",
-        "mean": say(None if score is None else score["mean"]),
+        "mean": say(None if saved is None else saved.evaluation.mean),
         "iqm": say(None if score is None else score["iqm"]),
         "solved": percent(None if saved is None else solved_share(saved.evaluation)),
         "length": NOTHING if score is None else f"{score['length_mean']:,.1f}",
-        "episodes": NOTHING if score is None else str(score["episodes"]),
+        "episodes": NOTHING if saved is None else str(len(saved.evaluation.returns)),
     }
 
 

@@ -41,7 +41,7 @@ def read_curves(run: RunDirectory) -> list[Curves]:
         RunError: the file is damaged.
     """
     curves_of: dict[tuple[str, str], Curves] = {}
-    stages = {entry.name: entry for entry in run.manifest["stages"]}
+    stages = {entry.name: entry for entry in run.manifest.stages}
     for line in run.metrics():
         stage = str(line.get("stage"))
         if stage not in stages or "steps" not in line:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from skillweave.policies.core import flat
 from skillweave.runs.command_words import command_words
 from skillweave.runs.directory import RunDirectory
-from skillweave.runs.manifest import as_json
+from skillweave.runs.manifest import LevelEntry, Manifest
+from skillweave.schema import as_json
 from skillweave.skills import Skill
-from skillweave.training.skill_report import SkillReport, all_steps
+from skillweave.training.skill_report import SkillReport, Words
 
 DIGITS = 3
 """Significant digits."""
@@ -64,6 +65,11 @@ def percent(value: float | None) -> str:
     return f"{100 * value:.0f} %"
 
 
+def span(bounds: Iterable[Any], say: Callable[[float], str] = percent) -> str:
+    """Return the bounds of an interval in words."""
+    return " to ".join(say(float(bound)) for bound in bounds)
+
+
 # Runs and stages
 
 LEFT_OUT = {"status", "final", "sha256", "policies", "metrics_bytes", "lineage_bytes", "winner"}
@@ -83,6 +89,8 @@ MADE = {
     "continued",
 }
 """Fields of a stage's entry that training wrote, or that follow from the hierarchy's settings."""
+OF_CODE = ("selector", "guide")
+"""Fields of the outermost hierarchy's entry that are no settings."""
 
 
 def name_of(run: RunDirectory) -> str:
@@ -93,28 +101,27 @@ def name_of(run: RunDirectory) -> str:
 def facts(run: RunDirectory) -> list[tuple[str, str]]:
     """Return facts about the training, by name."""
     manifest = run.manifest
-    rows = [("Environment", manifest["env"])]
-    if manifest["env_kwargs"]:
-        rows.append(("Made with", plain(manifest["env_kwargs"])))
-    rows.append(("Recipe", manifest.get("recipe") or "declared in Python"))
-    rows += [("Seed", str(manifest["seed"])), ("Made", manifest["created"].replace("T", " "))]
-    if manifest["kind"] == "hierarchy":
-        rows.append(("Skills", ", ".join(s.name for s in manifest["skills"])))
-        rows.append(("A call lasts", _call_length(manifest)))
-        selector = manifest.get("selector")
-        rows.append(("Selector", f"ready: {selector['kind']}" if selector else "trained"))
-        rows.append(("Learning", manifest.get("learn", "apart")))
-        if manifest.get("interrupt") is not None:
-            rows.append(("Calls are cut at", f"{manifest['interrupt']} deviations"))
-        if manifest.get("reflexes"):
-            rows.append(("Reflexes", ", ".join(manifest["reflexes"])))
+    rows = [("Environment", manifest.env)]
+    if manifest.env_kwargs:
+        rows.append(("Made with", plain(manifest.env_kwargs)))
+    rows.append(("Recipe", manifest.recipe or "declared in Python"))
+    rows += [("Seed", str(manifest.seed)), ("Made", manifest.created.replace("T", " "))]
+    if (level := manifest.hierarchy) is not None:
+        rows.append(("Skills", ", ".join(manifest.by_path)))
+        rows.append(("A call lasts", _call_length(level)))
+        rows.append(("Selector", f"ready: {level.selector.kind}" if level.selector else "trained"))
+        rows.append(("Learning", level.learn))
+        if level.interrupt is not None:
+            rows.append(("Calls are cut at", f"{level.interrupt} deviations"))
+        if level.reflexes:
+            rows.append(("Reflexes", ", ".join(level.reflexes)))
     return rows
 
 
-def _call_length(manifest: Mapping[str, Any]) -> str:
-    if "call_lengths" in manifest:
-        return f"{plain(manifest['call_lengths'])} steps at most, as the selector chooses"
-    most = manifest["call_steps"]
+def _call_length(level: LevelEntry) -> str:
+    if level.call_lengths:
+        return f"{plain(level.call_lengths)} steps at most, as the selector chooses"
+    most = level.call_steps
     if most is None:
         return "until the skill stops"
     return "1 step" if most == 1 else f"at most {most:,} steps"
@@ -123,7 +130,7 @@ def _call_length(manifest: Mapping[str, Any]) -> str:
 def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, str]]:
     """Return a row for each stage; ``steps``: by stage, the steps of its last metrics."""
     rows = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         notes = []
         if entry.continued:
             notes.append(f"continued after {', '.join(f'{k:,}' for k in entry.continued)} steps")
@@ -156,7 +163,7 @@ def stage_rows(run: RunDirectory, steps: Mapping[str, int]) -> list[dict[str, st
 def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     """Return a sentence for each unfinished stage; ``steps``: by stage, at its last metrics."""
     sentences = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         name, budget = entry.name, entry.budget
         if entry.status == "waiting":
             sentences.append(f"The stage {name!r} has not begun.")
@@ -173,32 +180,17 @@ def missing_stages(run: RunDirectory, steps: Mapping[str, int]) -> list[str]:
     return sentences
 
 
-def settings(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def settings(manifest: Manifest) -> dict[str, Any]:
     """Return every setting in a run's manifest by its dotted name, without seed and results."""
-    values: dict[str, Any] = {"env": manifest["env"]} | flat(manifest["env_kwargs"], "env_kwargs.")
-    names = (
-        "kind",
-        "learn",
-        "call_steps",
-        "call_lengths",
-        "interrupt",
-        "greedy_skills",
-        "greedy_selector",
-        "start_calls",
-        "search_steps",
-        "episode_calls",
-        "call_cost",
-        "reflexes",
-        "checkpoint_every",
-        "eval_every",
-        "eval_episodes",
-        "keep",
-    )
-    values |= {k: manifest[k] for k in names if k in manifest}
-    for skill in manifest.get("skills", ()):
+    values: dict[str, Any] = {"env": manifest.env} | flat(manifest.env_kwargs, "env_kwargs.")
+    level = as_json(manifest.hierarchy) or {}
+    values |= {"kind": manifest.kind} | {k: level[k] for k in level if k not in OF_CODE}
+    names = ("checkpoint_every", "eval_every", "eval_episodes", "keep")
+    values |= {name: getattr(manifest, name) for name in names}
+    for skill in manifest.skills:
         fields = {k: v for k, v in as_json(skill).items() if k != "name"}
         values |= flat(fields, f"skills.{skill.name}.")
-    for entry in manifest["stages"]:
+    for entry in manifest.stages:
         left_out = LEFT_OUT | MADE | {"name", "starts"}
         fields = {k: v for k, v in as_json(entry).items() if k not in left_out}
         # From which run differs from seed to seed.
@@ -229,37 +221,8 @@ WHY = {
     "episode": "with the episode",
 }
 """Ends of calls in the page's words."""
-
-
-def skill_rows(reports: Mapping[str, SkillReport]) -> list[dict[str, Any]]:
-    """Return a row for each skill."""
-    total = all_steps(reports)
-    longest = max(scale_of(report.length_mean for report in reports.values()), 10)
-    rows = []
-    for name, report in reports.items():
-        calls = report.calls
-        known = bool(report.ended and calls)
-        rows.append(
-            {
-                "name": name,
-                "share": report.steps / total if total else 0.0,
-                "percent": percent(report.steps / total if total else 0.0),
-                "calls": f"{calls:,}",
-                "length": number(report.length_mean, longest),
-                "ends": end_cells(report.ended, report.own_with_episode, calls if known else 0),
-                "success": percent(report.success_rate),
-                "return": number(report.return_mean),
-            }
-        )
-    return rows
-
-
-def end_cells(reasons: Mapping[str, int], own_with_episode: int, calls: int) -> list[str]:
-    """Return the shares of the ends of calls; 0 ``calls``: unknown."""
-    cells = [percent(reasons[why] / calls if calls else None) for why in WHY]
-    if own_with_episode:
-        cells[0] += f" ({percent(own_with_episode / calls)} in the last step)"
-    return cells
+WORDS: Words = (percent, number, "in the last step")
+"""How the page writes the rows of skills."""
 
 
 def about(skill: Skill) -> str:
@@ -268,19 +231,6 @@ def about(skill: Skill) -> str:
         if text := inspect.cleandoc(kind.__doc__ or ""):
             return " ".join(text.split("\n\n")[0].split()).replace("``", "`")
     return ""
-
-
-def reflex_rows(reflexes: Mapping[str, int], total: int) -> list[dict[str, Any]]:
-    """Return a row for each reflex: in how many of ``total`` steps it acted."""
-    return [
-        {
-            "name": name,
-            "steps": f"{steps:,}",
-            "share": steps / total,
-            "percent": percent(steps / total),
-        }
-        for name, steps in reflexes.items()
-    ]
 
 
 def transitions(reports: Mapping[str, SkillReport]) -> list[list[int]] | None:
@@ -305,10 +255,6 @@ def transition_rows(
     rows = []
     for name, row in zip(("start of an episode", *labels), counts, strict=True):
         total = sum(row)
-        shares = [n / total if total else 0.0 for n in row]
-        cells = [
-            {"count": f"{n:,.0f}", "share": share, "percent": percent(share)}
-            for n, share in zip(row, shares, strict=True)
-        ]
+        cells = [{"count": f"{n:,.0f}", "share": n / total if total else 0.0} for n in row]
         rows.append({"name": name, "total": total, "cells": cells})
     return rows

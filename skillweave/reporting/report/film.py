@@ -18,7 +18,7 @@ from skillweave.reporting.progress import EpisodeProgress
 from skillweave.reporting.screen import without_screen
 from skillweave.reporting.video import enlarged, frame_of
 from skillweave.reporting.video_file import VideoWriter
-from skillweave.training.played_episodes import Episode
+from skillweave.training.played_calls import Episode
 from skillweave.types import Array
 
 MOST_FRAMES = 1_500

@@ -43,14 +43,14 @@ def grouped(runs: Sequence[RunDirectory]) -> list[Group]:
     by_settings: dict[str, Group] = {}
     for run in runs:
         settings = facts.settings(run.manifest)
-        key = json.dumps([run.manifest.get("recipe"), settings], sort_keys=True, default=str)
+        key = json.dumps([run.manifest.recipe, settings], sort_keys=True, default=str)
         new = Group(_letter(len(by_settings)), _base(run), [], settings)
         group = by_settings.setdefault(key, new)
         for other in group.runs:
-            if other.manifest["seed"] == run.manifest["seed"]:
+            if other.manifest.seed == run.manifest.seed:
                 raise DeclarationError(
                     f"{other.path} and {run.path} have the same settings and the same seed, "
-                    f"{run.manifest['seed']}; name one of them"
+                    f"{run.manifest.seed}; name one of them"
                 )
         group.runs.append(run)
     groups = list(by_settings.values())
@@ -74,9 +74,9 @@ def _value(group: Group, name: str) -> str:
 
 
 def _base(run: RunDirectory) -> str:
-    recipe = run.manifest.get("recipe")
-    name = Path(recipe).stem if recipe else run.manifest["env"]
-    return f"{name}, plain agent" if recipe and run.manifest["kind"] == "agent" else name
+    recipe = run.manifest.recipe
+    name = Path(recipe).stem if recipe else run.manifest.env
+    return f"{name}, plain agent" if recipe and run.manifest.hierarchy is None else name
 
 
 def _distinguishing(groups: Sequence[Group]) -> list[str]:
@@ -120,7 +120,7 @@ class OverSeeds:
         """Return a single number's interval in words; empty: it has none."""
         if self.low is None or self.high is None:
             return ""
-        return f"{say(float(self.low))} to {say(float(self.high))}"
+        return facts.span((self.low, self.high), say)
 
 
 def over_seeds(values: Array | Sequence[float]) -> OverSeeds:

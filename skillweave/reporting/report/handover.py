@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from skillweave.errors import EnvError, SkillweaveError
 from skillweave.messages import short
 from skillweave.planning import CallLog, Handover
 from skillweave.planning.handover import before_each
+from skillweave.planning.neighbors import evenly
 from skillweave.reporting.report import charts
 from skillweave.reporting.report.calls import (
     coordinates,
@@ -23,7 +24,7 @@ from skillweave.reporting.report.calls import (
     rounded,
     varying,
 )
-from skillweave.reporting.report.facts import WHY, end_cells, number, percent, scale_of
+from skillweave.reporting.report.facts import WHY, WORDS, number, percent, scale_of, span
 from skillweave.reporting.report.film import HOLD, Film, Shot, make_film
 from skillweave.reporting.report.page import Section
 from skillweave.seeding import Seeds, global_generators
@@ -31,6 +32,7 @@ from skillweave.skills import Skill
 from skillweave.skills.goal_spaces import shown_goal
 from skillweave.skills.goals import goals_of
 from skillweave.spaces import env_form
+from skillweave.training.skill_report import end_cells
 from skillweave.types import Array
 
 MOST_FRAMES = 1_200
@@ -47,27 +49,22 @@ MOST_POINTS = 2_000
 """The most calls in the chart, of all cells."""
 
 
-@dataclass
+Cells = Mapping[tuple[int, int], Array]
+"""The rows of the log by the skills before and after, as places in the matrix."""
+
+
+@dataclass(frozen=True)
 class _Clip:
     """A call, with the end of the call before."""
 
     row: int
     """Of the log."""
+    before: int
+    """The row of the call before; −1: it begins an episode."""
     lead: int
     """Steps that are shown of the call before."""
     steps: int
     """Steps that are shown of the call."""
-    frame: int = 0
-    """The first one in the film."""
-
-
-@dataclass
-class _Cell:
-    """The calls of one skill after another one."""
-
-    rows: Array
-    """Of the log."""
-    clips: list[_Clip] = field(default_factory=list)
 
 
 def handover_section(
@@ -89,27 +86,33 @@ def handover_section(
     matrix, missing = log.handover(), []
     before = before_each(log, log.succeeded)
     cells = {
-        (i, j): _Cell(np.flatnonzero((before == i) & (log.skill == j)))
+        (i, j): np.flatnonzero((before == i) & (log.skill == j))
         for i, j in np.argwhere(matrix.calls > 0).tolist()
     }
-    film = None
+    film, clips = None, list[_Clip]()
     if spec is not None and filmed:
         try:
-            film = _film(log, spec, cells, matrix)
+            clips = _choose_clips(log, cells, matrix)
+            film = _film(log, spec, clips) if clips else None
         except SkillweaveError as error:
             missing.append(f"There is no film of handovers: {str(error).rstrip('.')}.")
     named = None if spec is None else spec.observation_names()
     named = None if names_misfit(log.start[:1], named) else named
-    if film is None:
-        for cell in cells.values():
-            cell.clips = []
     points = _points(log, cells, named)
     done = ("done", "not done")
+    shown = {
+        (i, j): _cell(matrix, i, j, log.take(rows).reasons)
+        | {
+            "clips": [
+                _shown(log, clip, film, with_goals)
+                for clip in clips
+                if film is not None and clip.row in rows
+            ]
+        }
+        for (i, j), rows in cells.items()
+    }
     data = {
-        "cells": {
-            f"{i}-{j}": _cell(matrix, i, j, log, cell, film, with_goals)
-            for (i, j), cell in cells.items()
-        },
+        "cells": {cell["id"]: cell for cell in shown.values()},
         "colors": dict(colors),
         "words": list(done),
         "spec": charts.handover(done),
@@ -117,31 +120,31 @@ def handover_section(
     }
     if film is not None:
         data["film"] = {"fps": film.fps}
-    context = {"handover": _words(log, matrix, named), "hand_film": film}
+    context = {"handover": _words(log, matrix, shown, named), "hand_film": film}
     return Section(context, {"handover": data}, missing)
 
 
-def _words(log: CallLog, matrix: Handover, named: ObsNames | None) -> dict[str, Any]:
-    weak = set(matrix.weak())
-    rows = []
-    for i, name in enumerate(matrix.before):
-        cells: list[dict[str, Any] | None] = []
-        for j in range(len(matrix.skills)):
-            calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-            if not calls:
-                cells.append(None)
-                continue
-            cell = {"id": f"{i}-{j}", "share": done / calls, "percent": percent(done / calls)}
-            cell |= {"count": f"{done:,} of {calls:,}", "weak": (i, j) in weak}
-            cells.append(cell | {"words": _interval(matrix, i, j)})
-        rows.append({"name": name if i else "start of an episode", "cells": cells})
+def _words(
+    log: CallLog,
+    matrix: Handover,
+    shown: Mapping[tuple[int, int], Mapping[str, Any]],
+    named: ObsNames | None,
+) -> dict[str, Any]:
+    """Return what the section's words are made of; ``shown``: of each cell."""
+    rows = [
+        {
+            "name": name if i else "start of an episode",
+            "cells": [shown.get((i, j)) for j in range(len(matrix.skills))],
+        }
+        for i, name in enumerate(matrix.before)
+    ]
     # Names between backticks, and percents as the page writes them.
     prose = [re.sub(r"'([^']+)'", r"`\1`", sentence) for sentence in matrix.weakest()]
     return {
         "columns": list(matrix.skills),
         "rows": rows,
         "weakest": [re.sub(r"(\d)%", r"\1 %", sentence) + "." for sentence in prose],
-        "weak": bool(weak),
+        "weak": any(cell["weak"] for cell in shown.values()),
         "meaning": matrix.meaning,
         "calls": f"{len(log):,}",
         "steps": f"{log.steps:,}",
@@ -149,11 +152,6 @@ def _words(log: CallLog, matrix: Handover, named: ObsNames | None) -> dict[str, 
         "ends": _end_rows(log),
         "where": _where_rows(log, named),
     }
-
-
-def _interval(matrix: Handover, i: int, j: int) -> str:
-    low, high = (percent(float(bound[i, j])) for bound in matrix.interval)
-    return f"{low} to {high}"
 
 
 def _called(log: CallLog) -> list[str]:
@@ -171,7 +169,7 @@ def _end_rows(log: CallLog) -> list[dict[str, Any]]:
                 "name": name,
                 "calls": f"{ends.calls:,}",
                 "length": number(ends.steps, max(ends.steps, 10)),
-                "ends": end_cells(ends.reasons, ends.own_with_episode, ends.calls),
+                "ends": end_cells(ends.reasons, ends.own_with_episode, ends.calls, WORDS),
                 "done": percent(ends.succeeded),
             }
         )
@@ -195,9 +193,7 @@ def _where_rows(log: CallLog, named: ObsNames | None) -> dict[str, Any]:
     return {"skills": skills, "rows": rows}
 
 
-def _points(
-    log: CallLog, cells: Mapping[tuple[int, int], _Cell], named: ObsNames | None
-) -> dict[str, Any]:
+def _points(log: CallLog, cells: Cells, named: ObsNames | None) -> dict[str, Any]:
     """Return names of coordinates, and rows of each cell: at start and end of a call, if done."""
     both = {when: coordinates(obs, named) for when, obs in (("start", log.start), ("end", log.end))}
     names = list(varying({k: np.stack([v, both["end"][k]]) for k, v in both["start"].items()}))
@@ -205,46 +201,45 @@ def _points(
         return {"names": [], "points": {}}
     most = max(10, MOST_POINTS // max(1, len(cells)))
     points = {}
-    for (i, j), cell in cells.items():
-        rows = cell.rows[np.linspace(0, len(cell.rows) - 1, min(most, len(cell.rows))).astype(int)]
+    for (i, j), rows in cells.items():
+        some = evenly(rows, most)
         points[f"{i}-{j}"] = [
             [*(rounded(both[when][k][c]) for when in both for k in names), int(log.succeeded[c])]
-            for c in rows
+            for c in some
         ]
     return {"names": names, "points": points}
 
 
-def _cell(
-    matrix: Handover,
-    i: int,
-    j: int,
-    log: CallLog,
-    cell: _Cell,
-    film: Film | None,
-    with_goals: Mapping[str, Skill],
-) -> dict[str, Any]:
-    """Return a cell for the page's script."""
+def _cell(matrix: Handover, i: int, j: int, reasons: Mapping[str, int]) -> dict[str, Any]:
+    """Return a cell for the page and its script; ``reasons``: its calls by their ends."""
     calls, done = int(matrix.calls[i, j]), int(matrix.done[i, j])
-    reasons = dict.fromkeys(WHY, 0) | log.take(cell.rows).call_ends(matrix.skills[j]).reasons
+    count = f"{done:,} of {calls:,}"
     return {
+        "id": f"{i}-{j}",
         "skill": matrix.skills[j],
         "before": matrix.before[i] if i else "",
-        "done": f"{done:,} of {calls:,} calls ({percent(done / calls)})",
-        "interval": _interval(matrix, i, j),
+        "share": done / calls,
+        "count": count,
+        "done": f"{count} calls ({percent(done / calls)})",
+        "weak": (i, j) in matrix.weak(),
+        "interval": span(bound[i, j] for bound in matrix.interval),
         "ends": ", ".join(f"{WHY[why]} {n:,}" for why, n in reasons.items() if n),
-        "clips": [
-            {
-                "from": clip.frame,
-                "call": clip.frame + -(-clip.lead // film.every),
-                "to": clip.frame + -(-(clip.lead + clip.steps) // film.every) + HOLD,
-                "done": bool(log.succeeded[clip.row]),
-                "steps": int(log.tau[clip.row]),
-                "goal": _goal(log, clip.row, with_goals),
-                "before_goal": _goal(log, _before(log, clip.row), with_goals) if i else "",
-            }
-            for clip in cell.clips
-            if film is not None
-        ],
+    }
+
+
+def _shown(
+    log: CallLog, clip: _Clip, film: Film, with_goals: Mapping[str, Skill]
+) -> dict[str, Any]:
+    """Return a clip for the page's script."""
+    first = film.first[clip.row]
+    return {
+        "from": first,
+        "call": first + -(-clip.lead // film.every),
+        "to": first + -(-(clip.lead + clip.steps) // film.every) + HOLD,
+        "done": bool(log.succeeded[clip.row]),
+        "steps": int(log.tau[clip.row]),
+        "goal": _goal(log, clip.row, with_goals),
+        "before_goal": _goal(log, clip.before, with_goals) if clip.before >= 0 else "",
     }
 
 
@@ -261,45 +256,35 @@ def _goal(log: CallLog, row: int, with_goals: Mapping[str, Skill]) -> str:
 
 
 @global_generators(Seeds(0) / "handover film")
-def _film(
-    log: CallLog, spec: EnvSpec, cells: Mapping[tuple[int, int], _Cell], matrix: Handover
-) -> Film | None:
-    """Play calls of each cell again, and film them; None: none can be played again.
+def _film(log: CallLog, spec: EnvSpec, clips: Sequence[_Clip]) -> Film:
+    """Play calls again, and film them.
 
     Raises:
         EnvError: the environment gives no frames, or does not repeat itself.
         MissingExtra: the extra 'video' is not installed.
     """
-    clips = _choose_clips(log, cells, matrix)
-    if not clips:
-        return None
-    film = make_film(
+    return make_film(
         spec,
         {clip.row: _shot(log, clip) for clip in clips},
         most_frames=MOST_FRAMES,
         most_bytes=MOST_BYTES,
         check_spaces=log.check_spaces,
     )
-    for clip in clips:
-        clip.frame = film.first[clip.row]
-    return film
 
 
-def _choose_clips(
-    log: CallLog, cells: Mapping[tuple[int, int], _Cell], matrix: Handover
-) -> list[_Clip]:
+def _choose_clips(log: CallLog, cells: Cells, matrix: Handover) -> list[_Clip]:
     """Choose calls of each cell, one that was not done and one that was, as many as fit.
 
     Cells that are worse than others come first, and two of their calls that were not done.
     """
     playable, weak = _playable(log), set(matrix.weak())
-    age = np.array(log.age)
+    age, tau = np.array(log.age), log.tau
     order = sorted(cells, key=lambda place: (place not in weak, matrix.rate[place]))
-    chosen: list[_Clip] = []
+    chosen: dict[int, _Clip] = {}
     filmed = replayed = 0
     for many in (False, True):  # a second one of the weak cells if there is room
         for place in order:
-            rows = cells[place].rows[playable[cells[place].rows]]
+            rows = cells[place][playable[cells[place]]]
             for done in (False,) if many else (False, True):
                 some = rows[log.succeeded[rows] == done]
                 if (many and place not in weak) or len(some) <= many:
@@ -308,23 +293,16 @@ def _choose_clips(
                 row = int(
                     some[np.argsort(age[some], kind="stable")][len(some) // (3 if many else 2)]
                 )
-                tau = int(log.tau[row])
-                lead = min(LEAD, int(log.tau[_before(log, row)])) if place[0] else 0
-                clip = _Clip(row, lead, min(tau, LONGEST))
-                shown, steps = clip.lead + clip.steps, int(age[row]) + tau
+                before = int(np.flatnonzero(log.followed_by == row)[0]) if place[0] else -1
+                lead = min(LEAD, int(tau[before])) if place[0] else 0
+                clip = _Clip(row, before, lead, min(int(tau[row]), LONGEST))
+                shown, steps = clip.lead + clip.steps, int(age[row] + tau[row])
                 if filmed + shown > MOST_FILMED or replayed + steps > MOST_REPLAYED:
                     continue
-                if any(clip.row == other.row for other in cells[place].clips):
-                    continue
-                filmed, replayed = filmed + shown, replayed + steps
-                cells[place].clips.append(clip)
-                chosen.append(clip)
-    return chosen
-
-
-def _before(log: CallLog, row: int) -> int:
-    """Return the call before a call."""
-    return int(np.flatnonzero(log.followed_by == row)[0])
+                if row not in chosen:
+                    filmed, replayed = filmed + shown, replayed + steps
+                    chosen[row] = clip
+    return list(chosen.values())
 
 
 def _playable(log: CallLog) -> Array:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skillweave.errors import MissingExtra
+from skillweave.errors import needs_extra
+from skillweave.reporting.report.facts import percent
 from skillweave.runs.files import write_bytes
 
 LOCAL = Path(__file__).parent / "templates"
@@ -54,6 +55,7 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["percent"] = percent
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     parts = {
         "style": (LOCAL / "style.css").read_text("utf-8"),
@@ -86,7 +88,5 @@ def need(module: str) -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
+    with needs_extra("a report", "report"):
         return importlib.import_module(module)
-    except ImportError as error:
-        raise MissingExtra("a report", "report") from error

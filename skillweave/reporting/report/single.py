@@ -5,13 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from skillweave.envs.make import EnvSpec
 from skillweave.envs.obs_names import ObsNames
 from skillweave.errors import SkillweaveError
-from skillweave.paths import AGENT, join
+from skillweave.paths import AGENT
+from skillweave.planning.columns import ENDS
 from skillweave.planning.handover import wilson
 from skillweave.planning.run_log import load_calls
 from skillweave.reporting.lineage import read_lineage, setting_title, short_value
@@ -35,12 +37,12 @@ from skillweave.reporting.report.curves import (
 )
 from skillweave.reporting.report.facts import (
     WHY,
+    WORDS,
     about,
     number,
     percent,
-    reflex_rows,
     scale_of,
-    skill_rows,
+    span,
     transition_rows,
     transitions,
 )
@@ -58,9 +60,8 @@ from skillweave.skills.base import RecordedSkill
 from skillweave.training.evaluation import Evaluation, episode_seeds, evaluate
 from skillweave.training.evaluation_file import SavedEvaluation, load_evaluation
 from skillweave.training.play import Played as PlayedStep
-from skillweave.training.played_calls import PlayedCalls
-from skillweave.training.played_episodes import PlayedEpisodes
-from skillweave.training.skill_report import levels_of
+from skillweave.training.played_calls import PlayedCalls, PlayedEpisodes
+from skillweave.training.skill_report import levels_of, skill_rows
 from skillweave.types import Policy
 
 EPISODES = 20
@@ -96,15 +97,21 @@ def play_episodes(
     """Play episodes with seeds that training never used, and film some of them."""
     spaces = policy.observation_space, policy.action_space
     calls = PlayedCalls(policy, spaces, own_rewards=True, inside=False)
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "num_envs": num_envs}
-    how["deterministic"] = deterministic
     with EpisodeProgress(episodes, quiet=quiet, name="report") as progress:
 
         def watch(played: PlayedStep) -> None:
             calls.add(played)
             progress.watch(played)
 
-        score = evaluate(policy, spec, watch=watch, **how)
+        score = evaluate(
+            policy,
+            spec,
+            episodes=episodes,
+            seed=seed,
+            deterministic=deterministic,
+            num_envs=num_envs,
+            watch=watch,
+        )
     seeds = episode_seeds(seed, episodes)
     log = PlayedEpisodes(calls, seeds)
     film = None
@@ -117,12 +124,7 @@ def play_episodes(
             missing.append(f"There is no film: {_sentence(error)}")
     wanted = [skill.color for skill in log.skills] or [None] * len(log.labels)
     colors = {k: color_of(i, wanted[i]) for i, k in enumerate(log.labels)}
-    with_goals = {
-        join(path, skill.name): skill
-        for path, recorder in calls.recorders().items()
-        for skill in recorder.skills.skills
-        if skill.goal_space is not None
-    }
+    with_goals = {k: skill for k, skill in calls.skills().items() if skill.goal_space is not None}
     section = _section(log, film, spec.observation_names(), colors, missing)
     if with_goals:
         pictures = goal_pictures(calls.logs(seeds), with_goals, "in the played episodes")
@@ -143,7 +145,7 @@ def _section(
             "Of the calls, neither the skills' own rewards nor their successes are known, as the "
             "run was loaded without the code of its skills: --recipe FILE.py gives it."
         )
-    if misfit := names_misfit(log.episodes[0].calls[0].obs[None], named):
+    if misfit := names_misfit(log.episodes[0].calls["start"][:1], named):
         missing.append(misfit)
     shown, left_out = episode_data(log, film, named)
     missing += left_out
@@ -158,13 +160,14 @@ def _section(
         "goals": [],
     }
     data: dict[str, Any] = {"labels": labels, "colors": hues, "inks": inks, "episodes": shown}
+    data["judged"] = log.judged
     data["seen"], _ = seen(log.episodes[0].calls[:1], named)
     if film is not None:
         data["film"] = {"fps": film.fps, "every": film.every}
     if context["has_skills"]:
         decisions = decision_data(log, named)
-        used = sorted({row[-2] for row in decisions["rows"]})
-        goals = any(decisions["goals"])
+        used = sorted({*decisions["calls"]["skill"]}) if decisions["rows"] else []
+        goals = any(decisions["calls"]["goal"])
         spec = charts.choices([labels[i] for i in used], [hues[i] for i in used], goals=goals)
         data["decisions"] = decisions | {"spec": spec}
     return Section(context, data, missing)
@@ -222,7 +225,7 @@ def write_report(
             sections.append(played.section)
         except SkillweaveError as error:
             missing.append(f"There are no episodes and no film: {_sentence(error)}")
-    if not all_curves and run.manifest["stages"]:
+    if not all_curves and run.manifest.stages:
         missing.append("There are no learning curves: no metrics were written yet.")
     colors = _colors(run, played)
     try:
@@ -237,7 +240,8 @@ def write_report(
         if played is not None:
             pictures = goal_pictures({"": log}, with_goals, "of the run’s log")
             played.section.context["goals"] += pictures
-    data: dict[str, Any] = {"curves": _curves(all_curves, colors), "why": WHY}
+    data: dict[str, Any] = {"curves": _curves(all_curves, colors)}
+    data["why"] = {end: WHY[name] for end, name in ENDS.items()}
     context = _words(run, missing, reached) | _scores(run, played, seed, deterministic)
     context |= _lineages(run, data, colors)
     context |= {"curves": [c.label for c in all_curves], "metrics": metrics_of(all_curves)}
@@ -258,10 +262,10 @@ def _sentence(error: SkillweaveError) -> str:
 
 def _colors(run: RunDirectory, played: Played | None) -> dict[str, str]:
     """Return colours by name: skills as in timelines, then the other agents that learnt."""
-    names = [skill.name for skill in run.manifest.get("skills", ())]
+    names = [skill.name for skill in run.manifest.skills]
     colors = {name: color_of(i) for i, name in enumerate(names)}
     colors |= {} if played is None else played.colors
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         for name in (entry.name, *entry.learns, *entry.algorithms):
             colors.setdefault(name, color_of(len(colors)))
     return {name: hex_of(color) for name, color in colors.items()}
@@ -286,17 +290,17 @@ def _words(run: RunDirectory, missing: list[str], reached: Mapping[str, int]) ->
     manifest = run.manifest
     return {
         "title": facts.name_of(run),
-        "kind": "hierarchy" if manifest["kind"] == "hierarchy" else "plain agent",
-        "env": manifest["env"],
+        "kind": "plain agent" if manifest.hierarchy is None else "hierarchy",
+        "env": manifest.env,
         "facts": facts.facts(run),
         "stages": facts.stage_rows(run, reached),
         "settings": [(k, facts.plain(v)) for k, v in facts.settings(manifest).items()],
-        "versions": list(manifest["versions"].items()),
+        "versions": list(manifest.versions.items()),
         "steps": sum(
             reached.get(entry.name, 0) if entry.steps is None else entry.steps
-            for entry in manifest["stages"]
+            for entry in manifest.stages
         ),
-        "training_seconds": sum(entry.seconds or 0.0 for entry in manifest["stages"]),
+        "training_seconds": sum(entry.seconds or 0.0 for entry in manifest.stages),
         "missing": missing,
         "finished": run.finished,
     }
@@ -314,7 +318,7 @@ def _scores(
             saved, source = own, "played for this report"
     if saved is None:
         nothing: dict[str, Any] = dict.fromkeys(("skill_table", "reflexes", "transitions"), ())
-        text = no_verdict(run.manifest["stages"])
+        text = no_verdict(run.manifest.stages)
         return nothing | {"verdict": text, "binary": False, "score": None}
     score = saved.evaluation
     docs = (
@@ -329,9 +333,9 @@ def _scores(
         "binary": is_binary(score.returns),
         "score": score_words(score) | {"of": of},
         "skill_table": [
-            row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills)
+            row | {"about": docs.get(row["name"], "")} for row in skill_rows(score.skills, WORDS)
         ],
-        "reflexes": reflex_rows(score.reflexes, sum(score.lengths)),
+        "reflexes": score.to_json()["reflexes"],
         "transitions": [
             (path, transition_rows(list(reports), counts))
             for path, reports in levels_of(score.skills).items()
@@ -343,33 +347,31 @@ def _scores(
 def score_words(score: Evaluation) -> dict[str, Any]:
     """Return the score as texts; digits fit the scale of the returns."""
     score_json = score.to_json()
-    scale = scale_of(score.returns)
-    low, high = (number(value, scale) for value in score_json["ci95"])
+    say = partial(number, scale=scale_of(score.returns))
     count = solved(score)
     words: dict[str, Any] = {
-        "mean": number(score_json["mean"], scale),
-        "interval": None if len(score.returns) == 1 else f"{low} to {high}",
-        "iqm": number(score_json["iqm"], scale),
-        "range": f"{number(score_json['min'], scale)} to {number(score_json['max'], scale)}",
-        "reached": percent(score_json["solved_fraction"]),
+        "mean": say(score.mean),
+        "interval": None if len(score.returns) == 1 else span(score_json["ci95"], say),
+        "iqm": say(score_json["iqm"]),
+        "range": span((min(score.returns), max(score.returns)), say),
+        "reached": percent(score.solved_fraction),
         "threshold": None if score.threshold is None else f"{score.threshold:g}",
         "length": number(score_json["length_mean"], max(score_json["length_mean"], 10)),
-        "cut": score_json["cut"],
+        "cut": score.cut,
         "binary": is_binary(score.returns),
         "solved": None,
     }
     if count is None:
         return words
-    low, high = (percent(float(bound)) for bound in wilson(count, len(score.returns)))
-    share = percent(count / len(score.returns))
-    return words | {"solved": share, "solved_interval": f"{low} to {high}"}
+    interval = span(wilson(count, len(score.returns)))
+    return words | {"solved": percent(count / len(score.returns)), "solved_interval": interval}
 
 
 def _lineages(run: RunDirectory, data: dict[str, Any], colors: Mapping[str, str]) -> dict[str, Any]:
     """Return a section for each stage whose population evolved."""
     sections = []
     data["trees"] = []
-    for entry in run.manifest["stages"]:
+    for entry in run.manifest.stages:
         lineage = read_lineage(run, entry.name)
         if lineage is None:
             continue

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 from skillweave.paths import level_of
 from skillweave.planning.handover import wilson
-from skillweave.reporting.report.facts import number, percent, scale_of
+from skillweave.reporting.report.facts import number, percent, scale_of, span
 from skillweave.runs.manifest import StageEntry
 from skillweave.training.evaluation import Evaluation
 from skillweave.training.skill_report import SkillReport, all_steps
@@ -72,9 +73,10 @@ def _outcome(score: Evaluation) -> str:
     if count is not None:
         if n < FEW:
             return f"Solves {count} of {n} {'episode' if n == 1 else 'episodes'}: too few to judge"
-        least, most = (percent(float(bound)) for bound in wilson(count, n))
-        return f"Solves {percent(count / n)} of {episodes}, so probably {least} to {most} of all"
-    mean = number(score.mean, scale_of(score.returns))
+        share = span(wilson(count, n))
+        return f"Solves {percent(count / n)} of {episodes}, so probably {share} of all"
+    say = partial(number, scale=scale_of(score.returns))
+    mean = say(score.mean)
     if n < FEW:
         return f"Mean return {mean} over {episodes}: too few to judge"
     if score.threshold is not None:
@@ -83,8 +85,8 @@ def _outcome(score: Evaluation) -> str:
             f"Reaches the environment's threshold of {score.threshold:g} in {reached} of "
             f"{episodes} (mean return {mean})"
         )
-    low, high = (number(value, scale_of(score.returns)) for value in score.to_json()["ci95"])
-    return f"Mean return {mean} over {episodes} (95 % interval {low} to {high})"
+    interval = span(score.to_json()["ci95"], say)
+    return f"Mean return {mean} over {episodes} (95 % interval {interval})"
 
 
 def _skills(skills: Mapping[str, SkillReport], total: int) -> list[str]:

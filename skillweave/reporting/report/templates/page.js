@@ -76,18 +76,25 @@
   });
   for (const [id, spec] of Object.entries(data.charts ?? {})) draw($(id), spec);
 
+  // Calls: of each field a list in the page, here an object for each call. Its fields are those of a
+  // recorder's rows, with `skill`, a place in data.labels, and `goal`, in words.
+
+  const objects = (columns) => columns.skill.map((_, i) =>
+    Object.fromEntries(Object.entries(columns).map(([name, values]) => [name, values[i]])));
+  for (const part of [...(data.episodes ?? []), data.decisions]) if (part) part.calls = objects(part.calls);
+  const outcome = ({ skill, succeeded }, [yes, no, unknown]) =>
+    (data.judged[skill] ? (succeeded ? yes : no) : unknown);
+
   // The selector's choices
 
+  const results = ["success", "no success", "not known"];
   const drawChoices = () => {
-    const { names, rows, goals, spec } = data.decisions;
+    const { names, rows, calls, spec } = data.decisions;
     const [across, up] = [$("across"), $("up")].map((s) => Number(s.value));
     const bySuccess = $("hue").value === "success";
-    const word = (row) => {
-      if (!bySuccess) return data.labels[row[names.length]];
-      const succeeded = row[names.length + 1];
-      return succeeded === null ? "not known" : succeeded ? "success" : "no success";
-    };
-    const values = rows.map((row, i) => ({ x: row[across], y: row[up], what: word(row), goal: goals[i] || "none" }));
+    const word = (call) => (bySuccess ? outcome(call, results) : data.labels[call.skill]);
+    const values = rows.map((row, i) =>
+      ({ x: row[across], y: row[up], what: word(calls[i]), goal: calls[i].goal || "none" }));
     const shown = structuredClone(spec);
     shown.data = { values };
     const titles = { x: names[across], y: names[up] };
@@ -96,15 +103,14 @@
     shown.encoding.tooltip[1].title = titles.x;
     shown.encoding.tooltip[2].title = titles.y;
     if (bySuccess) {
-      const domain = ["success", "no success", "not known"];
       shown.encoding.tooltip[0].title = "call";
-      shown.encoding.color.scale = { domain, range: ["#009e73", "#d55e00", "#8d8d97"] };
-      shown.encoding.shape.scale = { domain, range: ["circle", "cross", "square"] };
+      shown.encoding.color.scale = { domain: results, range: ["#009e73", "#d55e00", "#8d8d97"] };
+      shown.encoding.shape.scale = { domain: results, range: ["circle", "cross", "square"] };
     }
     draw($("choices"), shown);
   };
   if (data.decisions) {
-    const { names, rows } = data.decisions;
+    const { names, rows, calls } = data.decisions;
     $("choices-none").hidden = rows.length > 0;
     $("choices-some").hidden = rows.length === 0;
     if (rows.length) {
@@ -113,8 +119,7 @@
         $(id).addEventListener("change", drawChoices);
       }
       $("up").value = Math.min(1, names.length - 1);
-      const known = rows.some((row) => row[names.length + 1] !== null);
-      $("hue").parentElement.hidden = !known;
+      $("hue").parentElement.hidden = !calls.some((call) => data.judged[call.skill]);
       $("hue").addEventListener("change", drawChoices);
       drawChoices();
     }
@@ -244,11 +249,10 @@
     return place === 0 ? "the worst" : place === filmed - 1 ? "the best" : filmed === 3 ? "the median" : "";
   };
   // The skill of a call, with its goal.
-  const called = (episode, i) =>
-    withGoal(data.labels[episode.calls[i][0]], episode.goals?.[i]);
-  const words = (episode, [, start, steps, why, reward, , succeeded], i) =>
-    `call ${i + 1}: ${called(episode, i)}, from step ${start}, ${steps} steps, ended ${data.why[why] ?? "–"}, ` +
-    `reward ${signed(reward)}${succeeded === null ? "" : succeeded ? ", success" : ", no success"}`;
+  const called = ({ skill, goal }) => withGoal(data.labels[skill], goal);
+  const words = (call, i) =>
+    `call ${i + 1}: ${called(call)}, from step ${call.age}, ${call.steps} steps, ended ${data.why[call.end_reason]}, ` +
+    `reward ${signed(call.task_return)}${outcome(call, [", success", ", no success", ""])}`;
 
   const result = ({ return: total }) =>
     data.binary ? (total > 0 ? "solved" : "not solved") : `return ${signed(total)}`;
@@ -263,11 +267,11 @@
       "aria-orientation": "horizontal", style: `width:${(100 * episode.steps) / longest[shownFirst(episode, place) ? 0 : 1]}%`,
     });
     const options = episode.calls.map((call, i) => {
-      const [skill, start, steps] = call;
+      const { skill, age, steps } = call;
       const option = make("div", {
-        class: "call", role: "option", id: `call-${place}-${i}`, "aria-selected": "false", title: words(episode, call, i),
-        "aria-label": words(episode, call, i),
-        style: `left:${(100 * start) / episode.steps}%;width:${(100 * steps) / episode.steps}%`,
+        class: "call", role: "option", id: `call-${place}-${i}`, "aria-selected": "false", title: words(call, i),
+        "aria-label": words(call, i),
+        style: `left:${(100 * age) / episode.steps}%;width:${(100 * steps) / episode.steps}%`,
       }, make("span", { style: `background:${data.colors[skill]};color:${data.inks[skill]}` },
         make("b", { class: room(data.labels[skill]) }, data.labels[skill])));
       option.addEventListener("click", () => choose(place, i));
@@ -304,26 +308,28 @@
     if (changed) fillTable(place);
     [...$("calls").tBodies[0].rows].forEach((row, k) => row.setAttribute("aria-current", String(k === i)));
     if (seek && video && episode.frame !== null) {
-      const frame = episode.frame + Math.ceil(episode.calls[i][1] / data.film.every);
+      const frame = episode.frame + Math.ceil(episode.calls[i].age / data.film.every);
       video.currentTime = (frame + 0.5) / data.film.fps;
     }
   };
 
-  const outcome = (succeeded) => (succeeded === null ? "–" : succeeded ? "yes" : "no");
+  const ownReward = ({ own_return }) => (own_return === null ? "–" : signed(own_return));
+  const success = (call) => outcome(call, ["yes", "no", "–"]);
   const tell = (episode, i) => {
-    const [skill, start, steps, why, reward, own, succeeded] = episode.calls[i];
+    const call = episode.calls[i];
+    const { skill, age, steps } = call;
     const chip = make("span", { class: "chip", style: `background:${data.colors[skill]}` });
     $("call-title").replaceChildren(chip, `Call ${i + 1} of ${episode.calls.length}: ${data.labels[skill]}`);
     const rows = [
       ["Episode", `${episode.number}, seed ${episode.seed}`],
-      ["Steps", `${start} to ${start + steps} (${steps})`],
-      ["Ended", data.why[why] ?? "–"],
-      ["Reward", signed(reward)],
-    ];
-    if (episode.goals?.[i]) rows.splice(1, 0, ["Goal", episode.goals[i]]);
-    if (own !== null) rows.push(["Its own reward", signed(own)]);
-    if (succeeded !== null) rows.push(["Success", outcome(succeeded)]);
-    if (video && episode.frame === null) rows.push(["Film", "this episode is not in it"]);
+      ["Goal", call.goal],
+      ["Steps", `${age} to ${age + steps} (${steps})`],
+      ["Ended", data.why[call.end_reason]],
+      ["Reward", signed(call.task_return)],
+      ["Its own reward", ownReward(call)],
+      ["Success", success(call)],
+      ["Film", video && episode.frame === null ? "this episode is not in it" : ""],
+    ].filter(([, shown]) => shown && shown !== "–");
     const observed = (episode.seen?.[i] ?? []).map((x, k) => [data.seen[k], plain(x)]);
     $("seen").hidden = !observed.length;
     $("seen").querySelector("dl").replaceChildren(
@@ -332,14 +338,14 @@
   };
 
   const fillTable = (place) => {
-    const rows = data.episodes[place].calls.map(([, start, steps, why, reward, own, succeeded], i) => {
+    const rows = data.episodes[place].calls.map((call, i) => {
       const button = make("button", { type: "button", "aria-label": `Show call ${i + 1}` }, String(i + 1));
       button.addEventListener("click", () => choose(place, i));
       const cell = (text, numeric) => make("td", numeric ? { class: "num" } : {}, String(text));
       const first = make("td", { class: "num" }, button);
-      return make("tr", {}, first, cell(called(data.episodes[place], i)), cell(start, true), cell(steps, true),
-        cell(data.why[why] ?? "–"), cell(signed(reward), true), cell(own === null ? "–" : signed(own), true),
-        cell(outcome(succeeded)));
+      return make("tr", {}, first, cell(called(call)), cell(call.age, true), cell(call.steps, true),
+        cell(data.why[call.end_reason]), cell(signed(call.task_return), true), cell(ownReward(call), true),
+        cell(success(call)));
     });
     $("calls").tBodies[0].replaceChildren(...rows);
   };
@@ -357,9 +363,9 @@
   const lastFrame = ({ e }) => e.frame + Math.ceil(e.steps / data.film.every);
 
   // Captions name the acting skill and its goal, in full screen too.
-  load(video, "film", data.film.fps, filmed.flatMap((f) => f.e.calls.map(([, start, steps], i) => {
-    const [from, to] = [start, start + steps].map((s) => f.e.frame + Math.ceil(s / data.film.every));
-    return [from, to, called(f.e, i)];
+  load(video, "film", data.film.fps, filmed.flatMap((f) => f.e.calls.map((call) => {
+    const [from, to] = [call.age, call.age + call.steps].map((s) => f.e.frame + Math.ceil(s / data.film.every));
+    return [from, to, called(call)];
   })));
 
   const head = make("div", { class: "head" });
@@ -368,12 +374,12 @@
     const at = filmed.findLast(({ e }) => e.frame <= frame) ?? filmed[0];
     const step = Math.min((frame - at.e.frame) * data.film.every, at.e.steps);
     const over = frame >= lastFrame(at);
-    const found = at.e.calls.findLastIndex(([, start]) => start <= step);
+    const found = at.e.calls.findLastIndex(({ age }) => age <= step);
     const total = step === 0 ? 0 : at.e.totals[step - 1];
     tracks[at.place].track.append(head);
     head.style.left = `${(100 * step) / at.e.steps}%`;
     $("now").textContent = `Episode ${at.e.number} · step ${step} of ${at.e.steps} · ` +
-      `${over ? "over" : called(at.e, found)} · return so far ${signed(total)}`;
+      `${over ? "over" : called(at.e.calls[found])} · return so far ${signed(total)}`;
     if (!video.paused && (chosen.episode !== at.place || chosen.call !== found)) choose(at.place, found, false);
   };
   video.addEventListener("timeupdate", follow);
