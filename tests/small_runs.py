@@ -137,6 +137,17 @@ def policies(run: Path) -> dict[str, tuple[dict[str, Any], bytes]]:
     return found
 
 
+def acts(policy: Any, size: int = 4, steps: int = 40) -> list[Any]:
+    """What a hierarchy does, and which skills act, in 16 environments of so many numbers."""
+    rng, memory, found = np.random.default_rng(0), policy.start(16), []
+    for _ in range(steps):
+        obs = rng.normal(size=(16, size)).astype(np.float32)
+        action, memory = policy.act(memory, obs)
+        found.append((action.tolist(), policy.acting(memory).tolist()))
+        memory["end"][:] = rng.random(16) < 0.5
+    return found
+
+
 def lines(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
 
@@ -181,6 +192,15 @@ def stopped_run(hierarchy: Hierarchy, path: Path, tick: int, **options: Any) -> 
 def stopped_again(hierarchy: Hierarchy, path: Path, tick: int) -> RunDirectory:
     """A run that went on, in place and without ``Hierarchy.resume``, and was stopped again."""
     return _stopped(hierarchy, RunDirectory.open(path), tick)
+
+
+def goes_on(hierarchy: Callable[[], Hierarchy], folder: Path, tick: int = 3) -> Run:
+    """A whole run: one that is stopped at a tick, and resumed, ends with the same weights."""
+    whole = hierarchy().train(folder / "whole", seed=3, quiet=True)
+    stopped_run(hierarchy(), folder / "cut", tick)
+    hierarchy().resume(folder / "cut", quiet=True)
+    assert_same(folder / "cut", whole.path)
+    return whole
 
 
 def _stopped(hierarchy: Hierarchy, run: RunDirectory, tick: int) -> RunDirectory:

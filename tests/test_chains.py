@@ -97,13 +97,6 @@ def test_its_second_call_begins_where_its_first_has_left_the_agent(tmp_path, cal
     assert best == 0.0 if calls == 1 else best > 1.5
 
 
-def test_no_skill_may_start_where_learning_together_begins(tmp_path):
-    with pytest.raises(
-        SkillweaveError, match=r"no skill may start.*after 0 steps.*'beyond', 'unlock'"
-    ):
-        chain(Beyond(), Unlock()).train(tmp_path / "run", quiet=True)
-
-
 def never(selector=None):
     automaton = Automaton({"a": "get_key", "b": {"unlock", "leave"}, "c": "beyond"},
                           {("a", "b"): got_key})  # fmt: skip
@@ -140,15 +133,6 @@ def test_a_skill_that_acted_too_seldom_to_learn_is_told(tmp_path):
     training.train(few, run, (heard,))
     run.close()
     assert any("'unlock'" in text and "quota" in text for text in heard.said), heard.said
-
-
-def test_every_state_of_an_automaton_needs_a_skill_and_every_event_a_state():
-    with pytest.raises(SkillweaveError, match="state 'b' has no skill"):
-        Automaton({"a": "x", "b": []}, {})
-    with pytest.raises(
-        SkillweaveError, match=r"\('a', 'c'\) names the state 'c', which does not exist"
-    ):
-        Automaton({"a": "x", "b": "y"}, {("a", "c"): "success"})
 
 
 def test_a_run_killed_right_after_its_last_checkpoint_says_what_it_would_have_said(

@@ -1,6 +1,7 @@
 # ruff: noqa: NPY002
 """Environments that draw from the global generators: one seed gives one result."""
 
+import contextlib
 import multiprocessing
 import os
 import random
@@ -74,6 +75,16 @@ def disturb(number):
     torch.manual_seed(number)
 
 
+@contextlib.contextmanager
+def untouched():
+    """Assert that the caller's generators stand where they stood."""
+    disturb(7)
+    expected = random.random(), np.random.random(), torch.rand(())
+    disturb(7)
+    yield
+    assert (random.random(), np.random.random(), torch.rand(())) == expected
+
+
 @pytest.mark.fast_cases(1)
 @pytest.mark.parametrize("name", DRAWS)
 @pytest.mark.parametrize("workers", [1, 2])
@@ -111,12 +122,9 @@ def test_environments_that_draw_when_they_are_made_differ_between_processes(tmp_
 
 
 def test_generators_of_the_caller_stand_where_they_stood(tmp_path):
-    disturb(7)
-    expected = random.random(), np.random.random(), torch.rand(())
-    disturb(7)
-    run = train(drawing("random"), tmp_path / "run")
-    sw.evaluate(run.policy, drawing("torch"), episodes=2)
-    assert (random.random(), np.random.random(), torch.rand(())) == expected
+    with untouched():
+        run = train(drawing("random"), tmp_path / "run")
+        sw.evaluate(run.policy, drawing("torch"), episodes=2)
 
 
 class Everywhere(Corridor):
@@ -169,13 +177,9 @@ SLOW = {"report": pytest.mark.slow}
 
 @pytest.mark.parametrize("use", [pytest.param(u, marks=SLOW.get(u, ())) for u in USES])
 def test_generators_of_the_caller_stand_where_they_stood_after(use, everywhere, tmp_path):
-    disturb(7)
-    expected = random.random(), np.random.random(), torch.rand(())
-    disturb(7)
-    with warnings.catch_warnings():
+    with untouched(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         USES[use](everywhere, tmp_path)
-    assert (random.random(), np.random.random(), torch.rand(())) == expected
 
 
 def test_environments_of_skills_are_made_from_the_seed(everywhere):
@@ -212,21 +216,18 @@ def test_they_stand_where_they_stood_after_trainings_in_threads(tmp_path):
             one.join(20)
             return super().reset(seed=seed)
 
-    disturb(7)
-    expected = random.random(), np.random.random(), torch.rand(())
-    disturb(7)
     runs = []
     one, two = (
         threading.Thread(target=lambda env=env: runs.append(train(env, tmp_path / env.__name__)))
         for env in (Waiting, Late)
     )
-    one.start()
-    assert first_step.wait(20)
-    two.start()
-    one.join()
-    two.join()
+    with untouched():
+        one.start()
+        assert first_step.wait(20)
+        two.start()
+        one.join()
+        two.join()
     assert [run.path.name for run in runs] == ["Waiting", "Late"]
-    assert (random.random(), np.random.random(), torch.rand(())) == expected
 
 
 def test_an_evaluation_gives_the_same_again(tmp_path):

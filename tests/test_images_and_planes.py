@@ -223,11 +223,6 @@ def test_a_critic_of_its_own_reads_boards_as_the_actor_does():
         sw.PPO(critic=sw.Network(planes="first"))
 
 
-def test_no_other_word_says_where_planes_are():
-    with pytest.raises(DeclarationError, match="must be one of first, last, None"):
-        sw.Network(planes="middle")
-
-
 def test_a_run_remembers_the_setting(tmp_path):
     def make():
         return Shows(Box(0, 3, (5, 6, 7), BYTES))

@@ -1,12 +1,10 @@
 """Typical mistakes of newcomers, and unusual but legal ways: what comes of each.
 
 A mistake ends in an error of a kind, which names the thing, or in a warning; what is legal works.
-``test_errors_kinds.py`` has mistakes whose words are of no interest.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import warnings
 from collections.abc import Callable
@@ -21,6 +19,7 @@ import torch
 from safetensors.torch import load_file
 
 import skillweave as sw
+from skillweave import recipes
 from skillweave.errors import KINDS, SkillweaveError
 from skillweave.selectors.ready import FunctionSelector
 
@@ -53,6 +52,11 @@ class Wrong(Boom):
 class Old(Boom):
     def step(self, action):
         return np.zeros(2, np.float32), 0.0, False, {}
+
+
+class Forbids(Boom):
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {"action_mask": np.zeros(2, np.int8)}
 
 
 class Room(Boom):
@@ -140,6 +144,7 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         "of its episode: step() raised ValueError",
     ),
     "env returns a wrong shape": (lambda: train(Wrong), "EnvError", "not in its observation_space"),
+    "a mask that allows nothing": (lambda: train(Forbids), "EnvError", "allows no action"),
     "four values of old gym": (
         lambda: train(Old),
         "EnvError",
@@ -149,6 +154,13 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         lambda: train(sw.EnvSpec("CartPole-v1", kwargs={"sutton_bartow_reward": True})),
         "EnvError",
         "sutton_bartow_reward",
+    ),
+    "no success to reach": (
+        lambda: sw.train_agent(
+            "CartPole-v1", SMALL, 256, target_success=0.9, eval_every=128, eval_episodes=2
+        ),
+        "EnvError",
+        "target_success",
     ),
     # What a skill's methods return
     "reward (N, 1)": (
@@ -236,6 +248,11 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         lambda: with_skill(reward=lambda _, step: None),
         "SkillError",
         "reward() returned None at step 1, but shape (4,) was expected: does it lack a return?",
+    ),
+    "a reflex of floats": (
+        lambda: train(reflexes=[sw.Reflex(lambda obs: obs[:, 0] + 9.5, 0)]),
+        "SkillError",
+        "yes or no (bool) is needed",
     ),
     "termination is one bool": (
         lambda: with_skill(termination=lambda _, step: False),
@@ -331,6 +348,31 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str, str]] = {
         lambda: sw.Hierarchy("CartPole-v1", []),
         "DeclarationError",
         "needs at least one skill",
+    ),
+    "a skill without a name": (
+        lambda: declare(skills=[skill(name="")]),
+        "DeclarationError",
+        "set the class attribute 'name'",
+    ),
+    "skills that never end": (
+        lambda: declare(call_steps=None),
+        "DeclarationError",
+        "give it max_steps or termination()",
+    ),
+    "a function as a reflex": (
+        lambda: declare(reflexes=[zeros]),
+        "DeclarationError",
+        "an instance of Reflex",
+    ),
+    "a policy's class": (
+        lambda: declare(skills=[skill(policy=sw.PPO)]),
+        "DeclarationError",
+        "skill 's': policy is the class",
+    ),
+    "an unknown recipe": (
+        lambda: recipes.load("no_such_recipe"),
+        "DeclarationError",
+        "no recipe or Python file 'no_such_recipe'",
     ),
     "misspelt keyword of Hierarchy": (
         lambda: declare(skill_step=5),
@@ -588,12 +630,6 @@ def test_a_mistake_is_an_error_that_names_the_thing(label: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
-def test_a_device_that_is_not_there() -> None:
-    with pytest.raises(SkillweaveError, match="finds no CUDA device here; use 'cpu'"):
-        train(algorithm=dataclasses.replace(SMALL, device="cuda"))
-
-
 def changed(**attributes: Any) -> None:
     """Train a hierarchy whose attributes were set after it was declared."""
     hierarchy = declare()
@@ -604,10 +640,6 @@ def changed(**attributes: Any) -> None:
 
 CHANGED = {
     "learn": ("jointly", "it must be one of"),
-    "call_steps": (0, "it must be a whole number of at least 1"),
-    "algorithm": ("PPO", "it must be the settings of an algorithm"),
-    "selector": (3, "selector is 3"),
-    "steps": (-4, "steps is -4"),
     "apart": ({"skill_steps": 5}, "write Apart(skill_steps=5)"),
     "skills": ([Good], "write Center(), not Center"),
     "reflexes": (None, "each entry an instance of Reflex"),
@@ -714,12 +746,6 @@ def test_training_without_a_directory_is_either_refused_or_makes_one() -> None:
     optional = inspect.signature(sw.Hierarchy.train).parameters["run_dir"].default is None
     with nullcontext() if optional else pytest.raises(SkillweaveError, match="needs run_dir"):
         assert declare().train(quiet=True).path.is_dir()
-
-
-def test_the_directory_of_a_finished_run_is_not_used_again() -> None:
-    hierarchy = trained()
-    with pytest.raises(SkillweaveError, match="runs/ok holds a finished run"):
-        hierarchy.train("runs/ok", quiet=True)
 
 
 def test_a_resumed_run_goes_on_with_its_own_settings(capsys: pytest.CaptureFixture[str]) -> None:

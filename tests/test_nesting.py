@@ -461,8 +461,6 @@ WRONG = {
     ),
     "itself": (itself, "inner/loop is a hierarchy that contains itself"),
     "itself later": (gains_itself, "again is a hierarchy that contains itself"),
-    "two of one name": (lambda: declare(inside(name="left")), "two skills are named 'left'"),
-    "a reserved name": (lambda: declare(inside(name="selector")), "'selector', which names"),
     "no end": (
         lambda: declare(call_steps=None),
         "skill 'inner' never ends|skill 'left'",

@@ -29,7 +29,6 @@ from small_runs import (
 )
 
 from skillweave import SAC, EnvSpec, Hierarchy, Lengths, Skill, SkillweaveError, Together
-from skillweave.algorithms.config import SkillCritic
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.api.applying import differences
 from skillweave.evolution import Evolution, Mutations
@@ -431,12 +430,6 @@ def test_how_a_selectors_floor_falls_is_not_lost_where_it_has_none(name):
     declare(learn="apart", selector=replace(ON, **{name: 0.5})).stages()
 
 
-@pytest.mark.parametrize("make", [Together, SkillCritic])
-def test_a_floor_falls_over_a_share_of_the_budget(make):
-    with pytest.raises(SkillweaveError, match=r"epsilon_fraction is 1\.5"):
-        make(epsilon_fraction=1.5)
-
-
 def test_the_critic_learns_what_deciding_is_worth_where_calls_are_cut():
     for learn in ("together", "apart", "apart, then together"):
         *_, stage = declare(learn=learn, interrupt=True).stages()
@@ -535,20 +528,6 @@ def test_with_one_skill_and_calls_of_one_step_no_trajectory_is_torn(tmp_path):
     assert found["right.samples"] == 32
     assert (found["right.usage"], found["selector.call_length"]) == (1.0, 1.0)
     assert found["length"] > 15
-
-
-WRONG = {
-    "learn is 'both'": {"learn": "both"},
-    "it must be a whole number of at least 1, Lengths": {"call_steps": 0},
-    "call_cost is -1": {"call_cost": -1},
-    "interrupt is 3": {"interrupt": 3},
-}
-
-
-@pytest.mark.parametrize("says", WRONG)
-def test_a_wrong_declaration_is_told(says):
-    with pytest.raises(SkillweaveError, match=says):
-        declare(**WRONG[says])
 
 
 @pytest.mark.parametrize("steps", [(), (0, 4), (4, 2), (1, 2.5), (..., 4), (1, ...)])

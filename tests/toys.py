@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import pickle
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,8 @@ import numpy as np
 import torch
 
 from skillweave.algorithms.base import Algorithm
-from skillweave.algorithms.config import AlgorithmConfig
-from skillweave.algorithms.policy import make_algorithm
+from skillweave.algorithms.config import PPO, AlgorithmConfig
+from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.acting import Acting
 from skillweave.collecting.collector import Collector
 from skillweave.collecting.group import Collectors
@@ -23,13 +25,15 @@ from skillweave.collecting.learners import Alone, Calling
 from skillweave.collecting.search import Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.engine import RawStep
+from skillweave.experience import Sample
+from skillweave.networks.stacked import Layout
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.spaces import pack
-from skillweave.training.episodes import Episodes
+from skillweave.training.episodes import Episodes, Tick
 from skillweave.training.learner import Learner, Stack
-from skillweave.training.loop import Progress, resume, train
+from skillweave.training.loop import Progress, Saved, resume, train
 from skillweave.training.replay_learner import ReplayLearner, learner_of, store_of
 from skillweave.types import Array
 
@@ -96,6 +100,12 @@ class Rememberer(gym.Env):
         change = float(np.abs(action - self.previous).sum())
         self.previous = action
         return np.zeros(1, np.float32), change, False, False, {}
+
+
+def skills_of(*skills: Any, **how: Any) -> SkillSet:
+    """These skills, or those of these classes, each with its own policy."""
+    made = tuple(s() if isinstance(s, type) else s for s in skills)
+    return SkillSet(made, tuple(s.policy for s in made), **how)
 
 
 def alone_in(
@@ -283,7 +293,7 @@ class Calls(Toy):
 
     def collector(self, acting: Acting | None, shared: bool = False) -> Collector:
         calls = tuple(Call(i, (1, 10)[i], self.allowed[i]) for i in range(2))
-        return calling_in(self, acting, SkillSet(calls, tuple(c.policy for c in calls)), shared)
+        return calling_in(self, acting, skills_of(*calls), shared)
 
     def play(self, action: Array) -> Any:
         reward = np.where(action == 1, 3 * (self.under_way == 0), 1)
@@ -555,8 +565,130 @@ def learn(
     return algorithm, made.state
 
 
+class Cut(Exception):
+    """What interrupts a training here."""
+
+
+def goes_on(
+    algorithm: Algorithm, make: Callable[[], Toy], budget: int, every: int
+) -> tuple[Training, Saved, Callable[..., Training]]:
+    """What is cut at its second checkpoint, and resumed, learns and tells what a whole run does.
+
+    Returns:
+        The whole run, the second checkpoint, and a function of what is saved beside the state,
+        which resumes from there.
+    """
+    told: list[Tick] = []
+    whole = training(algorithm, make())
+    whole.run(budget, on_tick=told.append)
+    saved: list[Saved] = []
+    ticks: list[Tick] = []
+
+    def cut_at_second(found: Saved) -> None:
+        saved.append(replace(found, at=replace(found.at), states=[copied(found.states[0])]))
+        if len(saved) == 2:
+            raise Cut
+
+    how: dict[str, Any] = {"checkpoint_every": every, "on_tick": ticks.append}
+    with contextlib.suppress(Cut):
+        training(algorithm, make()).run(budget, on_checkpoint=cut_at_second, **how)
+
+    def resumed(extra: dict[str, Any]) -> Training:
+        at, state = saved[1].at, copied(saved[1].states[0])
+        now = Progress(at.update, at.steps)
+        found = training(algorithm, make(), state=state, goes_on_at=at.steps)
+        assert not len(found.resume(extra, now))
+        found.run(budget, resume_from=now, on_checkpoint=lambda saved: None, **how)
+        return found
+
+    state = resumed(saved[1].extra).state
+    for f in fields(state):
+        assert torch.equal(getattr(state, f.name), getattr(whole.state, f.name)), f.name
+        assert getattr(state, f.name).dtype == getattr(whole.state, f.name).dtype, f.name
+    said = [[(t.update, t.steps, t.metrics) for t in each] for each in (ticks, told)]
+    assert said[0] == said[1]
+    return whole, saved[1], resumed
+
+
 def random_critic(algorithm: Any, state: Any) -> None:
     """Give PPO's critic, which begins at 0, values of its own: the same to each member."""
     weight = algorithm.layout.views(state.params)[f"{algorithm.critic_net.head}.weight"]
     drawn = torch.randn(weight.shape[1:], generator=torch.Generator().manual_seed(0))
     weight.copy_(drawn / len(drawn) ** 0.5)
+
+
+def transitions(
+    space: gym.Space[Any],
+    lead: tuple[int, int],
+    width: int = 3,
+    *,
+    masked: bool = False,
+    weighted: bool = True,
+    seed: int = 0,
+) -> Sample:
+    """Random ones, ``lead`` of them: the first of each member ends its episode."""
+    g = torch.Generator().manual_seed(seed)
+    choices = getattr(space, "n", 0)
+    allowed = torch.rand(2, *lead, choices, generator=g) < 0.5
+    allowed[..., 1:2] = True
+    masks = allowed if masked else (None, None)
+    discount = torch.full(lead, 0.9)
+    discount[:, 0] = 0.0
+    forces = torch.rand(*lead, *(space.shape or ()), generator=g) * 2 - 1
+    return Sample(
+        obs=torch.randn(*lead, width, generator=g),
+        action=torch.randint(choices, lead, generator=g) if choices else forces,
+        reward=torch.randn(lead, generator=g), discount=discount,
+        next_obs=torch.randn(*lead, width, generator=g), mask=masks[0], next_mask=masks[1],
+        weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
+    )  # fmt: skip
+
+
+def network_of(
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    seed: int = 0,
+    **settings: Any,
+) -> AgentPolicy:
+    """A fresh network, its weights made large enough to act in more than one way."""
+    config = PPO(num_envs=1, n_steps=1, batch_size=1, **settings)
+    algorithm = make_algorithm(config, observation_space, action_space)
+    state = algorithm.init([Seeds(seed)])
+    with torch.no_grad():
+        state.params[:] = 5 * state.params
+        state.obs_mean[:], state.obs_var[:] = 0.3, 2.0
+    return AgentPolicy.of(algorithm, state)
+
+
+def drawn(net: Any, members: int, *args: Any) -> tuple[Layout, torch.Tensor]:
+    """The layout of a network, and weights of its members (members, size)."""
+    layout = Layout(net.shapes)
+    flat = torch.zeros(members, layout.size)
+    generators = [torch.Generator().manual_seed(m) for m in range(members)]
+    net.init_(layout.views(flat), *args, generators)
+    return layout, flat
+
+
+def members_of(x: Any, rows: slice) -> Any:
+    """The members ``rows`` of a state or a rollout, as a copy."""
+    values = {f.name: getattr(x, f.name) for f in fields(x)}
+    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
+    return type(x)(**{**values, **copied})
+
+
+class SideBySide:
+    """Environments as a pool, for tests that play them one by one as well."""
+
+    def __init__(self, envs: list[Any]) -> None:
+        self.envs = envs
+        self.observation_space = envs[0].observation_space
+        self.action_space = envs[0].action_space
+
+    def reset(self, ids: Any) -> Any:
+        return np.stack([self.envs[i].reset()[0] for i in ids]), {}
+
+    def step(self, action: Any, ids: Any) -> Any:
+        told = [self.envs[i].step(a) for i, a in zip(ids, action, strict=True)]
+        obs, reward, terminated, truncated, infos = zip(*told, strict=True)
+        info = {k: np.array([i[k] for i in infos]) for k in infos[0]}
+        return np.stack(obs), *map(np.array, (reward, terminated, truncated)), info

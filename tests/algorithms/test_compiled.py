@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
+from toys import transitions
 
 from skillweave import DQN, PPO, RNN, SAC, TD3, Network, SelfImitationPPO, SkillweaveError
 from skillweave.algorithms import register_encoder
@@ -23,35 +23,35 @@ from skillweave.algorithms.compiled import Compiled
 from skillweave.algorithms.policy import make_algorithm
 from skillweave.collecting.shipping import packed, unpacked
 from skillweave.errors import DeclarationError
-from skillweave.experience import Reference, Rehearsal, Rollout, Sample
+from skillweave.experience import Reference, Rehearsal, Rollout
 from skillweave.seeding import Seeds
 
 P, B = 2, 16
 OBS = gym.spaces.Box(-1.0, 1.0, (3,))
-FORCE = gym.spaces.Box(-1.0, 1.0, (2,))
+FORCE, CHOICES = gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)
 SMALL: dict[str, Any] = {"network": Network((8,), "relu", layer_norm=True), "normalize_obs": True}
 needs_compiler = pytest.mark.skipif(
     not (shutil.which("g++") or shutil.which("clang")), reason="no C++ compiler"
 )
 
 
-def sample(space: gym.Space[Any], seed: int) -> Sample:
-    g = torch.Generator().manual_seed(seed)
-    discrete = isinstance(space, gym.spaces.Discrete)
-    force = torch.rand(P, B, 2, generator=g) * 2 - 1
-    allowed = torch.ones(P, B, 3, dtype=torch.bool)
-    allowed[:, ::2, 0] = False
-    return Sample(
-        obs=torch.randn(P, B, 3, generator=g),
-        action=torch.randint(3, (P, B), generator=g) if discrete else force,
-        reward=torch.randn(P, B, generator=g),
-        discount=torch.rand(P, B, generator=g).round() * 0.9,
-        next_obs=torch.randn(P, B, 3, generator=g),
-        mask=allowed if discrete else None,
-        next_mask=allowed if discrete else None,
-        weight=torch.rand(P, B, generator=g),
-        index=np.zeros((P, B), np.int64),
-    )
+def learnt(config: Any, space: gym.Space[Any], data: list[Any]) -> list[tuple[Any, list[Any]]]:
+    """The state and the metrics after updates by plain steps, then by compiled ones."""
+    found = []
+    for compile in (False, True):
+        algorithm: Any = make_algorithm(replace(config, compile=compile), OBS, space)
+        state, told = algorithm.init([Seeds(m) for m in range(P)]), []
+        for u, each in enumerate(data):
+            generators = [(Seeds(u) / m).torch() for m in range(P)]
+            told.append(algorithm.update(state, each, generators)[1].metrics)
+        found.append((state, told))
+    return found
+
+
+def assert_close(state: Any, other: Any, **how: float) -> None:
+    for f in fields(state):
+        one, two = getattr(state, f.name), getattr(other, f.name)
+        torch.testing.assert_close(one, two, msg=f.name, **how)
 
 
 # A C++ compiler takes most of the time: one algorithm goes all the way, the others as far as torch
@@ -60,9 +60,9 @@ def sample(space: gym.Space[Any], seed: int) -> Sample:
 @pytest.mark.parametrize(
     ("kind", "space", "backend"),
     [
-        pytest.param(DQN.rainbow, gym.spaces.Discrete(3), "inductor", marks=needs_compiler),
-        (TD3, gym.spaces.Box(-1.0, 1.0, (2,)), "aot_eager"),
-        (SAC, gym.spaces.Box(-1.0, 1.0, (2,)), "aot_eager"),
+        pytest.param(DQN.rainbow, CHOICES, "inductor", marks=needs_compiler),
+        (TD3, FORCE, "aot_eager"),
+        (SAC, FORCE, "aot_eager"),
     ],
     ids=["rainbow", "td3", "sac"],
 )
@@ -70,17 +70,10 @@ def test_compiled_steps_equal_plain_ones(
     kind: Any, space: gym.Space[Any], backend: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    states = []
-    for compile in (False, True):
-        algorithm: Any = make_algorithm(kind(**SMALL, compile=compile), OBS, space)
-        state = algorithm.init([Seeds(m) for m in range(P)])
-        for u in range(5):
-            generators = [(Seeds(u) / m).torch() for m in range(P)]
-            algorithm.update(state, replace(sample(space, u), progress=0.1), generators)
-        states.append(state)
-    for field in fields(states[0]):
-        plain, fused = (getattr(s, field.name) for s in states)
-        torch.testing.assert_close(fused, plain, rtol=1e-4, atol=1e-6, msg=field.name)
+    drawn = [transitions(space, (P, B), masked=space is CHOICES, seed=u) for u in range(5)]
+    data = [replace(each, progress=0.1) for each in drawn]
+    (plain, _), (fused, _) = learnt(kind(**SMALL), space, data)
+    assert_close(fused, plain, rtol=1e-4, atol=1e-6)
 
 
 def rehearsed(width: int, log_std: torch.Tensor | None = None) -> Rehearsal:
@@ -120,11 +113,11 @@ def rollout(space: gym.Space[Any], seed: int) -> Rollout:
 @pytest.mark.parametrize(
     ("kind", "settings", "space", "backend"),
     [
-        pytest.param(PPO, {}, gym.spaces.Discrete(3), "inductor", marks=needs_compiler),
+        pytest.param(PPO, {}, CHOICES, "inductor", marks=needs_compiler),
         (PPO, {"learning_rate_schedule": "kl", "target_kl": 0.01}, FORCE, "aot_eager"),
-        (PPO, {"target_kl": 0.002}, gym.spaces.Discrete(3), "aot_eager"),
+        (PPO, {"target_kl": 0.002}, CHOICES, "aot_eager"),
         (SelfImitationPPO, {"clip_value": 0.2, "imitation_rows": 64}, FORCE, "aot_eager"),
-        (PPO, {"rehearsal": rehearsed(3)}, gym.spaces.Discrete(3), "aot_eager"),
+        (PPO, {"rehearsal": rehearsed(3)}, CHOICES, "aot_eager"),
         (PPO, {"rehearsal": rehearsed(2, torch.zeros(P, 1, 2))}, FORCE, "aot_eager"),
     ],
     ids=["ppo", "kl-rate", "kl-limit", "self-imitation", "rehearsal", "rehearsal-force"],
@@ -137,23 +130,14 @@ def test_compiled_steps_of_rollouts_equal_plain_ones(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    states, reports = [], []
     more = {"rehearsal": settings.get("rehearsal")}
     settings = {k: v for k, v in settings.items() if k not in more}
-    for compile in (False, True):
-        config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16, compile=compile)
-        algorithm: Any = make_algorithm(config, OBS, space)
-        state = algorithm.init([Seeds(m) for m in range(P)])
-        for u in range(3):  # each with other numbers of rows
-            generators = [(Seeds(u) / m).torch() for m in range(P)]
-            data = replace(rollout(space, u), **more)
-            _, report = algorithm.update(state, data, generators)
-            reports.append(report.metrics)
-        states.append(state)
-    for field in fields(states[0]):
-        plain, fused = (getattr(s, field.name) for s in states)
-        torch.testing.assert_close(fused, plain, rtol=1e-3, atol=1e-5, msg=field.name)
-    for own, other in zip(reports[:3], reports[3:], strict=True):
+    config = kind(**SMALL, **settings, num_envs=4, n_steps=8, batch_size=16)
+    # Each rollout has other numbers of rows.
+    data = [replace(rollout(space, u), **more) for u in range(3)]
+    (plain, told), (fused, tells) = learnt(config, space, data)
+    assert_close(fused, plain, rtol=1e-3, atol=1e-5)
+    for own, other in zip(told, tells, strict=True):
         assert own.keys() == other.keys()
         for name in own:
             torch.testing.assert_close(other[name], own[name], rtol=1e-2, atol=1e-4, msg=name)
@@ -162,7 +146,7 @@ def test_compiled_steps_of_rollouts_equal_plain_ones(
 def small_ppo(**settings: Any) -> tuple[Any, Any]:
     """An algorithm on three actions, and P members."""
     config = PPO(**(SMALL | settings), num_envs=4, n_steps=8, batch_size=16)
-    algorithm: Any = make_algorithm(config, OBS, gym.spaces.Discrete(3))
+    algorithm: Any = make_algorithm(config, OBS, CHOICES)
     return algorithm, algorithm.init([Seeds(m) for m in range(P)])
 
 

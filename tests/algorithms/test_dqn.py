@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from toys import Toy, learn
+from toys import Toy, learn, transitions
 
 from skillweave.algorithms.config import DQN
 from skillweave.algorithms.dqn import DQNAlgorithm, State
@@ -30,20 +30,7 @@ def make(config: DQN = LINEAR, members: int = P, **settings: Any) -> tuple[DQNAl
 
 
 def sample(members: int = P, masked: bool = False, weighted: bool = False) -> Sample:
-    g = torch.Generator().manual_seed(0)
-    lead = (members, B)
-    mask = None
-    if masked:
-        mask = torch.rand(*lead, A, generator=g) < 0.5
-        mask[..., 1] = True
-    discount = torch.full(lead, 0.9**3)
-    discount[:, 0] = 0.0  # an end
-    return Sample(
-        obs=torch.randn(*lead, 2, generator=g), action=torch.randint(A, lead, generator=g),
-        reward=torch.randn(lead, generator=g), discount=discount,
-        next_obs=torch.randn(*lead, 2, generator=g), mask=None, next_mask=mask,
-        weight=torch.rand(lead, generator=g) if weighted else None, index=np.zeros(lead, np.int64),
-    )  # fmt: skip
+    return transitions(Discrete(A), (members, B), 2, masked=masked, weighted=weighted)
 
 
 def linear(algorithm: DQNAlgorithm, flat: torch.Tensor, member: int, obs: torch.Tensor) -> Any:
@@ -59,7 +46,7 @@ def loss(algorithm: DQNAlgorithm, state: State, s: Sample) -> tuple[torch.Tensor
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("double", [False, True])
 def test_the_target_by_hand(double, masked):
-    # The sample's own discount counts: here that of three steps, and 0 at an end.
+    # The sample's own discount counts, and it is 0 at an end.
     algorithm, state = make(double=double)
     s = sample(masked=masked)
     _, error, mean = loss(algorithm, state, s)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
-from toys import random_critic
+from toys import members_of, random_critic
 
 from skillweave.algorithms.config import PPO
 from skillweave.algorithms.ppo import PPOAlgorithm, State
@@ -110,13 +110,6 @@ def packed(rollout: Rollout) -> Rollout:
     return found
 
 
-def some(x: Any, rows: slice) -> Any:
-    """The members ``rows`` of a state or a rollout, as a copy."""
-    values = {f.name: getattr(x, f.name) for f in fields(x)}
-    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
-    return type(x)(**{**values, **copied})
-
-
 def learnt(algorithm: PPOAlgorithm, state: State, rollout: Rollout, first: int = 0) -> Any:
     """State and metrics after an update; members have random streams by their number."""
     if rollout.valid is not None:
@@ -136,8 +129,8 @@ def assert_alike(one: State, other: State, exactly: bool = False) -> None:
 def test_a_rollout_with_gaps_is_learnt_from_as_the_full_one_with_the_same_rows(config):
     algorithm, state = made(config, 2)
     rollout = full(algorithm, 2)
-    there, report = learnt(algorithm, some(state, slice(0, 2)), rollout)
-    here, other = learnt(algorithm, some(state, slice(0, 2)), with_gaps(rollout))
+    there, report = learnt(algorithm, members_of(state, slice(0, 2)), rollout)
+    here, other = learnt(algorithm, members_of(state, slice(0, 2)), with_gaps(rollout))
     assert not torch.equal(there.params, state.params)
     assert_alike(here, there, exactly=True)
     assert {k: v.tolist() for k, v in other.metrics.items()} == {
@@ -161,8 +154,8 @@ def test_columns_of_different_lengths_are_learnt_from_row_by_row(config):
         if getattr(rollout, name) is not None:
             into, rows = getattr(ragged, name), getattr(rollout, name)
             into[:, :T, :B], into[:, T:, 1] = rows, rows[:, :, 0]
-    there, _ = learnt(algorithm, some(state, slice(0, 1)), rollout)
-    here, report = learnt(algorithm, some(state, slice(0, 1)), ragged)
+    there, _ = learnt(algorithm, members_of(state, slice(0, 1)), rollout)
+    here, report = learnt(algorithm, members_of(state, slice(0, 1)), ragged)
     assert report.metrics["samples"].tolist() == [T * B]
     assert_alike(here, there)
 
@@ -191,15 +184,15 @@ def test_a_stack_with_gaps_learns_what_its_members_learn_alone(config):
     for m in range(3):  # as many of each member
         cells = rollout.valid[m].flatten().nonzero()[:, 0]
         rollout.valid[m].view(-1)[cells[equal:]] = False
-    stack, _ = learnt(algorithm, some(state, slice(0, 3)), rollout)
+    stack, _ = learnt(algorithm, members_of(state, slice(0, 3)), rollout)
     if config is RECURRENT:
         # Whole columns are shuffled, and members may have different numbers of them.
         assert stack.params.isfinite().all()
         return
     for m in range(3):
         part = slice(m, m + 1)
-        alone, _ = learnt(algorithm, some(state, part), some(rollout, part), m)
-        assert_alike(some(stack, part), alone)
+        alone, _ = learnt(algorithm, members_of(state, part), members_of(rollout, part), m)
+        assert_alike(members_of(stack, part), alone)
 
 
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
@@ -207,12 +200,12 @@ def test_members_with_fewer_rows_are_padded_with_rows_that_do_not_count(config):
     algorithm, state = made(replace(config, batch_size=T * B, update_epochs=3), 2)
     rollout = with_gaps(full(algorithm, 2))
     rollout.valid[1, :, 2:] = False
-    stack, report = learnt(algorithm, some(state, slice(0, 2)), rollout)
+    stack, report = learnt(algorithm, members_of(state, slice(0, 2)), rollout)
     assert report.metrics["samples"].tolist() == [T * B, T * 2]
     for m in range(2):
         part = slice(m, m + 1)
-        alone, own = learnt(algorithm, some(state, part), some(rollout, part), m)
-        assert_alike(some(stack, part), alone)
+        alone, own = learnt(algorithm, members_of(state, part), members_of(rollout, part), m)
+        assert_alike(members_of(stack, part), alone)
         for name, value in own.metrics.items():
             torch.testing.assert_close(report.metrics[name][part], value, rtol=1e-3, atol=1e-5)
 
@@ -220,7 +213,7 @@ def test_members_with_fewer_rows_are_padded_with_rows_that_do_not_count(config):
 @pytest.mark.parametrize("config", [CONFIG, RECURRENT], ids=["mlp", "gru"])
 def test_a_member_without_rows_stays_as_it_is(config):
     algorithm, state = made(config, 2)
-    rollout, before = with_gaps(full(algorithm, 2)), some(state, slice(0, 2))
+    rollout, before = with_gaps(full(algorithm, 2)), members_of(state, slice(0, 2))
     rollout.valid[0] = False
     after, report = learnt(algorithm, state, rollout)
     for name in ("params", "mu", "nu", "count", "obs_mean", "obs_var", "return_mean"):

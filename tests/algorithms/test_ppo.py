@@ -5,7 +5,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch import nn
-from toys import Echo, learn, random_critic, training
+from toys import Echo, learn, members_of, random_critic, training
 
 from skillweave.algorithms.config import (
     PPO,
@@ -13,7 +13,6 @@ from skillweave.algorithms.config import (
     config_to_json,
 )
 from skillweave.algorithms.ppo import PPOAlgorithm, State
-from skillweave.errors import DeclarationError, RunError
 from skillweave.experience import Rollout
 from skillweave.networks.config import RNN, Network
 from skillweave.ops.moments import normalize
@@ -38,13 +37,6 @@ def make(action=None, members=1, **settings) -> tuple[PPOAlgorithm, State]:
 
 def rngs(*seeds: int | Seeds) -> list[torch.Generator]:
     return [(s if isinstance(s, Seeds) else Seeds(s)).torch() for s in seeds]
-
-
-def members_of(x, rows: slice):
-    """The members ``rows`` of a State or Rollout, as a copy."""
-    values = {f.name: getattr(x, f.name) for f in fields(x)}
-    copied = {k: v[rows].clone() for k, v in values.items() if isinstance(v, torch.Tensor)}
-    return type(x)(**{**values, **copied})
 
 
 def rollout(algorithm: PPOAlgorithm, state: State, seed: int = 0, masked: bool = False) -> Rollout:
@@ -450,26 +442,7 @@ def test_a_small_rollout_needs_no_batch_size_of_its_own():
     assert PPO(num_envs=4, n_steps=4).batch_size == PPO().batch_size
 
 
-def test_the_kl_schedule_asks_for_its_target():
-    with pytest.raises(DeclarationError, match=r"PPO\.target_kl is None; .* 'kl'"):
-        PPO(learning_rate_schedule="kl")
-
-
 def test_settings_survive_json():
     config = replace(CONFIG, critic=Network((8,), "relu", True), target_kl=0.1)
     assert config_from_json(config_to_json(config)) == config
     assert config_from_json(config_to_json(PPO())) == PPO()
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"algorithm": "SARSA"}, "'SARSA'.*PPO"),
-        ({"momentum": 1}, "no field momentum"),
-        ({"gamma": 2.0}, r"PPO\.gamma"),
-        ({"network": {"hidden": [8], "depth": 3}}, "depth"),
-    ],
-)
-def test_unknown_settings_in_json_are_named(change, says):
-    with pytest.raises(RunError, match=says):
-        config_from_json({**config_to_json(PPO()), **change})

@@ -227,7 +227,6 @@ MISTAKES: dict[str, tuple[Callable[[], Any], str]] = {
         "TD3 cannot .*Discrete.*; PPO, SelfImitationPPO, DQN, SAC, A2C",
     ),
     "a common setting": (lambda: own(gamma=2.0), r"A2C\.gamma is 2"),
-    "a device": (lambda: own(device="tpu"), r"A2C\.device is 'tpu'; it must be one of"),
 }
 
 

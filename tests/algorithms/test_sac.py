@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
 from torch.distributions import Categorical, Normal, TanhTransform, TransformedDistribution
-from toys import Masked, Toy, learn
+from toys import Masked, Toy, learn, transitions
 
 from skillweave.algorithms.config import SAC
 from skillweave.algorithms.sac import SACAlgorithm, State
@@ -35,25 +35,6 @@ def make(space: Any, **settings: Any) -> tuple[SACAlgorithm, State]:
         flat += 0.3 * torch.randn(flat.shape, generator=g)
     state.log_alpha = torch.tensor([[math.log(0.2)], [math.log(0.7)]])
     return algorithm, state
-
-
-def sample(space: Any, masked: bool = False) -> Sample:
-    g = torch.Generator().manual_seed(0)
-    discount = torch.full((P, B), 0.9)
-    discount[:, 0] = 0.0
-    masks = [None, None]
-    if masked:
-        masks = list(torch.rand(2, P, B, 3, generator=g) < 0.5)
-        for mask in masks:
-            mask[..., 1] = True
-    forces = torch.rand(P, B, 2, generator=g) * 2 - 1
-    return Sample(
-        obs=torch.randn(P, B, 3, generator=g),
-        action=torch.randint(3, (P, B), generator=g) if space is CHOICES else forces,
-        reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), mask=masks[0], next_mask=masks[1],
-        weight=torch.rand(P, B, generator=g), index=np.zeros((P, B), np.int64),
-    )  # fmt: skip
 
 
 def generators() -> list[torch.Generator]:
@@ -98,7 +79,7 @@ def critic(algorithm: SACAlgorithm, state: State, s: Sample, noise: Any) -> Any:
 
 def test_forces_by_hand():
     algorithm, state = make(FORCES)
-    s, alphas = sample(FORCES), [0.2, 0.7]
+    s, alphas = transitions(FORCES, (P, B)), [0.2, 0.7]
     (total, error, _), (policy, entropy) = losses(algorithm, state, s)
     views = algorithm.layout.views(state.params)
     for m in range(P):
@@ -123,7 +104,7 @@ def test_forces_by_hand():
 @pytest.mark.parametrize("masked", [False, True])
 def test_choices_by_hand(masked):
     algorithm, state = make(CHOICES)
-    s, alphas = sample(CHOICES, masked), [0.2, 0.7]
+    s, alphas = transitions(CHOICES, (P, B), masked=masked), [0.2, 0.7]
     (total, error, _), (policy, entropy) = losses(algorithm, state, s)
     views = algorithm.layout.views(state.params)
 
@@ -151,7 +132,7 @@ def test_choices_by_hand(masked):
 @pytest.mark.parametrize("space", [FORCES, CHOICES], ids=["forces", "choices"])
 def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_below(space):
     algorithm, state = make(space)
-    s = sample(space)
+    s = transitions(space, (P, B))
     _, (_, entropy) = losses(algorithm, state, s)
     before = state.log_alpha.clone()
     for aim in (entropy.min().item() - 2.0, entropy.max().item() + 2.0):
@@ -172,7 +153,7 @@ def test_the_temperature_falls_where_the_entropy_is_above_its_aim_and_rises_belo
 def test_a_fixed_temperature_stays():
     algorithm, state = make(FORCES, learn_ent_coef=False, ent_coef=0.2)
     state.ent_coef[1] = 0.7  # members' own
-    _, report = algorithm.update(state, sample(FORCES), generators())
+    _, report = algorithm.update(state, transitions(FORCES, (P, B)), generators())
     assert report.metrics["ent_coef"].tolist() == pytest.approx([0.2, 0.7])
 
 
@@ -188,7 +169,7 @@ def test_the_policy_is_delayed_and_the_target_is_not():
     algorithm, state = make(FORCES, policy_delay=2, tau=0.25)
     for due in (False, True, False, True):
         before = {k: getattr(state, k).clone() for k in ("params", "log_alpha", "critic_target")}
-        algorithm.update(state, sample(FORCES), generators())
+        algorithm.update(state, transitions(FORCES, (P, B)), generators())
         assert torch.equal(state.params, before["params"]) != due
         assert torch.equal(state.log_alpha, before["log_alpha"]) != due
         moved = before["critic_target"] + 0.25 * (state.critic - before["critic_target"])
@@ -221,7 +202,7 @@ def test_masks_and_a_high_temperature_leave_everything_finite(alpha):
 @pytest.mark.parametrize("space", [FORCES, CHOICES], ids=["forces", "choices"])
 def test_the_entropy_between_n_steps_is_part_of_the_target_by_hand(space):
     algorithm, state = make(space, n_step=3)
-    s, alphas, g = sample(space), [0.2, 0.7], torch.Generator().manual_seed(5)
+    s, alphas, g = transitions(space, (P, B)), [0.2, 0.7], torch.Generator().manual_seed(5)
     between = torch.randn(P, B, 2, 3, generator=g)
     counts = torch.tensor([0.9, 0.5]).expand(P, B, 2).clone()
     counts[:, 1:3, 1] = 0.0  # the steps ended before
@@ -334,6 +315,6 @@ def test_a_collapsed_deviation_comes_back():
     bias = algorithm.layout.views(state.params)["actor.0.bias"]
     bias[..., 2:] = -9.0
     for _ in range(10):
-        algorithm.update(state, sample(FORCES), generators())
+        algorithm.update(state, transitions(FORCES, (P, B)), generators())
     # There a deviation costs nothing and entropy pays: every step of Adam is the whole rate.
     assert bias[..., 2:].flatten().tolist() == pytest.approx([-8.9] * 4, abs=0.01)

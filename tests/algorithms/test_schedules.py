@@ -85,9 +85,6 @@ def test_what_is_no_schedule_is_a_sentence(kind):
         (lambda remaining: remaining - 0.6, r"\(0\.5\) returned -0\.09"),
         (lambda remaining: 1.0 / remaining, r"\(0\) raised ZeroDivisionError.*test_schedules\.py"),
         (lambda remaining: "a", "raised ValueError"),
-        (-1.0, rf"{name}\.learning_rate is -1\.0; it must be a positive number"),
-        ("fast", rf"{name}\.learning_rate is 'fast'; it must be a positive number, Linear"),
-        ((1, 2), rf"{name}\.learning_rate is \(1, 2\); it must be a positive number"),
     ):
         with pytest.raises(DeclarationError, match=says):
             kind(learning_rate=rate)

@@ -186,18 +186,6 @@ def test_what_was_kept_is_looked_at_before_it_is_learnt_from():
         Stack(grid, state)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("imitation_rows", 0), ("imitation_steps", 0),
-        ("imitation_coef", float("nan")), ("imitation_vf_coef", -0.1),
-    ],
-)  # fmt: skip
-def test_a_setting_out_of_range_is_named(name, value):
-    with pytest.raises(DeclarationError, match=rf"SelfImitationPPO\.{name} is {value!r}; it must"):
-        SelfImitationPPO(**{name: value})
-
-
 def test_memory_is_refused():
     from skillweave import RNN
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from toys import transitions
 
 from skillweave.algorithms.base import ActingParams
 from skillweave.algorithms.config import TD3
@@ -19,30 +19,18 @@ from skillweave.ops.losses import critic_loss as regression
 from skillweave.seeding import Seeds
 
 P, B, A = 2, 6, 2
+FORCES = Box(-1, 1, (A,))
 LINEAR = TD3(num_envs=2, network=Network(()), learning_rate=1e-2)
 
 
 def make(**settings: Any) -> tuple[TD3Algorithm, State]:
-    algorithm = TD3Algorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), Box(-1, 1, (A,)))
+    algorithm = TD3Algorithm(replace(LINEAR, **settings), Box(-1, 1, (3,)), FORCES)
     state = algorithm.init([Seeds(m) for m in range(P)])
     g = torch.Generator().manual_seed(1)
     for name in ("params", "target", "critic", "critic_target"):
         flat = getattr(state, name)
         flat += 0.3 * torch.randn(flat.shape, generator=g)
     return algorithm, state
-
-
-def sample(weighted: bool = False) -> Sample:
-    g = torch.Generator().manual_seed(0)
-    discount = torch.full((P, B), 0.9)
-    discount[:, 0] = 0.0
-    return Sample(
-        obs=torch.randn(P, B, 3, generator=g), action=torch.rand(P, B, A, generator=g) * 2 - 1,
-        reward=torch.randn(P, B, generator=g), discount=discount,
-        next_obs=torch.randn(P, B, 3, generator=g), mask=None, next_mask=None,
-        weight=torch.rand(P, B, generator=g) if weighted else None,
-        index=np.zeros((P, B), np.int64),
-    )  # fmt: skip
 
 
 def force(algorithm: TD3Algorithm, flat: torch.Tensor, m: int, obs: torch.Tensor) -> torch.Tensor:
@@ -72,7 +60,7 @@ def critic_loss(algorithm: TD3Algorithm, state: State, s: Sample) -> Any:
 @pytest.mark.parametrize("noise", [0.0, 0.2, 5.0])
 def test_the_target_is_smoothed_by_clipped_noise_and_the_smaller_of_two(twin, noise):
     algorithm, state = make(twin=twin, target_noise=noise, target_noise_clip=0.3)
-    s = sample(weighted=True)
+    s = transitions(FORCES, (P, B))
     total, error, mean = critic_loss(algorithm, state, s)
     for m, g in enumerate(generators()):
         action = force(algorithm, state.target, m, s.next_obs[m])
@@ -98,7 +86,7 @@ def test_the_target_is_smoothed_by_clipped_noise_and_the_smaller_of_two(twin, no
 
 def test_the_actor_climbs_the_first_critic():
     algorithm, state = make(action_l2=0.0)
-    s = sample()
+    s = transitions(FORCES, (P, B), weighted=False)
     flat = state.params.clone().requires_grad_()
     algorithm.policy_loss(algorithm.layout.views(flat), state, {"vector": s.obs}).sum().backward()
     for m in range(P):
@@ -114,7 +102,7 @@ def test_actor_and_targets_follow_with_a_delay(delay):
     names = ("params", "target", "critic_target")
     for step in range(1, 7):
         before = {k: getattr(state, k).clone() for k in (*names, "critic")}
-        algorithm.update(state, sample(), generators())
+        algorithm.update(state, transitions(FORCES, (P, B), weighted=False), generators())
         assert not torch.equal(state.critic, before["critic"])
         due = step % delay == 0
         assert [not torch.equal(getattr(state, k), before[k]) for k in names] == [due] * 3
@@ -168,7 +156,7 @@ def test_the_actors_rate_is_a_share_of_the_critics():
     for share in (1.0, 0.25):
         algorithm, state = make(actor_rate=share, policy_delay=1)
         before = state.params.clone(), state.critic.clone()
-        algorithm.update(state, sample(), generators())
+        algorithm.update(state, transitions(FORCES, (P, B), weighted=False), generators())
         moved[share] = state.params - before[0], state.critic - before[1]
     # Adam's first step is the rate times the gradient's sign
     torch.testing.assert_close(moved[0.25][0], 0.25 * moved[1.0][0], rtol=1e-3, atol=1e-6)

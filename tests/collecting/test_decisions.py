@@ -1,26 +1,16 @@
 """What a selector learns from beside its calls, which tests/calls has: γ, success, info, errors."""
 
+import functools
 import itertools
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from calls.cases import SEEN, SkillCase, skill_of
-from reference_calls import (
-    Counter,
-    Left,
-    Right,
-    T,
-    Walk,
-    Zigzag,
-    scripted,
-)
+from reference_calls import Counter, Die, Left, Right, T, Walk, Zigzag, scripted
 from toy_acting import Again, Choices, Given, requests
-from toys import alone_in, calling_in
+from toys import alone_in, calling_in, network_of, skills_of
 
-from skillweave.algorithms.config import PPO
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
@@ -28,12 +18,11 @@ from skillweave.seeding import Seeds
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
 
+SPACES = Walk.observation_space, Walk.action_space
 N, ALL = 4, (Left, Right, Zigzag, Counter)
 
 
-def skill_set(*kinds, call_steps=5, **how):
-    skills = tuple(kind() for kind in kinds)
-    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **how)
+skill_set = functools.partial(skills_of, call_steps=5)
 
 
 def collector_of(skills, n=N, keep_rewards=False, env=Walk, acting=None, **spec):
@@ -202,13 +191,6 @@ def test_a_call_that_nothing_ends_is_told_and_not_waited_for(monkeypatch):
         collector.collect(next(asked))
 
 
-@pytest.mark.parametrize("method", ["initiation", "termination"])
-def test_a_wrong_shape_names_the_skill_and_the_method(method):
-    wrong = type("Wrong", (Left,), {method: lambda self, x: np.zeros((2, 1), bool)})
-    with pytest.raises(SkillweaveError, match=rf"'wrong'.*{method}\(\).*shape"):
-        collector_of(skill_set(wrong)).collect(next(requests(1)))
-
-
 def test_a_termination_that_is_no_flag_names_the_environment():
     class Half(Left):
         def termination(self, step):
@@ -224,31 +206,9 @@ def test_a_termination_that_is_no_flag_names_the_environment():
 # Skills that sample ----------------------------------------------------------------------------
 
 
-class Sampler(ScriptedPolicy):
-    """Greedy: 0; else a die."""
-
-    def act(self, memory, obs, mask=None, *, deterministic=True, rng=None):
-        n = len(obs)
-        return np.zeros(n, np.int64) if deterministic else rng.integers(3, size=n), memory
-
-
-class Die(Skill):
-    policy = Sampler(None, Walk.observation_space, Walk.action_space)
-
-
-def network():
-    """A fresh network's policy."""
-    config = PPO(num_envs=1, n_steps=1, batch_size=1)
-    algorithm = make_algorithm(config, Walk.observation_space, Walk.action_space)
-    state = algorithm.init([Seeds(0)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-    return AgentPolicy.of(algorithm, state)
-
-
 @pytest.mark.parametrize("kind", ["scripted", "network"])
 def test_what_skills_draw_follows_from_the_requests_seeds(kind):
-    policies = (Die.policy if kind == "scripted" else network(), Zigzag.policy)
+    policies = (Die.policy if kind == "scripted" else network_of(*SPACES), Zigzag.policy)
 
     def play(first, greedy):
         skills = SkillSet((Die(), Zigzag()), policies, call_steps=4, greedy=greedy)

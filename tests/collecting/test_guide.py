@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from ready_selectors.chain import KEY, SPEC, GetKey, Leave, OpenDoor, Wait, bound, got_key
 from toy_acting import Choices, requests
-from toys import calling_in
+from toys import calling_in, skills_of
 
 from skillweave.collecting.acting import Acted
 from skillweave.collecting.calls import SMOOTHED, as_logits
 from skillweave.collecting.collector import joined_collected
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import make_engine
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.seeding import Seeds
@@ -26,7 +25,7 @@ AUTOMATON = Automaton(
 
 
 def collector_of(guide, call_steps=2):
-    skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=call_steps)
+    skills = skills_of(*SKILLS, call_steps=call_steps)
     acting = Choices(N, skills.choices)
     found = calling_in(make_engine(SPEC, N), acting, skills, guide=guide)
     found.start(Seeds(2))
@@ -34,7 +33,7 @@ def collector_of(guide, call_steps=2):
 
 
 def test_a_guide_that_decides_takes_any_of_several_and_the_first_if_it_is_greedy():
-    skills = SkillSet(SKILLS, tuple(s.policy for s in SKILLS), call_steps=2)
+    skills = skills_of(*SKILLS, call_steps=2)
     for greedy in (False, True):
         collector = calling_in(
             make_engine(SPEC, N), None, skills,

@@ -177,7 +177,6 @@ def test_a_reward_that_changes_gets_each_step_once_and_in_order(make: Any, path:
         lambda step: np.where(step.info["number"] >= 1, np.nan, 0.0),
         lambda step: 1 / 0 if (step.info["number"] >= 1).any() else step.reward,
         lambda step: step.reward[:-1] if (step.info["number"] >= 1).any() else step.reward,
-        lambda step: step.info["missing"],
     ],
 )
 def test_a_wrong_reward_has_the_message_of_the_step_in_which_it_is_wrong(

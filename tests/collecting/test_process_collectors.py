@@ -15,41 +15,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from living import all_end
-from reference_calls import EPISODE, Counter, Left, Right, Zigzag
-from toy_acting import Again, Choices, Mortal, requests
-from toys import alone_in, calling_in
+from reference_calls import EPISODE
+from toy_acting import Again, Choices, Mortal, deciding, equal, requests, stepping
+from toys import alone_in
 
 from skillweave.collecting import processes, worker_process
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.placement import make_collectors
 from skillweave.collecting.processes import ProcessCollectors
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
-
-NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
-
-
-def skills():
-    kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
-    return SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
-
-
-def deciding(env=Again):
-    def make(num_envs, first):
-        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return calling_in(engine, Choices(num_envs, 4), skills())
-
-    return make
-
-
-def stepping(env=Again):
-    def make(num_envs, first):
-        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return alone_in(engine, Choices(num_envs, 3))
-
-    return make
 
 
 def here(make):
@@ -69,11 +45,8 @@ def in_processes():
         collectors.close()
 
 
-def equal(one, two):
-    for name in NAMES:
-        np.testing.assert_array_equal(one.batches[""].get(name), two.batches[""].get(name))
-    assert one.steps == two.steps
-    np.testing.assert_array_equal(one.episodes, two.episodes)
+def same(one, two):
+    equal(one, two)
     assert not len(one.begun_anew)
     assert not len(two.begun_anew)
 
@@ -86,7 +59,7 @@ def test_the_same_experience_here_and_in_processes(in_processes, kind, rows):
     for collectors in (plain, apart):
         collectors.start(Seeds(3))
     for request in itertools.islice(requests(rows), 40):  # with snapshots in between
-        equal(plain.collect(request), apart.collect(request))
+        same(plain.collect(request), apart.collect(request))
     assert plain.steps_made == apart.steps_made
 
 
@@ -103,7 +76,7 @@ def test_killed_workers_are_made_again_and_find_the_same(in_processes, kind):
             os.kill(victim.pid, signal.SIGKILL)
             if rng.random() < 0.5:
                 victim.join()
-        equal(plain.collect(request), apart.collect(request))
+        same(plain.collect(request), apart.collect(request))
         if at % 13 == 12:
             assert plain.state().keys() == apart.state().keys()
 
@@ -150,7 +123,7 @@ def test_one_that_dies_in_the_middle_of_a_step_is_made_again(in_processes, tmp_p
         if at == 3:
             fuse.touch()
         one, two = plain.collect(request), apart.collect(request)
-        equal(one, two)
+        same(one, two)
     assert not fuse.exists(), "it did not die"
 
 
@@ -173,7 +146,7 @@ def test_processes_that_are_not_forked_get_the_users_code_and_stay(
         collectors.start(Seeds(3))
     for i, request in enumerate(itertools.islice(requests(2), 2)):
         time.sleep(1.5 * worker_process.LOOK * i)  # they look whether their parent lives
-        equal(ours.collect(request), theirs.collect(request))
+        same(ours.collect(request), theirs.collect(request))
     assert [worker.process.pid for worker in theirs._workers] == pids
 
 
@@ -220,8 +193,8 @@ def test_a_state_goes_from_processes_to_this_thread_and_back(in_processes):
     again.restore(state)
     for request in itertools.islice(asked, 5):
         found = apart.collect(request)
-        equal(plain.collect(request), found)
-        equal(again.collect(request), found)
+        same(plain.collect(request), found)
+        same(again.collect(request), found)
 
 
 def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
@@ -229,42 +202,6 @@ def test_a_state_of_another_number_of_collectors_is_refused(in_processes):
     apart.start(Seeds(0))
     with pytest.raises(SkillweaveError, match="of 2 collectors, but there are 1"):
         Collectors([deciding()(6, 0)]).restore(apart.state())
-
-
-class Always(Mortal):
-    """Kills its process in each third step of an episode."""
-
-    def step(self, action):
-        if self.t == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().step(action)
-
-
-def test_one_that_dies_again_at_the_same_place_is_told(in_processes):
-    collectors = in_processes(stepping(Always))
-    collectors.start(Seeds(0))
-    with pytest.raises(SkillweaveError, match=r"worker 0 \(environments 0 to 2\) died by signal 9"):
-        collectors.collect(next(requests(5)))
-
-
-class Unpicklable(Exception):
-    def __reduce__(self):
-        raise TypeError("cannot be pickled")
-
-
-class Failing(Again):
-    def step(self, action):
-        if self.t == 2:
-            raise Unpicklable("the arm is stuck")
-        return super().step(action)
-
-
-def test_an_error_names_environment_step_and_worker(in_processes):
-    collectors = in_processes(stepping(Failing))
-    collectors.start(Seeds(0))
-    match = r"environment [0-5], step 3.*the arm is stuck.*worker [01]"
-    with pytest.raises(SkillweaveError, match=match):
-        collectors.collect(next(requests(5)))
 
 
 class Stuck(Again):
@@ -279,14 +216,6 @@ def test_closing_ends_workers_that_are_stuck(in_processes):
     workers = [w.process for w in collectors._workers]
     collectors.close()
     assert not any(w.is_alive() for w in workers)
-
-
-def test_an_environment_that_cannot_be_made_is_told():
-    def broken(num_envs, first):
-        raise SkillweaveError("no such maze")
-
-    with pytest.raises(SkillweaveError, match="no such maze"):
-        ProcessCollectors(broken, 2, 2, 1, "Maze")
 
 
 def test_environments_that_cannot_be_shared_out_equally_are_refused():
@@ -327,7 +256,7 @@ def test_large_columns_come_whole_though_the_memory_must_grow(in_processes):
         collectors.start(Seeds(0))
     for rows in (2, 40, 3):
         request = next(requests(rows))
-        equal(plain.collect(request), apart.collect(request))
+        same(plain.collect(request), apart.collect(request))
 
 
 def left_behind():

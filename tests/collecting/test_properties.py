@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 from reference_calls import POSITION, Counter, Left, Right, Walk, Zigzag
 from toy_acting import Choices, requests, valid_rows
-from toys import ASKS, SHOWS, alone_in, calling_in
+from toys import ASKS, SHOWS, alone_in, calling_in, skills_of
 
 from skillweave.algorithms.config import PPO, SAC
 from skillweave.algorithms.policy import make_algorithm
@@ -168,8 +168,7 @@ def skill_part(kind):
 
 
 def decision_part(kind):
-    skills = tuple(k() for k in (Left, Right, Zigzag, Counter))
-    calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=40)
+    calls = skills_of(Left, Right, Zigzag, Counter, call_steps=40)
     engine = make_engine(EnvSpec(Walk, engine="sync"), 2)
     return calling_in(engine, Choices(2, 4), calls, keep_rewards=kind == "rewards")
 

@@ -14,12 +14,9 @@ from importlib import metadata
 from types import SimpleNamespace
 
 import gymnasium as gym
-import numpy as np
 import pytest
-from reference_calls import Counter, Left, Right, Zigzag
 from small_runs import interrupt_at_checkpoint
-from toy_acting import Again, Choices, requests
-from toys import alone_in, calling_in
+from toy_acting import Again, deciding, equal, requests, stepping
 
 from skillweave import (
     PPO,
@@ -28,8 +25,7 @@ from skillweave import (
 )
 from skillweave.collecting.cluster import Ray
 from skillweave.collecting.group import Collectors
-from skillweave.collecting.skill_set import SkillSet
-from skillweave.envs.make import EnvSpec, make_engine
+from skillweave.envs.make import EnvSpec
 from skillweave.errors import SkillweaveError
 from skillweave.runs.files import read_tensors
 from skillweave.seeding import Seeds
@@ -39,9 +35,6 @@ cluster_utils = pytest.importorskip("ray.cluster_utils")
 
 from skillweave.collecting import actors  # noqa: E402
 from skillweave.collecting.actor_host import COMPUTING, ActorHost  # noqa: E402
-
-NAMES = ("obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid")
-
 
 pytestmark = [
     pytest.mark.slow,
@@ -80,33 +73,8 @@ def on_ray(cluster):
         yield of
 
 
-def deciding(env=Again):
-    def make(num_envs, first):
-        kinds = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
-        skills = SkillSet(kinds, tuple(s.policy for s in kinds), call_steps=5)
-        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return calling_in(engine, Choices(num_envs, 4), skills)
-
-    return make
-
-
-def stepping(env=Again):
-    def make(num_envs, first):
-        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
-        return alone_in(engine, Choices(num_envs, 3))
-
-    return make
-
-
 def here(make, count=2):
     return Collectors([make(3, 3 * i) for i in range(count)])
-
-
-def equal(one, two):
-    for name in NAMES:
-        np.testing.assert_array_equal(one.batches[""].get(name), two.batches[""].get(name))
-    assert one.steps == two.steps
-    np.testing.assert_array_equal(one.episodes, two.episodes)
 
 
 def kill(worker):

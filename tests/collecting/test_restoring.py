@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from reference_calls import POSITION, Counter, Left, Right, Zigzag, shy
 from toy_acting import Again, Choices, Counts, Given, requests, step
-from toys import alone_in, calling_in
+from toys import alone_in, calling_in, skills_of
 
-from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.errors import SkillweaveError
 from skillweave.seeding import Seeds
@@ -61,8 +60,7 @@ def of_skill(env=Again, skill=None, engine="sync", actions=3, reflexes=(), actin
 
 def of_selector(greedy=True):
     def make():
-        skills = tuple(kind() for kind in (Left, Right, Zigzag, Counter))
-        calls = SkillSet(skills, tuple(s.policy for s in skills), call_steps=5, greedy=greedy)
+        calls = skills_of(Left, Right, Zigzag, Counter, call_steps=5, greedy=greedy)
         return calling_in(engine_of(Again), Counts(3, 4), calls, keep_rewards=True)
 
     return make

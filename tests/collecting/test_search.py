@@ -9,12 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from toy_acting import Choices, requests
-from toys import alone_in
+from toys import alone_in, skills_of
 
 from skillweave.collecting.search import Search, Starts
 from skillweave.collecting.skill_set import SkillSet
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.policies.core import World
 from skillweave.seeding import Seeds
 from skillweave.skills import Skill
@@ -82,15 +82,21 @@ class Anywhere(Skill):
 
 
 def collector_of(
-    *kinds, env=Corridor, skill=Far, start_calls=0, search_steps=None, episode_calls=1
+    *kinds, env=Corridor, skill=Far, start_calls=0, search_steps=None, episode_calls=1, **more
 ):
-    skills = tuple(kind() for kind in kinds)
-    starters = SkillSet(skills, tuple(s.policy for s in skills)) if skills else None
+    starters = skills_of(*kinds) if kinds else None
     engine = make_engine(EnvSpec(env, engine="sync"), N)
     how = start_calls, search_steps, episode_calls
-    found = alone_in(engine, Choices(N, 5), skill(), (), starters, *how)
+    found = alone_in(engine, Choices(N, 5), skill(), (), starters, *how, **more)
     found.start(Seeds(0))
     return found
+
+
+def starts_of(collector, rows=1_500):
+    found = collector.collect(next(requests(rows))).batches[""]
+    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
+    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
+    return found["obs"][began]
 
 
 def test_it_is_led_to_where_it_may_start_and_only_its_own_rows_are_valid():
@@ -124,19 +130,14 @@ def test_where_no_starter_may_start_chance_acts():
 
 def test_without_starters_it_says_that_chance_found_nothing():
     collector = collector_of()
-    with pytest.raises(SkillweaveError, match="steps of random acting"):
+    with pytest.raises(TrainingError, match="steps of random acting"):
         collector.collect(next(requests(6_000)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "skill"), [((Five,), Anywhere), ((Five,), Far)])
 def test_a_number_of_calls_comes_first_and_each_number_is_as_likely(kinds, skill):
-    collector = collector_of(*kinds, skill=skill, start_calls=6)
-    found = collector.collect(next(requests(6_000))).batches[""]
-    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
-    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
-    at = found["obs"][:, :, X][began]
-    calls = at / 5
+    calls = starts_of(collector_of(*kinds, skill=skill, start_calls=6), 6_000)[:, X] / 5
     least = 4 if skill is Far else 0  # it may start at 20, after four calls
     counts = np.array([np.mean(calls == k) for k in range(7)])
     expected = np.where(np.arange(7) < least, 0, 1 / 7)
@@ -159,10 +160,7 @@ def test_an_episode_in_which_it_may_not_start_begins_anew():
 
 def test_where_it_may_start_the_calls_that_come_first_take_their_time():
     collector = collector_of(Five, skill=Anywhere, start_calls=6, search_steps=3)
-    found = collector.collect(next(requests(2_000))).batches[""]
-    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
-    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
-    assert set(np.unique(found["obs"][:, :, X][began] / 5)) == set(range(7))
+    assert set(np.unique(starts_of(collector, 2_000)[:, X] / 5)) == set(range(7))
 
 
 @pytest.mark.parametrize(
@@ -337,20 +335,8 @@ class Back(Skill):
     policy = always(0)
 
 
-def named(start_calls=0, kinds=(Five, Back), after=("five",), skill=Anywhere):
-    skills = tuple(kind() for kind in kinds)
-    starters = SkillSet(skills, tuple(s.policy for s in skills))
-    engine = make_engine(EnvSpec(Corridor, engine="sync"), N)
-    found = alone_in(engine, Choices(N, 5), skill(), (), starters, start_calls, after=after)
-    found.start(Seeds(0))
-    return found
-
-
-def starts_of(collector, rows=1_500):
-    found = collector.collect(next(requests(rows))).batches[""]
-    before = np.concatenate([np.zeros((1, N), bool), found["valid"][:-1]])
-    began = found["valid"] & (~before | (found["obs"][:, :, T] == 0))
-    return found["obs"][began]
+def named(start_calls=0, kinds=(Five, Back), after=("five",)):
+    return collector_of(*kinds, skill=Anywhere, start_calls=start_calls, after=after)
 
 
 def test_half_of_the_episodes_start_after_a_call_of_a_named_skill():

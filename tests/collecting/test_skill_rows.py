@@ -446,23 +446,13 @@ def bad_skill(method: str, value) -> Skill:
 
 
 @pytest.mark.parametrize("method", ["reward", "termination", "success"])
-@pytest.mark.parametrize("value", [lambda x: x[:1], lambda x: x[:, None], lambda x: 0.0])
-def test_a_wrong_shape_names_the_skill_the_method_and_the_step(collector, method, value):
-    env = collector("sync", "CartPole-v1", bad_skill(method, value))
+def test_a_wrong_shape_names_the_skill_the_method_and_the_step(collector, method):
+    env = collector("sync", "CartPole-v1", bad_skill(method, lambda x: x[:, None]))
     for _ in range(2):
         step(env, np.zeros(3, np.int64))
     with pytest.raises(
         SkillweaveError, match=rf"'wrong': {method}\(\) returned shape .* at step 3"
     ):
-        step(env, np.zeros(3, np.int64))
-
-
-@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
-def test_a_reward_that_is_not_finite_names_the_skill_and_the_step(collector, number):
-    env = collector("sync", "CartPole-v1", bad_skill("reward", lambda x: x * number))
-    for _ in range(2):
-        step(env, np.zeros(3, np.int64))
-    with pytest.raises(SkillweaveError, match=rf"'wrong': reward\(\) returned {number} at step 3"):
         step(env, np.zeros(3, np.int64))
 
 

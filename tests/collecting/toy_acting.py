@@ -10,10 +10,12 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from reference_calls import EPISODE, Walk
+from reference_calls import EPISODE, Counter, Left, Right, Walk, Zigzag
+from toys import alone_in, calling_in, skills_of
 
 from skillweave.collecting.acting import Acted, Request
-from skillweave.collecting.collector import Collected
+from skillweave.collecting.collector import Collected, Collector
+from skillweave.envs.make import EnvSpec, make_engine
 from skillweave.experience import Batch
 from skillweave.seeding import Seeds
 from skillweave.types import Array
@@ -114,3 +116,34 @@ class Mortal(Again):
                 self.fuse.unlink()
                 os.kill(os.getpid(), signal.SIGKILL)
         return super().step(action)
+
+
+def deciding(env: Any = Again) -> Any:
+    """Makes collectors of a selector of four skills."""
+
+    def make(num_envs: int, first: int) -> Collector:
+        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
+        skills = skills_of(Left, Right, Zigzag, Counter, call_steps=5)
+        return calling_in(engine, Choices(num_envs, 4), skills)
+
+    return make
+
+
+def stepping(env: Any = Again) -> Any:
+    """Makes collectors of an agent."""
+
+    def make(num_envs: int, first: int) -> Collector:
+        engine = make_engine(EnvSpec(env, engine="sync"), num_envs, first=first)
+        return alone_in(engine, Choices(num_envs, 3))
+
+    return make
+
+
+def equal(one: Any, two: Any) -> None:
+    """Both collected the same."""
+    for name in (
+        "obs", "action", "reward", "steps", "terminated", "truncated", "next_obs", "valid",
+    ):  # fmt: skip
+        np.testing.assert_array_equal(one.batches[""].get(name), two.batches[""].get(name))
+    assert one.steps == two.steps
+    np.testing.assert_array_equal(one.episodes, two.episodes)

@@ -242,10 +242,8 @@ def test_images_and_one_hot_states():
     ("make", "says"),
     [
         (lambda: PPO([8], 4, False, True, net_config={"arch": "mlp"}), "hidden_size"),
-        (lambda: PPO([8], 4, False, True, net_config={"hidden_size": [8]}), "arch"),
         (lambda: PPO([8], 4, False, True, batch_size=0), "batch_size"),
         (lambda: PPO([8], 4, False, True, actor_network=torch.nn.Linear(8, 4)), "actor_network"),
-        (lambda: PPO([8], 4, False, True, accelerator=object()), "accelerator"),
         (lambda: KINDS["ppo"]().getAction(OBS, action=torch.zeros(5)), "learn()"),
     ],
 )

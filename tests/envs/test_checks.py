@@ -7,7 +7,7 @@ import pytest
 from skillweave.envs.checks import CheckedEnv, Watch, time_limit
 from skillweave.envs.engine import RawStep
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import DeclarationError, EnvError
+from skillweave.errors import EnvError
 
 BOX = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 GOOD = np.zeros(2, np.float32), 1.0, False, False, {}
@@ -52,24 +52,15 @@ def third_step(env):
 WRONG = {
     "nothing": (None, "step.. returned a NoneType"),
     "a complex reward": (but(reward=1 + 2j), r"reward is \(1\+2j\); it must be a number"),
-    "a text as reward": (but(reward="1.5"), "reward is '1.5'"),
-    "no reward": (but(reward=None), "reward is None"),
-    "rewards": (but(reward=np.zeros(2)), "reward is array"),
     "a NaN as reward": (but(reward=np.nan), "its reward is nan; it must be finite"),
-    "an infinite reward": (but(reward=-np.inf), "its reward is -inf"),
-    "a reward too large": (but(reward=1e300), r"its reward is 1e\+300"),
     "a reward too large to square": (
         but(reward=-2e15),
         r"-2000000000000000.0; it must be .*at most 1e\+15",
     ),
     "terminated: NaN": (but(terminated=np.nan), "terminated is nan; it must be True or False"),
-    "terminated: 7": (but(terminated=7), "terminated is 7"),
-    "terminated: text": (but(terminated="no"), "terminated is 'no'"),
-    "terminated: None": (but(terminated=None), "terminated is None"),
     "truncated: object": (but(truncated=np.array([None])), "truncated is array"),
     "info: a list": (but(info=[]), r"info is \[\]"),
     "a NaN seen": (but(obs=np.float32([0, np.nan])), "1 of 2 numbers that are not finite.*nan"),
-    "infinity seen": (but(obs=np.float32([-np.inf, np.inf])), "2 of 2 numbers.*-inf"),
     "another shape": (
         but(obs=np.zeros(3, np.float32)),
         r"an array \(3,\) of float32",
@@ -169,24 +160,12 @@ def test_the_first_observation_is_looked_at_too(reset, says):
         (lambda: None, "made None, which is no environment"),
         (lambda: 1 / 0, "could not be made: ZeroDivisionError"),
         (scripted(GOOD, action_space=3), "action_space is 3; it must be a Gymnasium space"),
-        (type("Bare", (gym.Env,), {}), "observation_space is None"),
         (lambda shared=Scripted(): shared, "the same environment each time"),  # noqa: B008
     ],
 )
 def test_what_makes_no_environment_is_told(made, says):
     with pytest.raises(EnvError, match=says):
         make_engine(EnvSpec(made), 2)
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        ({"env": Scripted()}, "env is .*many environments are made"),
-    ],
-)
-def test_a_wrong_specification_names_the_field(given, says):
-    with pytest.raises(DeclarationError, match=says):
-        EnvSpec(**given)
 
 
 def test_settings_that_gymnasium_does_not_know_and_wrappers_that_fail_are_told():
@@ -231,13 +210,12 @@ def test_large_numbers_are_numbers():
     watch.check_step(raw(huge, (1e15, -1e15)))
 
 
-@pytest.mark.parametrize("reward", [2e15, -3e38])
-def test_a_reward_too_large_to_be_squared_names_its_environment(reward):
+def test_a_reward_too_large_to_be_squared_names_its_environment():
     # Before, training ended with a NaN and the advice to lower the learning rate.
     watch = Watch("X", BOX, 2)
     watch.check_reset(zeros := np.zeros((2, 2), np.float32))
     with pytest.raises(EnvError, match=r"X: environment 1, step 1.*at most 1e\+15 in size"):
-        watch.check_step(raw(zeros, (0.0, reward)))
+        watch.check_step(raw(zeros, (0.0, 2e15)))
 
 
 def test_envpool_is_watched_too(monkeypatch):

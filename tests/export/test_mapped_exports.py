@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from skills.mapped_models import ACTION, CASES, SPACE, observations
+from skills.mapped_models import ACTION, CASES, SPACE, observations, one
 
 import skillweave as sw
 from skillweave.api.player import Player
@@ -16,20 +16,10 @@ from skillweave.errors import PolicyError
 from skillweave.export.foreign import as_file
 from skillweave.export.runner import Runner
 from skillweave.export.write import write_export
-from skillweave.types import Array
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("stable_baselines3")
 torch.set_num_threads(1)
-
-
-def one(obs: Array, i: int) -> dict[str, Any]:
-    """An observation as an environment returns it."""
-    return {
-        "gyro": obs["gyro"][i],
-        "state": obs["state"][i],
-        "arm": {"joints": obs["arm"]["joints"][i], "grip": obs["arm"]["grip"][i]},
-    }
 
 
 def compare(policy: Any, folder: Path, code: Any) -> None:

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from goals.worlds import ON, SPACES, Point, Rest, declared
-from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait
+from ready_selectors.chain import DOOR, PLACE, Corridor, GetKey, Leave, OpenDoor, Wait, at_four
 
 from skillweave import EnvSpec, Lengths
 from skillweave.api.player import Player
@@ -33,10 +33,6 @@ from skillweave.policies.core import Turn, World
 from skillweave.policies.hierarchy import ActiveGuide
 from skillweave.skills import Skill
 from skillweave.skills.scripted import ScriptedPolicy
-
-
-def at_four(obs: Any) -> Any:
-    return obs[:, PLACE] == 4
 
 
 def opened(step: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 from reference_calls import POSITION, TAG, Counter, Left, Right, T, Walk, Zigzag, scripted, shy
 from test_networks import agent
+from toys import skills_of
 
 from skillweave import PPO, RNN, Automaton, Network, Reflex
 from skillweave.algorithms.config import SkillCritic
@@ -90,9 +92,7 @@ class Free(Skill):
     policy = network(3, seed=3)
 
 
-def skill_set(*kinds: Any, call_steps: Any = 4, **more: Any) -> SkillSet:
-    skills = tuple(k() for k in kinds)
-    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **more)
+skill_set = functools.partial(skills_of, call_steps=4)
 
 
 def ready(value: Any, skills: SkillSet) -> HierarchyPolicy:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_runs import assert_same, stopped_run
+from small_runs import goes_on
 from worlds import SMALL, SPACES, GoTo, Rest, aim_of, declared, go_to
 
 import skillweave as sw
@@ -78,15 +78,12 @@ def test_it_learns_and_goes_on_bit_for_bit(learn, space, tmp_path):
             )
         return declared([far(inner, space), Rest()], **outer)
 
-    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    run = goes_on(hierarchy, tmp_path, 4)
     selector = run.policy.skills.policies[0].selector
     assert selector.observation_space == with_goal(run.policy.observation_space, SPACES[space])
     before = run.evaluate(3)
     assert {"far", "far/go_to"} <= set(before.skills)
-    assert sw.load(tmp_path / "run", hierarchy()).evaluate(3).returns == before.returns
-    stopped_run(hierarchy(), tmp_path / "cut", 4)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", run.path)
+    assert sw.load(run.path, hierarchy()).evaluate(3).returns == before.returns
 
 
 def test_its_selector_learns_to_use_the_goal(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from goals.test_calls_of_goals import ready
 from goals.worlds import SPACES, Point, Rest, declared, go_to, place_of
 from planning.logs import log_of
-from planning.steps import step_to
+from planning.steps import at, step_to
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, RunError, SkillError
@@ -32,10 +32,6 @@ def near(*place: float) -> Predicate:
         return np.abs(obs - np.float32(place)).max(1) < 0.3
 
     return Predicate(there, f"near {place}", "obs")
-
-
-def at(*places: float) -> Predicate:
-    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
 
 
 MISSION = Mission(near(1.4, 0.3), near(0.3, 1.4))

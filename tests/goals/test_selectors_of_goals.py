@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_runs import assert_same, stopped_run
+from small_runs import goes_on
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
 import skillweave as sw
@@ -99,10 +99,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(learn, space, tmp_path):
             [Rest(), go_to(space)], selector=SELECTOR, learn=learn, steps=1500, train_defaults=OFTEN
         )
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(hierarchy, tmp_path)
 
 
 @pytest.mark.parametrize("learn", ["apart", "together"])
@@ -113,12 +110,9 @@ def test_skills_with_goals_inside(learn, tmp_path):
         still = type("Still", (Rest,), {})()
         return declared([inner, still], steps=1500, **how)
 
-    run = hierarchy().train(tmp_path / "run", seed=3, quiet=True)
+    run = goes_on(hierarchy, tmp_path, 5)
     assert "inner/go_to" in run.evaluate(3).skills
     assert run.evaluate(2, skill="inner/go_to").skills["inner/go_to"].calls == 2
-    stopped_run(hierarchy(), tmp_path / "cut", 5)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", run.path)
 
 
 def test_chosen_lengths_and_goals(tmp_path):
@@ -149,11 +143,8 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
         skills = [Sometimes(), go_to(space)]
         return declared(skills, selector=selector, learn=learn, steps=900, train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    whole = goes_on(hierarchy, tmp_path, 4)
     assert sw.load(whole.path, hierarchy()).evaluate(3).returns == whole.evaluate(3).returns
-    stopped_run(hierarchy(), tmp_path / "cut", 4)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
     hierarchy("together").train(tmp_path / "together", seed=3, quiet=True)
 
 
@@ -161,7 +152,6 @@ def test_a_selector_with_values_chooses_discrete_goals(selector, space, tmp_path
     ("selector", "space", "says"),
     [
         (sw.DQN(), "box", r"selector: DQN cannot choose goals of Box.*'go_to' needs them"),
-        (sw.SAC(), "box", "selector: SAC cannot choose goals of Box"),
         (sw.TD3(), "number", "selector: TD3 cannot choose goals, but"),
         (sw.PPO(), "picture", "selector: PPO cannot choose goals of Box"),
     ],
@@ -233,11 +223,8 @@ def test_an_environment_of_options_takes_goals(tmp_path):
     ("actions", "says"),
     [
         ([0, 1], "but skills have goals: give a dict with 'skill'.* goals for 'go_to'"),
-        ({"skill": [0, 1]}, "a dict with goals for 'go_to'"),
-        ({"goal": {"go_to": np.zeros((2, 2))}}, "give a dict with 'skill'"),
         ({"skill": [0], "goal": {"go_to": np.zeros((2, 2))}}, r"the skills are \[0\]; .* 2 env"),
         ({"skill": [0, 2], "goal": {"go_to": np.zeros((2, 2))}}, "action 2 is no skill"),
-        ({"skill": [0, 0.5], "goal": {"go_to": np.zeros((2, 2))}}, "must be a whole number"),
         (
             {"skill": [0, 0], "goal": {"go_to": np.zeros((2, 3))}},
             r"shape \(2, 3\) for skill 'go_to'",
@@ -342,7 +329,6 @@ def test_goals_of_other_rows_may_be_anything(tmp_path):
             "which are no goals of Box",
         ),
         (sw.Automaton({"a": ("go_to", lambda obs: None)}, {}), "returned None, but goals"),
-        (sw.tree.Sequence(("go_to", lambda obs: None)), "returned None, but goals"),
     ],
 )
 def test_goals_that_are_no_arrays(selector, says, tmp_path):
@@ -392,20 +378,11 @@ def test_a_function_gives_goals_of_a_tuple(tmp_path):
     assert goal["1"] == 1
 
 
-def test_parts_of_goals_that_are_missing_are_said(tmp_path):
-    rule = lambda obs: (["go_to"] * len(obs), {"at": obs, "bite": obs})  # noqa: E731
-    with pytest.raises(SkillError, match=r"goals of the parts .* for skill .* a dict with"):
-        evaluated(rule, NESTED, tmp_path)
-
-
 @pytest.mark.parametrize(
     "rule",
     [
         lambda obs: ("go_to", HERE),
-        lambda obs: ("go_to", np.array(HERE)),
         lambda obs: [("go_to", HERE) for _ in obs],
-        lambda obs: tuple(("go_to", HERE) for _ in obs),
-        lambda obs: [("go_to", HERE), *["rest"] * (len(obs) - 1)],
         lambda obs: (["go_to"] * len(obs), None),
         lambda obs: (["go_to"] * len(obs), obs / 4, 1),
     ],

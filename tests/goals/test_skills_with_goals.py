@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 import pytest
-from small_runs import assert_same, reports_every, stopped_run
+from small_runs import goes_on, reports_every
 from toys import alone_in
 from worlds import ON, SMALL, SPACES, Point, Rest, declared, go_to
 
@@ -71,10 +71,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(name, tmp_path):
         env = functools.partial(Point, discrete=discrete)
         return declared(env=env, algorithm=algorithm, steps=400, train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(hierarchy, tmp_path)
 
 
 @pytest.mark.parametrize("space", ["dict", "whole"])
@@ -82,10 +79,7 @@ def test_goals_of_other_spaces_are_resumed(space, tmp_path):
     def hierarchy():
         return declared([go_to(space), Rest()], selector=rest, steps=400, train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(hierarchy, tmp_path)
 
 
 def test_goals_of_a_damaged_checkpoint_are_refused():

@@ -31,7 +31,6 @@ from skillweave.spaces import obs_dtype
         (lambda self, obs, rng: None, r"goals\(\) returned None"),
         (lambda self, obs, rng: obs.astype(str), r"goals\(\) gave goals of <U.*are numbers"),
         (lambda self, obs, rng: obs + 7, r"goals\(\) gave the goal .* out of goal_space Box"),
-        (lambda self, obs, rng: obs * np.nan, r"goals\(\) gave the goal \[nan"),
         (lambda self, obs, rng: obs.no, r"goals\(\) raised AttributeError"),
     ],
 )
@@ -47,7 +46,6 @@ UNSUPPORTED: dict[str, Any] = {
         r"the part word of the goal_space, Text.* is not supported",
     ),
     "empty": (gym.spaces.Box(-1, 1, (0,), np.float32), "which holds no number: leave it out"),
-    "no part": (gym.spaces.Dict({}), "needs at least one part"),
     "names": (gym.spaces.Dict({1: SPACES["box"]}), "each with text as its name"),
 }
 
@@ -66,15 +64,9 @@ def test_a_space_that_is_not_supported_is_named_with_its_skill(space, says, lear
     [
         (
             "dict",
-            {"to": 0, "side": 1},
-            r"gave goals of the parts \['to', 'side'\] for skill 'go_to', but",
-        ),
-        (
-            "dict",
             {"at": 0, "side": 1, "sid": 0},
             r"gave goals of the parts \['at', 'side', 'sid'\] for",
         ),
-        ("dict", {"at": 0}, "a dict with 'at', 'side' was expected: its goals are of Dict"),
         ("tuple", (0, 1, 2), "a tuple of 2 parts was expected"),
     ],
 )
@@ -190,11 +182,9 @@ def test_a_player_keeps_its_own_goal(tmp_path):
 @pytest.mark.parametrize(
     ("space", "goal", "says"),
     [
-        ("picture", np.full((8, 8, 3), 300), "out of goal_space"),
         ("bits", (257, 0), r"gave the goal \[257, 0\], which is out of goal_space MultiBinary"),
         ("dict", {"at": (0, 0)}, "a dict with 'at', 'side' was expected"),
         ("dict", {"at": (0, 5), "side": 1}, "out of goal_space"),
-        ("tuple", ((0, 0),), "a tuple of 2 parts was expected"),
         ("dict", {"at": (0,), "side": 1}, r"\(1, 2\) was expected: .* for one environment$"),
         ("tuple", 3, "gave"),
     ],
@@ -317,10 +307,8 @@ def test_functions_get_the_goal_where_a_parameter_takes_it(name, tmp_path):
     ("policy", "kind", "says"),
     [
         (lambda self, obs: constant(obs), PolicyError, r"takes no goal.*policy\(obs, goal\)"),
-        (lambda self, obs, scale=2.0: constant(obs), PolicyError, "takes no goal"),
         (lambda obs, scale=2.0: constant(obs), PolicyError, "takes no goal"),
         (lambda s, o: constant(o), DeclarationError, r"takes \(s, o\), which may be"),
-        (lambda s, o, g=None: constant(o), DeclarationError, r"takes \(s, o, g\), which may be"),
     ],
 )
 def test_functions_that_cannot_take_the_goal_are_refused(policy, kind, says):

@@ -174,15 +174,6 @@ def test_a_weight_of_a_hierarchy_holds_for_the_skills_in_it():
     assert stage.task_weights == {"inner/one": 0.5, "inner/two": 0.5}
 
 
-@pytest.mark.parametrize("weight", [-1.0, float("nan"), "much", True])
-def test_a_weight_that_is_none_is_refused(weight):
-    class Odd(Skill):
-        task_weight = weight
-
-    with pytest.raises(SkillweaveError, match=r"task_weight is .*at least 0"):
-        declare(Odd())
-
-
 def test_lengths_learn_together_too():
     (stage,) = declare(call_steps=Lengths(4, 8), selector=PPO()).stages()
     assert stage.kind == "together"

@@ -9,7 +9,8 @@ import pytest
 import torch
 from declaring import plainly, skills_with
 from gymnasium.spaces import Box, Dict, Discrete, Text
-from small_runs import stage_entry
+from small_runs import acts, stage_entry
+from toys import network_of
 
 from skillweave import (
     DQN,
@@ -23,15 +24,15 @@ from skillweave import (
     SkillweaveError,
     recipes,
 )
-from skillweave.algorithms.policy import AgentPolicy, make_algorithm
+from skillweave.algorithms.policy import AgentPolicy
 from skillweave.api import Run
 from skillweave.cli.overrides import apply_overrides, list_settings
+from skillweave.errors import DeclarationError
 from skillweave.hierarchy.policy import HierarchyPolicy
 from skillweave.hierarchy.roles import roles_of
 from skillweave.hierarchy.weights import open_weights, read_weights, write_weights
 from skillweave.networks.config import CNN, Network
 from skillweave.runs.files import read_tensors, write_tensors
-from skillweave.seeding import Seeds
 from skillweave.skills.scripted import ScriptedPolicy
 from skillweave.training.stage import check_stages
 
@@ -68,47 +69,6 @@ def named(name: str, **attributes) -> Skill:
 # What is wrong -------------------------------------------------------------------------------
 
 
-WRONG = {
-    "no name": (lambda: declare(named("")), "Custom.*no name"),
-    "a name that is no file name": (lambda: declare(named("a/b")), "'a/b'.*Custom.*letters"),
-    "the name of the selector": (lambda: declare(named("selector")), "'selector'.*stage"),
-    "the name of the baseline": (lambda: declare(named("agent")), "'agent'.*stage"),
-    "no skill at all": (lambda: declare("center"), "'center'.*not a Skill"),
-    "max_steps=0": (lambda: declare(named("x", max_steps=0)), "'x'.*max_steps is 0"),
-    "max_steps=1.5": (lambda: declare(named("x", max_steps=1.5)), "'x'.*max_steps is 1.5"),
-    "steps=0": (lambda: declare(named("x", steps=0)), "'x'.*steps is 0"),
-    "steps='many'": (lambda: declare(named("x", steps="many")), "'x'.*steps is 'many'"),
-    "skills that never stop": (
-        lambda: declare(Center(), named("endless"), call_steps=None),
-        "call_steps is None.*'endless'.*max_steps or termination",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_declaration_names_the_skill_and_the_field(case):
-    make, says = WRONG[case]
-    with pytest.raises(SkillweaveError, match=says):
-        make()
-
-
-NOT_CHECKED = {
-    "a reflex that is only a function": (
-        lambda: declare(reflexes=[zeros]),
-        "must be an instance of Reflex",
-    ),
-    "a skill's settings as a class": (lambda: declare(named("x", algorithm=PPO)), "'x'.*algorithm"),
-    "a policy's class": (lambda: declare(named("x", policy=ScriptedPolicy)), "'x'.*policy"),
-}
-
-
-@pytest.mark.parametrize("case", NOT_CHECKED)
-def test_what_is_of_a_wrong_type_is_named_before_anything_is_trained(case):
-    make, says = NOT_CHECKED[case]
-    with pytest.raises(SkillweaveError, match=says):
-        make().check_spaces()
-
-
 def test_a_right_declaration_passes_and_skills_may_stop_in_any_way():
     declare().check_spaces()
     stops = named("stops", termination=lambda self, step: step.terminated)
@@ -140,9 +100,7 @@ def test_a_space_that_is_not_supported_is_named(spaces, says):
     ("kind", "space"),
     [
         ("observation_space", Box(-1, 1, (3,))),
-        ("observation_space", Discrete(4)),
         ("action_space", Discrete(3)),
-        ("action_space", Box(-1, 1, ())),
     ],
 )
 def test_a_policy_for_other_spaces_names_the_skill_and_both_spaces(kind, space):
@@ -154,33 +112,16 @@ def test_a_policy_for_other_spaces_names_the_skill_and_both_spaces(kind, space):
         assert word in str(raised.value)
 
 
-@pytest.mark.parametrize("env", ["CartPol-v1", "CartPole-v99", "Cartpole-v1"])
-def test_an_unknown_environment_is_an_error_with_close_matches(env):
-    with pytest.raises(SkillweaveError, match=rf"'{env}'.*CartPole-v1"):
-        declare(env=env).check_spaces()
-
-
-@pytest.mark.parametrize("env", ["NothingLikeIt-v0", "no_such_module:Env-v0", ""])
-def test_an_environment_like_no_other_is_an_error_too(env):
-    with pytest.raises(SkillweaveError, match="no environment"):
-        declare(env=env).check_spaces()
-
-
 def test_a_wrong_declaration_is_not_trained(tmp_path):
     with pytest.raises(SkillweaveError, match="CartPole-v1"):
         declare(env="CartPol-v1").train(tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", [[], [0, 1], {"a": 1}, 7, None], ids=str)
-def test_a_skill_asked_for_by_what_is_no_name_is_answered_so_too(name):
-    with pytest.raises(SkillweaveError, match=r"no skill .*; there are: "):
+@pytest.mark.parametrize("name", [[], {"a": 1}, None, "middle"], ids=str)
+def test_a_skill_that_is_not_there_is_answered_with_those_that_are(name):
+    with pytest.raises(SkillweaveError, match=r"no skill .*center, lean"):
         declare().skill(name)
-
-
-def test_a_skill_that_is_not_there_is_answered_with_those_that_are():
-    with pytest.raises(SkillweaveError, match=r"'middle'.*center, lean"):
-        declare().skill("middle")
 
 
 def test_budgets_are_the_skills_own_else_the_hierarchys_and_nothing_for_ready_policies():
@@ -279,34 +220,19 @@ KNOWN = "PPO, SelfImitationPPO, DQN, TD3, SAC"
 WRONG_SETTINGS = {
     "call_steps": "name=value",
     "call_step=4": "call_step'.*is 'call_steps' meant",
-    "selecter.gamma=1": "selecter.gamma.*is 'selector.gamma",
     "selector.gama=0.9": "selector.gama.*is 'selector.gamma",
-    "skills.center.learning_rat=1": "learning_rat'.*is 'skills.center.learning_rate",
     "selector.network.hiden=3": "hiden.*is 'selector.network.hidden",
     "skills.centre.gamma=1": "'centre'.*is 'center' meant",
-    "skills.center=4": f"skills.center=4: no algorithm '4'; there are: {KNOWN}",
     "selector=4": f"selector=4: no algorithm '4'; there are: {KNOWN}, .*Rainbow, DDPG",
     "skills.nobody=DQN": "no skill 'nobody'",
-    "selector.update_epoch=4": "no setting 'selector.update_epoch'.*update_epochs",
-    "=4": "no setting ''",
     "selector.gamma.x=4": "gamma has no parts",
-    "call_steps=soon": "call_steps=soon: expected a whole number",
-    "call_steps=2.5": "call_steps=2.5: expected a whole number",
-    "call_steps=true": "call_steps=true: expected a whole number",
     "call_steps=": "call_steps=: expected a whole number",
     "selection.greedy_skills=1": "selection.greedy_skills=1: expected True, False or None",
     "together.interrupt=none": "together.interrupt=none: expected True or False",
-    "apart.skill_steps=soon": "apart.skill_steps=soon: expected a whole number",
-    "apart.skill_steps=1e999": "apart.skill_steps=1e999: expected a whole number",
-    "selector.gamma=high": "selector.gamma=high: expected a number, between 0 and 1",
-    "selector.gamma=true": "selector.gamma=true: expected a number, between 0 and 1",
     "selector.gamma=nan": "selector.gamma=nan: expected a number, between 0 and 1",
     "selector.network.activation=sine": "activation=sine: expected.*tanh",
-    "selector.network.hidden=wide": "hidden=wide: expected a list, each entry a whole number",
     "call_steps=0": "call_steps is 0",
-    "apart.skill_steps=0": "skill_steps is 0",
     "skills.lean.steps=-4": "'lean'.*steps is -4",
-    "selector.gamma=2": "gamma is 2.0.*between 0 and 1",
     "skills.center.learning_rate=-1": "learning_rate is -1.0.*positive",
     "selector.batch_size=100000": "batch_size is 100000.*num_envs",
     "selector.learning_rate_schedule=kl": "target_kl",
@@ -328,14 +254,8 @@ def test_a_setting_of_an_agents_name_alone_takes_another_algorithm_then_the_rest
 
 @pytest.mark.parametrize("setting", WRONG_SETTINGS)
 def test_a_wrong_setting_is_named(setting):
-    with pytest.raises(SkillweaveError, match=WRONG_SETTINGS[setting]):
+    with pytest.raises(DeclarationError, match=WRONG_SETTINGS[setting]):
         apply_overrides(declare(), [setting])
-
-
-@pytest.mark.parametrize("value", ["(0,)", "(-4, 4)", "('a',)", "(2.5,)"])
-def test_widths_that_no_layer_can_have_are_an_error_for_people(value):
-    with pytest.raises(SkillweaveError, match="hidden"):
-        apply_overrides(declare(), [f"selector.network.hidden={value}"])
 
 
 def test_a_critic_of_its_own_can_be_set_where_it_has_been_as_the_actors():
@@ -378,14 +298,7 @@ def test_a_ready_policy_has_no_settings_to_list():
 
 
 def agent(seed: int, actions: int = 2, **settings) -> AgentPolicy:
-    config = PPO(num_envs=1, n_steps=1, batch_size=1, network=Network(hidden=(8, 8)), **settings)
-    algorithm = make_algorithm(config, OBS, Discrete(actions))
-    state = algorithm.init([Seeds(seed)])
-    with torch.no_grad():
-        state.params[:] = 5 * state.params
-        state.obs_mean[:] = 0.3
-        state.obs_var[:] = 2.0
-    return AgentPolicy.of(algorithm, state)
+    return network_of(OBS, Discrete(actions), seed, network=Network((8, 8)), **settings)
 
 
 def trained(d: Hierarchy) -> HierarchyPolicy:
@@ -395,16 +308,6 @@ def trained(d: Hierarchy) -> HierarchyPolicy:
 
 def read(d: Hierarchy, path: Path) -> HierarchyPolicy:
     return read_weights(roles_of(d), *open_weights(path), path)[1]
-
-
-def acts(policy, steps: int = 30) -> list:
-    rng, memory, found = np.random.default_rng(0), policy.start(16), []
-    for _ in range(steps):
-        obs = rng.normal(size=(16, 4)).astype(np.float32)
-        action, memory = policy.act(memory, obs)
-        found.append((action.tolist(), policy.acting(memory).tolist()))
-        memory["end"][:] = rng.random(16) < 0.5
-    return found
 
 
 @pytest.mark.parametrize("skills", [(Center, Lean), (Center, Ready, Lean)])
@@ -566,9 +469,7 @@ class Plain(Skill):
     ("space", "which"),
     [
         (gym.spaces.MultiBinary(10**9), "observation"),
-        (gym.spaces.Discrete(10**9), "observation"),
         (gym.spaces.Dict(a=gym.spaces.MultiDiscrete([2**60, 2**62])), "observation"),
-        (gym.spaces.MultiBinary(10**9), "action"),
         (gym.spaces.MultiDiscrete([2**60, 2**62]), "action"),
     ],
 )
@@ -608,13 +509,7 @@ def test_a_wrong_argument_of_train_is_told(tmp_path, wrong, says):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"skills": Plain}, "skills must be a list"),
-        ({"skills": 3}, "skills must be a list"),
         ({"reflexes": 3}, "reflexes is 3; it must be a list"),
-        ({"reflexes": Reflex(max, 0)}, "reflexes is .*; it must be a list"),
-        ({"greedy_skills": "no"}, "greedy_skills is 'no'; it must be True, False or None"),
-        ({"skill_steps": 10.0}, "skill_steps is 10.0"),
-        ({"env": None}, "env is None"),
         ({"skills": ["x" * 10_000]}, "skills holds 'xxx.{0,200} which is not a Skill"),
     ],
 )

@@ -10,6 +10,7 @@ import torch
 from declaring import plainly, skills_with
 from gymnasium.spaces import Box, MultiDiscrete
 from skills.foreign_models import WEIGHT, linear, onnx_file, sb3_zip
+from small_runs import acts
 
 from skillweave import (
     PPO,
@@ -61,16 +62,6 @@ def made(tmp_path_factory):
     onnx_file(folder / "skill.onnx")
     run = declare(*all_kinds(folder)).train(folder / "run", seed=0, quiet=True)
     return folder, run
-
-
-def acts(policy, size=4, steps=40):
-    rng, memory, found = np.random.default_rng(0), policy.start(16), []
-    for _ in range(steps):
-        obs = rng.normal(size=(16, size)).astype(np.float32)
-        action, memory = policy.act(memory, obs)
-        found.append((action.tolist(), policy.acting(memory).tolist()))
-        memory["end"][:] = rng.random(16) < 0.5
-    return found
 
 
 def test_a_run_names_and_keeps_its_policies(made):

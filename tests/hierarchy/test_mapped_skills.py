@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from declaring import plainly
-from small_runs import assert_same, stopped_run
+from small_runs import goes_on
 from torch import nn
 
 import skillweave as sw
@@ -63,10 +63,7 @@ def declare() -> Hierarchy:
 
 
 def test_a_run_that_is_stopped_in_the_middle_of_calls_goes_on_bit_for_bit(tmp_path: Path) -> None:
-    whole = declare().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(declare(), tmp_path / "cut", 3)
-    resumed = declare().resume(tmp_path / "cut", quiet=True)
-    assert_same(resumed.path, whole.path)
+    whole = goes_on(declare, tmp_path)
     recorded = json.loads((whole.path / "run.json").read_text())["skills"][0]["policy"]
     assert recorded["mapping"]["every"] == 2
     assert recorded["mapping"]["sees"][""][1] == {"source": "last_action", "scale": 0.5}

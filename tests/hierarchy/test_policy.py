@@ -1,5 +1,6 @@
 """HierarchyPolicy as a policy: its memory, its errors, and one of its skills alone."""
 
+import functools
 from pathlib import Path
 
 import gymnasium as gym
@@ -22,6 +23,7 @@ from reference_calls import (
     Zigzag,
     scripted,
 )
+from toys import skills_of
 
 from skillweave.api import Hierarchy, Run
 from skillweave.collecting.skill_set import SkillSet
@@ -54,9 +56,7 @@ class Chooser(ScriptedPolicy):
         return np.array(chosen), memory
 
 
-def skill_set(*kinds, call_steps=4, **more) -> SkillSet:
-    skills = tuple(k() if isinstance(k, type) else k for k in kinds)
-    return SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps, **more)
+skill_set = functools.partial(skills_of, call_steps=4)
 
 
 def hierarchy(*kinds, **more) -> HierarchyPolicy:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from reach import ON, SMALL, SPACES, Arm, Grip, Reach, Ready, Whole, by_hand, on, reach
-from small_runs import assert_same, reports_every, stopped_run
+from small_runs import goes_on, reports_every
 from torch import nn
 
 import skillweave as sw
@@ -101,10 +101,7 @@ def declared(name: str) -> sw.Hierarchy:
     "name", ["together", "held", "apart", "recurrent", "self-imitation", "nested"]
 )
 def test_a_stopped_run_ends_with_the_same_weights(name, tmp_path):
-    whole = declared(name).train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(declared(name), tmp_path / "cut", 3)
-    declared(name).resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    whole = goes_on(lambda: declared(name), tmp_path)
     returns = whole.evaluate(3).returns
     assert declared(name).load(whole.path).evaluate(3).returns == returns
 
@@ -168,10 +165,7 @@ def test_a_script_holds_actions_of_several_parts(kind, tmp_path):
     def declared() -> sw.Hierarchy:
         return reach([Slow(), Whole()], env=on(kind), call_steps=6, train_defaults=OFTEN)
 
-    whole = declared().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(declared(), tmp_path / "cut", 3)
-    declared().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(declared, tmp_path)
     alone = reach([Slow()], env=on(kind), call_steps=6).train(quiet=True)
     grips = [a["grip"] if kind == "dict" else a[1] for a in played(alone.policy, kind)]
     assert grips[:6] == [g for g in grips[:6:3] for _ in range(3)]

@@ -8,7 +8,7 @@ import torch
 from gymnasium.spaces import Box, Dict
 from torch import nn
 from torch.nn import functional as F
-from toys import Echo, learn
+from toys import Echo, drawn, learn
 
 from skillweave.algorithms import register_encoder
 from skillweave.algorithms.config import DQN, PPO
@@ -28,13 +28,6 @@ IMPALA = CNN.impala((4, 6))
 
 def image_space(height: int = 12, width: int = 10, channels: int = 3) -> Box:
     return Box(0, 255, (height, width, channels), np.uint8)
-
-
-def made(encoder: ImageEncoder, members: int = P) -> tuple[Layout, torch.Tensor]:
-    layout = Layout(encoder.shapes)
-    flat = torch.zeros(members, layout.size)
-    encoder.init_(layout.views(flat), [torch.Generator().manual_seed(m) for m in range(members)])
-    return layout, flat
 
 
 def plain(views, m: int, x: torch.Tensor, activation) -> torch.Tensor:
@@ -67,7 +60,7 @@ def test_a_stack_computes_and_learns_what_plain_torch_networks_do(
     monkeypatch.setattr(ObsCodec, "pixels", lambda *of: pixels(*of).double())
     obs = obs_codec(image_space())
     encoder = ImageEncoder(obs, 0, cnn, activation)
-    layout, flat = made(encoder)
+    layout, flat = drawn(encoder, P)
     g = torch.Generator().manual_seed(9)
     flat += 0.1 * torch.randn(flat.shape, generator=g)
     flat = flat.double()
@@ -90,7 +83,7 @@ def test_a_stack_computes_and_learns_what_plain_torch_networks_do(
 @pytest.mark.parametrize("cnn", [PLAIN, IMPALA])
 def test_filters_are_orthogonal_and_of_each_members_own(cnn):
     encoder = ImageEncoder(obs_codec(image_space()), 0, cnn, "relu")
-    layout, flat = made(encoder)
+    layout, flat = drawn(encoder, P)
     for m in range(P):
         alone = torch.zeros(1, layout.size)
         encoder.init_(layout.views(alone), [torch.Generator().manual_seed(m)])

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from small_runs import assert_same, stopped_run
+from small_runs import goes_on
 
 import skillweave as sw
 
@@ -104,10 +104,7 @@ def crane(skills: Any = None, **how: Any) -> sw.Hierarchy:
 
 def goes_on_and_loads(hierarchy: Callable[[], sw.Hierarchy], folder: Path) -> None:
     """Assert that a stopped run ends with the same weights, and that these load in both ways."""
-    whole = hierarchy().train(folder / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), folder / "cut", 3)
-    hierarchy().resume(folder / "cut", quiet=True)
-    assert_same(folder / "cut", whole.path)
+    whole = goes_on(hierarchy, folder)
     returns = whole.evaluate(3).returns
     assert hierarchy().load(whole.path).evaluate(3).returns == returns
     file = whole.save_weights(folder / "weights.safetensors")

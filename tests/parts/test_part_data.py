@@ -30,13 +30,9 @@ HELD = ((), np.ones(3, bool))
     ("make", "says"),
     [
         (lambda: Part(BOX, box(1), places=(3,), fixed=FIXED), r"Part.places is \(3,\).* 0 to 2"),
-        (lambda: Part(BOX, box(2), places=(0, 0), fixed=FIXED), "Part.places .*each one once"),
         (lambda: Part(BOX, box(2), places=(0,), fixed=FIXED), "Part.own is "),
-        (lambda: Part(ONE, ONE, places=(0, 1)), "Part.own is Discrete"),
         (lambda: Part(BOX, box(1), places=(0,)), "Part.fixed is None"),
-        (lambda: Part(BOX, BOX, fixed=FIXED), "Part.fixed is "),
         (lambda: Part(BOX, box(1), places=(0,), fixed=FIXED[0]), "Part.fixed is .*does not fit"),
-        (lambda: Part(BOX, box(1), places=(0,), fixed=FIXED * 1.0e0 + np.zeros(1)), "Part.fixed"),
         (
             lambda: Part(BOX, box(1), places=(0,), fixed=FIXED, held=((("x",), HELD[1]),)),
             r"Part.held has \('x',\)",

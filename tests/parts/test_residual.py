@@ -14,7 +14,7 @@ from torch import nn
 
 import skillweave as sw
 from skillweave.algorithms.policy import AgentPolicy
-from skillweave.errors import DeclarationError, PolicyError
+from skillweave.errors import DeclarationError
 from skillweave.evolution import Evolution
 
 often = reports_every(40)
@@ -221,10 +221,7 @@ def test_a_population_learns_corrections():
     ("policy", "scale", "says"),
     [
         (None, 0.2, "Residual.policy is None; it must be a function of observations"),
-        (nn.Linear, 0.2, "Residual.policy is .*Linear"),
         (middle, 0.0, "Residual.scale is 0.0; it must be a number over 0"),
-        (middle, float("nan"), "Residual.scale is nan"),
-        (middle, "big", "Residual.scale is 'big'"),
         (middle, (0.1, -0.2), "Residual.scale is"),
         (sw.Residual(middle), 0.2, "Residual.policy is Residual"),
     ],
@@ -239,10 +236,6 @@ class Ready(sw.Skill):
         return middle(obs)
 
 
-class Corrected(sw.Skill):
-    policy = sw.Residual(middle)
-
-
 READY = r"and no policy: give what acts in that skill, {}\.policy"
 LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
 
@@ -254,8 +247,6 @@ LEARNS = r"a skill that learns, and no policy: train .* run\.policy"
         (Ready(), "is the skill 'ready', " + READY.format("skill")),
         (Arm, "is the class Arm, " + LEARNS),
         (Arm(), "is the skill 'arm', " + LEARNS),
-        (Corrected, "is the class Corrected, " + LEARNS),
-        (Corrected(), "is the skill 'corrected', " + LEARNS),
     ],
 )
 def test_a_skill_is_no_policy(skill, says):
@@ -292,11 +283,6 @@ def test_what_has_a_policy_is_not_one():
         crane([declared(ready)]).train(quiet=True)
     with pytest.raises(DeclarationError, match=r"the skill 'ready', and no policy.*\.policy"):
         declared(ready.as_skill("ready"))
-
-
-def test_a_ready_policy_of_another_shape_is_refused():
-    with pytest.raises(PolicyError, match=r"skill 'better'.*\(2, 3\) was expected"):
-        crane([declared(lambda obs: obs["arm"])]).train(quiet=True)
 
 
 def test_an_action_without_bounds_is_corrected_in_its_own_unit():

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from crane import ON, SMALL, Arm, Crane, Hook, crane, goes_on_and_loads
-from small_runs import assert_same, reports_every, stopped_run
+from small_runs import goes_on, reports_every
 
 import skillweave as sw
 from skillweave.errors import DeclarationError, PolicyError, RunError, SkillError
@@ -178,7 +178,6 @@ def learnt(tmp_path_factory):
     [
         ({"acts": (0, 2)}, r"acts was '0:2', and here it is \[0, 2\]"),
         ({"sees": (1, 2)}, r"sees was .*'arm'.*, and here it is .*\[1, 2\]"),
-        ({"sees": sw.Part("arm", scale=2.0)}, r"sees was .*, and here it is .*'scale': 2"),
         ({"policy": sw.Residual(lambda obs: np.zeros((len(obs), 2)))}, "residual was None.* 0.2"),
     ],
 )
@@ -246,10 +245,7 @@ def test_a_nested_hierarchy_learns(learn, tmp_path):
         all_of_it = type("Whole", (sw.Skill,), {})()
         return crane([inner, all_of_it], learn=learn, train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
+    goes_on(hierarchy, tmp_path)
 
 
 def test_a_hierarchy_has_no_part_of_its_own():
@@ -325,12 +321,9 @@ def test_a_skill_has_goals_and_a_part(learn, tmp_path):
     def hierarchy() -> sw.Hierarchy:
         return crane([Sideways(), Hook()], learn=learn, rest="hold", train_defaults=OFTEN)
 
-    whole = hierarchy().train(tmp_path / "whole", seed=3, quiet=True)
+    whole = goes_on(hierarchy, tmp_path)
     space = whole.policy.skills.policies[0].observation_space
     assert space["observation"] == Crane.observation_space["arm"]
-    stopped_run(hierarchy(), tmp_path / "cut", 3)
-    hierarchy().resume(tmp_path / "cut", quiet=True)
-    assert_same(tmp_path / "cut", whole.path)
     assert whole.evaluate(2, skill="sideways").returns
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from skillweave.planning import Predicate
 from skillweave.types import Array, Step
 
 
@@ -35,3 +36,8 @@ def column(i: int) -> Any:
 
     holds.__name__ = "abcdef"[i]
     return holds
+
+
+def at(*places: float) -> Predicate:
+    """The predicate that the first number is one of these."""
+    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")

@@ -23,6 +23,7 @@ from ready_selectors.chain import (
     Wait,
     hierarchy,
 )
+from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
 from skillweave.collecting.skill_set import SkillSet
@@ -38,7 +39,7 @@ SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 
 def skill_set(**how: Any) -> SkillSet:
-    return SkillSet(SKILLS, tuple(s.policy for s in SKILLS), **how)
+    return skills_of(*SKILLS, **how)
 
 
 @pytest.fixture(scope="module")
@@ -294,7 +295,7 @@ def test_logs_are_joined(log: CallLog) -> None:
         join([log, record_calls(SPEC, skill_set(call_steps=5), 20)])
     with pytest.raises(RunError, match="'get_key' differs between the logs"):
         join([log, record_calls(SPEC, skill_set(call_steps=6), 20, info=["door"])])
-    few = SkillSet(SKILLS[2:], tuple(s.policy for s in SKILLS[2:]))
+    few = skills_of(*SKILLS[2:])
     with pytest.raises(RunError, match="another of leave, wait"):
         join([log, record_calls(SPEC, few, 20)])
     with pytest.raises(DeclarationError, match="at least one"):
@@ -306,7 +307,7 @@ def test_a_log_of_other_skills_says_so(log: CallLog) -> None:
     for skills, message in (
         (skill_set(call_steps=6), "'get_key' has changed since the log was recorded"),
         (skill_set(call_steps=Lengths(1, 2)), "no chosen lengths, but these are with the lengths"),
-        (SkillSet(SKILLS[1:], tuple(s.policy for s in SKILLS[1:])), "record a log of these skills"),
+        (skills_of(*SKILLS[1:]), "record a log of these skills"),
     ):
         with pytest.raises(RunError, match=message):
             log.check_skills(skills)

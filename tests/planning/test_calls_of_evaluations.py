@@ -20,6 +20,7 @@ from ready_selectors.chain import (
     bound,
     hierarchy,
 )
+from toys import skills_of
 
 from skillweave import Automaton, EnvSpec, Lengths
 from skillweave.collecting.skill_set import SkillSet
@@ -63,7 +64,7 @@ def lengths_of(obs: Array) -> Array:
 
 def policies() -> dict[str, HierarchyPolicy]:
     skills = (GetKey(), OpenDoor(), Leave(), Wait())
-    lengths = SkillSet(skills, tuple(s.policy for s in skills), call_steps=Lengths(1, 3))
+    lengths = skills_of(*skills, call_steps=Lengths(1, 3))
 
     class Chooser:
         observation_space, action_space = Fixed.observation_space, gym.spaces.Discrete(8)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ready_selectors.chain import PLACE, SPEC, GetKey, OpenDoor, Wait, hierarchy
+from ready_selectors.chain import PLACE, SPEC, GetKey, OpenDoor, Wait, at_four, hierarchy
 
 import skillweave as sw
 from skillweave.api import Run
@@ -24,10 +24,6 @@ class Then(Wait):
 class ToKey(GetKey):
     def success(self, step: Any) -> Any:
         return step.next_obs[:, 1] == 1
-
-
-def at_four(obs: Any) -> Any:
-    return obs[:, PLACE] == 4
 
 
 def at_five(obs: Any) -> Any:

@@ -9,8 +9,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from planning.logs import log_of
-from planning.steps import step_to
-from ready_selectors.chain import DOOR, KEY, PLACE, SPEC, Corridor, GetKey, Leave, OpenDoor, Wait
+from planning.steps import at, step_to
+from ready_selectors.chain import (
+    DOOR,
+    KEY,
+    PLACE,
+    SPEC,
+    Corridor,
+    GetKey,
+    Leave,
+    OpenDoor,
+    Wait,
+    has_key,
+)
+from toys import skills_of
 
 from skillweave import EnvSpec, Hierarchy, Lengths, evaluate
 from skillweave.collecting.skill_set import SkillSet
@@ -38,10 +50,6 @@ from skillweave.types import Array, HierarchyPolicy
 
 GAMMA = 0.9
 LINE = 10
-
-
-def at(*places: float) -> Predicate:
-    return Predicate(lambda obs: np.isin(obs[:, 0], places), f"at {places}", "obs")
 
 
 def moved(place: int, by: int) -> list[int]:
@@ -320,11 +328,7 @@ SKILLS = (GetKey(), OpenDoor(), Leave(), Wait())
 
 
 def skill_set(**how: Any) -> SkillSet:
-    return SkillSet(SKILLS, tuple(s.policy for s in SKILLS), **how)
-
-
-def has_key(obs: Array) -> Array:
-    return obs[:, KEY] == 1
+    return skills_of(*SKILLS, **how)
 
 
 def open_door(obs: Array) -> Array:
@@ -379,7 +383,7 @@ def test_it_chooses_lengths_when_they_are_chosen() -> None:
         policy = GetKey.policy
 
     pair = (Go(), Back())
-    skills = SkillSet(pair, tuple(s.policy for s in pair), call_steps=Lengths(1, 2, 4))
+    skills = skills_of(*pair, call_steps=Lengths(1, 2, 4))
     log = record_calls(SPEC, skills, 1_500, num_envs=4)
     planner = Planner(log, Mission(has_key, at_three), skills=skills)
     memory = planner.among(("go", "back")).start(1)
@@ -618,7 +622,7 @@ def in_places(picture: bool) -> tuple[EnvSpec, SkillSet]:
 
     spec = EnvSpec(lambda: Places(Corridor(), picture), engine="sync")
     skills = (go(0), go(2))
-    return spec, SkillSet(skills, tuple(s.policy for s in skills))
+    return spec, skills_of(*skills)
 
 
 def test_observations_in_a_dict_are_planned_on() -> None:

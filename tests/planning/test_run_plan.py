@@ -5,19 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from ready_selectors.chain import (
-    DOOR,
     PLACE,
     SPEC,
     Corridor,
     GetKey,
+    InDict,
     Leave,
     OpenDoor,
     Wait,
     always,
+    at_four,
     hierarchy,
 )
 
@@ -36,10 +36,6 @@ from skillweave.planning import (
 )
 from skillweave.planning.mission import as_task
 from skillweave.planning.task_env import Tasked, TaskEnv
-
-
-def at_four(obs: Any) -> Any:
-    return obs[:, PLACE] == 4
 
 
 def door_open(step: Any) -> Any:
@@ -128,15 +124,6 @@ def test_what_cannot_be_planned_is_refused(run: Run, log: CallLog, tmp_path: Pat
         agent.log_calls(10)
 
 
-class InDict(gym.ObservationWrapper):  # type: ignore[type-arg]
-    observation_space = gym.spaces.Dict(
-        {"door": gym.spaces.Discrete(2), "at": gym.spaces.Box(0, 9, (1,))}
-    )
-
-    def observation(self, obs: Any) -> Any:
-        return {"at": obs[:1], "door": int(obs[DOOR])}
-
-
 def test_the_environment_of_a_task_by_hand() -> None:
     """Each step is judged on the observation before and after; a goal, and parts of a dict."""
 
@@ -212,7 +199,6 @@ def test_tasks_and_skills_go_by_the_environments_own_reward_and_success() -> Non
     [
         ("exploring", "'random', 'explore', an Explorer"),
         (Explorer, "'random', 'explore', an Explorer"),
-        (sw.Automaton, "'random', 'explore', an Explorer"),
         (always(1), "among 4 skills"),
         (lambda obs: ["nobody"] * len(obs), "nobody"),
     ],

@@ -18,10 +18,12 @@ from ready_selectors.chain import (
     SPEC,
     Corridor,
     GetKey,
+    InDict,
     Leave,
     OpenDoor,
     Wait,
     always,
+    at_four,
     bound,
     has_key,
     hierarchy,
@@ -42,10 +44,6 @@ from skillweave.skills import ready_policy
 from skillweave.skills.foreign_policy import fitted, made_up
 
 QUICK: dict[str, Any] = {"num_envs": 4, "n_steps": 32, "batch_size": 32, "update_epochs": 2}
-
-
-def at_four(obs: Any) -> Any:
-    return obs[:, PLACE] == 4
 
 
 def door_open(obs: Any) -> Any:
@@ -143,15 +141,6 @@ def test_what_cannot_start_from_a_plan_is_refused(planned: Run, tmp_path: Path) 
 
 
 # Observations with the task's state
-
-
-class InDict(gym.ObservationWrapper):  # type: ignore[type-arg]
-    observation_space = gym.spaces.Dict(
-        {"door": gym.spaces.Discrete(2), "at": gym.spaces.Box(0, 9, (1,))}
-    )
-
-    def observation(self, obs: Any) -> Any:
-        return {"at": obs[:1], "door": int(obs[DOOR])}
 
 
 class Renamed(InDict):

@@ -94,6 +94,17 @@ class Wait(Skill):
     policy = always(1)
 
 
+class InDict(gym.ObservationWrapper):  # type: ignore[type-arg]
+    """Shows the place and the door, each by a name."""
+
+    observation_space = gym.spaces.Dict(
+        {"door": gym.spaces.Discrete(2), "at": gym.spaces.Box(0, 9, (1,))}
+    )
+
+    def observation(self, obs: Any) -> Any:
+        return {"at": obs[:1], "door": int(obs[DOOR])}
+
+
 NAMES = ("get_key", "open_door", "leave", "wait")
 
 
@@ -103,6 +114,10 @@ def has_key(obs: Array) -> Array:
 
 def got_key(step: Step) -> Array:
     return step.next_obs[:, KEY] == 1
+
+
+def at_four(obs: Array) -> Array:
+    return obs[:, PLACE] == 4
 
 
 def bound(selector: Any, names: tuple[str, ...] = NAMES) -> Any:

@@ -41,9 +41,7 @@ def test_numbers_and_names_choose_the_same(function):
 
 WRONG = {
     "a number out of range": (lambda obs: np.full(len(obs), 4), r"returned 4, which is no action"),
-    "a negative number": (lambda obs: np.full(len(obs), -1), "returned -1"),
     "a wrong shape": (lambda obs: np.zeros((len(obs), 1), int), r"returned shape \(1, 1\)"),
-    "one name": (lambda obs: "get_key", r"returned shape \(\)"),
     "None": (lambda obs: [None] * len(obs), "names None, which is no skill"),
     "an error": (lambda obs: obs[:, 99], "IndexError"),
     "one that may not start": (

@@ -155,7 +155,6 @@ def test_a_ready_selector_takes_no_steps():
 
 WRONG = {
     "a class": (lambda: declare(Automaton), "selector is <class.*an Automaton or a tree"),
-    "text": (lambda: declare("get_key"), "selector is 'get_key'.*an Automaton or a tree"),
     "a target": (lambda: declare(by_rule, target_return=1.0), "selector is ready"),
     "an unknown skill": (lambda: declare(tree.Sequence("walk")), "leaf names 'walk'"),
     "a wrong choice": (

@@ -44,17 +44,14 @@ TWICE = Leaf("a")
 X = {"x": ("a", "b")}
 WRONG = {
     "no skill": (lambda: asked(()), r"different names, not \(\)"),
-    "two skills of a name": (lambda: asked(("a", "a")), "different names"),
     "goals of no skill": (lambda: asked(ABC, {"d": NEAR}), "goals names 'd', which is no skill"),
     "no state": (lambda: automaton({}), "start names the state 'x', which does not exist"),
     "a state without a skill": (lambda: automaton({"x": ()}), "state 'x' has no skill"),
     "a state's skill": (lambda: automaton({"x": ("d",)}), "state 'x' names 'd', which is no"),
-    "the first state": (lambda: automaton(X, start="y"), "start names the state 'y'.*are: x"),
     "from no state": (
         lambda: automaton(X, (("y", "x", "success"),)),
         r"transition \('y', 'x'\) names the state 'y', which does not exist; the states are: x",
     ),
-    "to no state": (lambda: automaton(X, (("x", "y", first),)), "names the state 'y'"),
     "an event": (
         lambda: automaton(X, (("x", "x", "won"),)),
         "has the event 'won'; give a function",

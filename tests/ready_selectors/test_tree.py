@@ -135,7 +135,6 @@ def test_a_tree_that_ends_without_a_skill_says_where():
 WRONG = {
     "no children": (lambda: tree.Sequence(), "Sequence has no children"),
     "a number as a child": (lambda: tree.Fallback("a", 3), "Fallback has the child 3"),
-    "a list as a child": (lambda: tree.Sequence(["a"]), r"has the child \['a'\]"),
     "a class as a child": (lambda: tree.Sequence(tree.Fallback), "has the child <class"),
     "memory": (lambda: tree.Sequence("a", memory=1), "memory is 1"),
     "no skill": (lambda: made(tree.Sequence(flag(0))), "tree has no skill"),

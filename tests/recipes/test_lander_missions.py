@@ -7,6 +7,7 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
+from toys import SideBySide
 
 from benchmarks.pay.lander_missions import suite
 from skillweave import Apart, EnvSpec, Selection, Step
@@ -116,26 +117,9 @@ class Film(gym.Env):
         return lander(place), reward, end and reward > 0, end and reward < 0, {}
 
 
-class Films:
-    """The same as a pool."""
-
-    observation_space, action_space = Film.observation_space, Film.action_space
-
-    def __init__(self, n):
-        self.films = [Film(i) for i in range(n)]
-
-    def reset(self, ids):
-        return np.stack([self.films[i].reset()[0] for i in ids]), {}
-
-    def step(self, action, ids):
-        rows = [self.films[i].step(int(a)) for i, a in zip(ids, action, strict=True)]
-        obs, reward, terminated, truncated, _ = zip(*rows, strict=True)
-        return np.stack(obs), np.array(reward), np.array(terminated), np.array(truncated), {}
-
-
 def test_a_pool_and_single_landers_are_the_same_for_the_same_flights():
     n, legs, rng = 6, missions.MISSIONS["any"], np.random.default_rng(1)
-    pool = world.MissionPool(Films(n), legs, True, n, seed=0)
+    pool = world.MissionPool(SideBySide([Film(i) for i in range(n)]), legs, True, n, seed=0)
     pool._rngs = [np.random.default_rng(100 + i) for i in range(n)]
     alone = [world.Mission(Film(i), legs, gusts=True) for i in range(n)]
     obs, _ = pool.reset(np.arange(n))
@@ -159,7 +143,7 @@ def test_a_pool_and_single_landers_are_the_same_for_the_same_flights():
             begun = pool.reset(ended)[0]
             np.testing.assert_array_equal(begun, [alone[i].reset()[0] for i in ended])
     assert paid > 3.0
-    assert [film.actions for film in pool.pool.films] == [env.env.actions for env in alone]
+    assert [film.actions for film in pool.pool.envs] == [env.env.actions for env in alone]
 
 
 def step_of(before, after, action=0, terminated=False):

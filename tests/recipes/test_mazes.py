@@ -11,7 +11,7 @@ import torch
 
 from skillweave import Step
 from skillweave.errors import DeclarationError, MissingExtra
-from skillweave.recipes import _mazes as world, mazes
+from skillweave.recipes import _mazes as world, mazes, pick_and_place
 
 CORNER = np.array(
     [[1, 1, 1, 1, 1], [1, 0, 0, 0, 1], [1, 1, 1, 0, 1], [1, 0, 0, 0, 1], [1] * 5], bool
@@ -128,10 +128,11 @@ def test_a_maze_that_there_is_not_is_refused():
         mazes.declare("moon")
 
 
-def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
+@pytest.mark.parametrize("recipe", [mazes, pick_and_place])
+def test_a_missing_extra_is_named_before_anything_is_trained(recipe, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     with pytest.raises(MissingExtra, match=r"skillweave\[robotics\]"):
-        mazes.declare().train(tmp_path / "run", quiet=True)
+        recipe.declare().train(tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import gymnasium as gym
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from skillweave import Apart, Step
-from skillweave.errors import MissingExtra
 from skillweave.recipes import _arm as world, pick_and_place as arm
 
 
@@ -112,13 +110,6 @@ def test_recovering_is_paid_by_progress_to_the_block():
     assert skill.reward(step(after, there)) == pytest.approx(10 * 0.2 + 1.0)
     assert skill.termination(step(after, there))
     assert not skill.termination(step(before, after))
-
-
-def test_a_missing_extra_is_named_before_anything_is_trained(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
-    with pytest.raises(MissingExtra, match=r"skillweave\[robotics\]"):
-        arm.declare().train(tmp_path / "run", quiet=True)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture

@@ -133,9 +133,7 @@ def test_recipes_of_one_name_do_not_replace_one_another(write: Write) -> None:
     ("text", "says"),
     [
         ("x = 1\ny = x +\n", r"bad.py raised SyntaxError: invalid syntax \(bad.py, line 2\)$"),
-        ("x = 1\ny = z\n", r"NameError: name 'z' is not defined \(bad.py, line 2\)$"),
         ("import nowhere_to_be_found", r"No module named 'nowhere_to_be_found' \(bad.py, line 1\)"),
-        ("import json\njson.loads('{')", r"JSONDecodeError: .* \(bad.py, line 2\)$"),
         (
             "import skillweave as sw\n\nsw.PPO(gamma=9)",
             r"bad.py: .*gamma is 9.* \(bad.py, line 3\)$",

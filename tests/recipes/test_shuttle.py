@@ -7,6 +7,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from toys import SideBySide
 
 from benchmarks.pay.shuttle import POINTS, suite as shuttle_suite
 from skillweave import SkillweaveError, Step
@@ -141,27 +142,9 @@ def test_its_name_says_how_x_is_seen_so_that_runs_that_saw_metres_are_refused():
     assert shuttle.declare().spec.name == "Shuttle(2, -2; log x)"
 
 
-class Runners:
-    """Two ``Runner`` side by side, as a pool."""
-
-    observation_space, action_space = Runner.observation_space, Runner.action_space
-
-    def __init__(self, *places):
-        self.envs = [Runner(p) for p in places]
-
-    def reset(self, ids):
-        return np.stack([self.envs[i].reset()[0] for i in ids]), {}
-
-    def step(self, action, ids):
-        told = [self.envs[i].step(a) for i, a in zip(ids, action, strict=True)]
-        obs, reward, terminated, truncated, infos = zip(*told, strict=True)
-        info = {k: np.array([i[k] for i in infos]) for k in infos[0]}
-        return np.stack(obs), *map(np.array, (reward, terminated, truncated)), info
-
-
 def test_a_pool_of_patrols_sees_and_pays_as_each_patrol_alone():
     points, places = (2.0, 6.0, -2.0), ([3.0, 7.0, -3.0, 3.0], [1.0, 3.0, 5.0, 7.0])
-    pool = cheetah.Patrols(Runners(*places), 2, points)
+    pool = cheetah.Patrols(SideBySide([Runner(p) for p in places]), 2, points)
     alone = [cheetah.Patrol(Runner(p), points) for p in places]
     seen = pool.reset(np.arange(2))[0]
     np.testing.assert_array_equal(seen, [env.reset()[0] for env in alone])

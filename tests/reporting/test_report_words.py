@@ -277,10 +277,9 @@ def test_names_come_from_the_spec_the_environment_or_gymnasium() -> None:
     assert names == ("cart position", "cart speed", "pole angle", "pole angular speed")
 
 
-@pytest.mark.parametrize("names", ["xy", ["x", 3], ["x", "x"], {"place": "x"}, 5])
-def test_wrong_names_are_refused(names: Any) -> None:
+def test_a_name_is_given_once() -> None:
     with pytest.raises(DeclarationError, match="obs_names"):
-        EnvSpec(Walkway, obs_names=names)
+        EnvSpec(Walkway, obs_names=["x", "x"])
 
 
 def test_known_names_are_as_many_as_the_numbers_of_an_observation() -> None:

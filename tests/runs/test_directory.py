@@ -401,17 +401,8 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
     ("change", "says"),
     [
         (lambda m: m.update(stages=5), "stages is 5; it must be a list"),
-        (
-            lambda m: m["stages"][0].update(status=5),
-            "stages[0].status is 5; it must be one of wait",
-        ),
         (lambda m: m["stages"][0].pop("status"), "damaged: stages[0] has no field 'status'"),
         (lambda m: m["stages"][0].update(learns=[]), "stages[0].learns is []; it must be at least"),
-        (lambda m: m["stages"][0].update(kind="x"), "stages[0].kind is 'x'; it must be one of ag"),
-        (
-            lambda m: m["stages"][0].update(target={"of": "return", "at_least": None}),
-            "stages[0].target.at_least is None; it must be a finite number",
-        ),
         (lambda m: m.pop("hierarchy"), "stages has 2 entries, but a plain agent has one"),
         (lambda m: m["stages"][0].update(status="done"), "stages[0] is done, but has no field 's"),
         (lambda m: m["stages"][1].update(name="landing"), "stages[1].name is 'landing', a second"),
@@ -424,8 +415,6 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
             lambda m: m.update(checkpoint_every=[[]]),
             "checkpoint_every is [[]]; it must be a whole number",
         ),
-        (lambda m: m.update(checkpoint_every=0), "checkpoint_every is 0; it must be at least 1"),
-        (lambda m: m.update(seed=-1), "seed is -1; it must be at least 0"),
         (lambda m: m.update(keep="x" * 10_000), "keep is 'xxx"),
         (
             lambda m: m["hierarchy"].update(call_steps=0),
@@ -435,10 +424,6 @@ def write_manifest(run: RunDirectory, change: Any) -> None:
         (
             lambda m: m["stages"][0]["algorithm"].update(gamma="a"),
             "stages[0].algorithm.gamma is 'a'; it must be a number, between 0 and 1",
-        ),
-        (
-            lambda m: m["stages"][0]["algorithm"].update(gamma=2.0),
-            "stages[0].algorithm.gamma is 2.0; it must be between 0 and 1",
         ),
         (
             lambda m: m["stages"][0]["algorithm"]["network"].update(hidden=[[]]),

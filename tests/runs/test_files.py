@@ -203,11 +203,9 @@ def test_json_comes_back_as_it_went_with_its_schema(tmp_path: Path) -> None:
 DAMAGED_JSON = {
     "empty": b"",
     "cut off": b'{"schema": 1, "seed": 0, "pha',
-    "not JSON": b"hello",
     "not UTF-8": b'{"schema": 1, "x": "\xff\xfe"}',
     "a list": b"[1, 2]",
     "no schema": b'{"seed": 0}',
-    "a schema that is no number": b'{"schema": "one"}',
     "a newer schema": json.dumps({"schema": SCHEMA + 1}).encode(),
 }
 

@@ -68,15 +68,9 @@ def link(place: Path, target: Path) -> None:
     ("name", "target"),
     [
         ("metrics.jsonl", "thesis.txt"),
-        ("lineage.jsonl", "thesis.txt"),
         (".lock", "thesis.txt"),
         ("run.json.tmp", "not-there"),
         ("policies", ""),
-        ("final", ""),
-        ("starts", ""),
-        ("states", ""),
-        ("tensorboard", ""),
-        ("wandb", ""),
         ("plots/deeper/notes", "thesis.txt"),
     ],
 )

@@ -14,6 +14,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete
 
 import skillweave as sw
+from skillweave.skills.foreign_policy import fitted
 from skillweave.types import Array
 
 SPACE = Dict(
@@ -40,6 +41,20 @@ def observations(n: int, steps: int, seed: int = 0) -> list[Array]:
         obs["arm"]["grip"] = rng.integers(0, 3, n)
         found.append(obs)
     return found
+
+
+def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
+    """Return the policy, bound to the robot's spaces or others."""
+    return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
+
+
+def one(obs: Array, i: int) -> dict[str, Any]:
+    """An observation as an environment returns it."""
+    return {
+        "gyro": obs["gyro"][i],
+        "state": obs["state"][i],
+        "arm": {"joints": obs["arm"]["joints"][i], "grip": obs["arm"]["grip"][i]},
+    }
 
 
 class Source:

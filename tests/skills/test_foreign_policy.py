@@ -149,7 +149,7 @@ def test_a_zip_is_not_opened_without_trust(tmp_path, trust):
     pytest.importorskip("stable_baselines3")
     mark = tmp_path / "mark"
     path = poisoned(tmp_path / "evil.zip", mark)
-    with pytest.raises(SkillweaveError, match=r"evil.zip was not opened.*pickle.*trust=True"):
+    with pytest.raises(PolicyError, match=r"evil.zip was not opened.*pickle.*trust=True"):
         from_sb3(path, "ppo", **trust)
     assert not mark.exists()
     from_sb3(path, "ppo", trust=True)  # else the test would not show anything

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cloudpickle
 import numpy as np
 import pytest
-from skills.mapped_models import ACTION, CASES, SPACE, Case, observations
-
-from skillweave.skills.foreign_policy import fitted
-from skillweave.types import Array
+from skills.mapped_models import CASES, Case, fit, observations, one
 
 
 @pytest.fixture(scope="module")
@@ -19,19 +14,6 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     pytest.importorskip("stable_baselines3")
     folder = tmp_path_factory.mktemp("mapped")
     return {name: make(folder) for name, make in CASES.items()}
-
-
-def fit(policy: Any, space: Any = SPACE, action: Any = ACTION) -> Any:
-    return fitted(policy, space, action, "skill 'walk'", "Robot-v0")
-
-
-def one(obs: Array, i: int) -> dict[str, Any]:
-    """An observation as an environment returns it."""
-    return {
-        "gyro": obs["gyro"][i],
-        "state": obs["state"][i],
-        "arm": {"joints": obs["arm"]["joints"][i], "grip": obs["arm"]["grip"][i]},
-    }
 
 
 @pytest.mark.parametrize("name", CASES)

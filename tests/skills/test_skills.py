@@ -9,7 +9,6 @@ from skillweave.messages import short
 from skillweave.policies.core import Policy
 from skillweave.policies.parts import Reflexes
 from skillweave.policies.spaces import space_of
-from skillweave.schema import Count, fitted
 from skillweave.skills import Reflex, Skill, asked, from_function
 from skillweave.skills.outputs import checked
 from skillweave.types import Step
@@ -59,25 +58,6 @@ def test_a_skill_knows_which_methods_it_defines_also_by_inheritance():
     assert [m for m in Skill.methods if Derived().defines(m)] == ["termination"]
 
 
-@pytest.mark.parametrize(
-    ("attribute", "value", "says"),
-    [
-        ("name", "", "set the class attribute 'name'"),
-        ("name", "../secret", "names files"),
-        ("name", "a b", "names files"),
-        ("name", "x" * 65, "at most 64"),
-        ("max_steps", 0, "max_steps is 0"),
-        ("max_steps", 2.5, r"max_steps is 2\.5"),
-        ("steps", -1, "steps is -1"),
-    ],
-)
-def test_a_wrong_declaration_names_the_class_and_the_field(attribute, value, says):
-    skill = LandSafely()
-    setattr(skill, attribute, value)
-    with pytest.raises(SkillweaveError, match=f"LandSafely.*{says}"):
-        skill.validate()
-
-
 OBS = np.array([[0.0], [1.0], [2.0]])
 
 
@@ -118,14 +98,6 @@ def test_a_reflex_is_named_after_its_condition():
         reflex.apply(OBS, np.zeros(3, int), space_of(Discrete(2)))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_number_that_is_not_finite_names_who_what_when_and_where(bad):
-    with pytest.raises(
-        SkillweaveError, match=rf"skill x: reward\(\).*{bad} at step 7.*environment 1"
-    ):
-        checked([0.0, bad], 2, np.float32, "skill x: reward()", 7)
-
-
 @pytest.mark.filterwarnings("ignore:overflow")
 def test_a_number_too_large_for_float32_is_not_finite_either():
     with pytest.raises(SkillweaveError, match=r"skill x: reward\(\)"):
@@ -137,12 +109,6 @@ def test_a_reward_too_large_to_be_squared_is_refused(bad):
     says = r"skill x: reward\(\).*environment 1.*at most 1e\+15"
     with pytest.raises(SkillweaveError, match=says):
         checked([1e15, bad], 2, np.float32, "skill x: reward()", 7)
-
-
-@pytest.mark.parametrize("bad", [0.0, np.zeros(3), np.zeros((2, 1))], ids=["()", "(3,)", "(2, 1)"])
-def test_a_wrong_shape_is_named(bad):
-    with pytest.raises(SkillweaveError, match=r"reward\(\) returned shape \(.*at step 7.*\(2,\)"):
-        checked(bad, 2, np.float32, "skill x: reward()", 7)
 
 
 def test_numbers_are_cast():
@@ -167,9 +133,7 @@ def step_of(last: int = 2) -> Step:
     [
         ([[1.0], [1.0, 2.0]], "which is no array: ValueError"),
         (["a", "b"], r"returned <U1 \('a'\) at step 2, but rewards are real numbers"),
-        ([1j, 1.0], r"returned complex128 \(1j\) at step 2, but rewards are real numbers"),
         ([None, 1], "returned object .*real numbers"),
-        (np.zeros(2, "M8[s]"), "returned datetime64.*real numbers"),
     ],
 )
 def test_a_reward_of_another_kind_is_told(bad, says):
@@ -264,7 +228,6 @@ def test_observations_cannot_be_changed_either(function):
     ("action", "space", "says"),
     [
         ("up", Discrete(4), "whole numbers"),
-        (0.5, Discrete(4), "float64, but actions of.*whole numbers"),
         ([0.0, 1.0], Box(-1, 1, (3,)), r"shape \(1, 2\), but \(1, 3\)"),
         ([[0], [1, 2]], Box(-1, 1, (2,)), "no array"),
         (np.nan, Box(-1, 1, (1,)), "NaN"),
@@ -294,8 +257,6 @@ def test_a_reflex_is_a_function_with_a_name(condition, name, says):
     ("attribute", "value", "says"),
     [
         ("name", 5, "skill 5 .*name is 5; it must be a text"),
-        ("max_steps", True, "max_steps is True"),
-        ("steps", 1.0, "steps is 1.0"),
         ("reward", 3, "reward is 3; it must be a method"),
     ],
 )
@@ -317,15 +278,3 @@ def test_long_values_are_shortened_and_what_cannot_be_shown_is_named():
             raise RuntimeError
 
     assert short(Shy()) == "a Shy"
-
-
-@pytest.mark.parametrize("bad", [None, 1.5, "x", True, np.bool_(1), [1], np.nan])
-def test_what_is_no_whole_number_is_told(bad):
-    with pytest.raises(SkillweaveError, match=r"seed is .*; it must be a whole number"):
-        fitted(Count, bad, "seed")
-
-
-def test_whole_numbers_become_ints():
-    assert type(fitted(Count, np.int64(3), "seed")) is int
-    with pytest.raises(SkillweaveError, match="seed is -1; it must be at least 0"):
-        fitted(Count, -1, "seed")

@@ -14,7 +14,7 @@ from small_runs import OFF, ON, Balance, Left, Push, assert_same, lines
 
 import skillweave as sw
 from skillweave import Agent, Apart, EnvSpec, Hierarchy, SkillweaveError
-from skillweave.errors import Interrupted
+from skillweave.errors import DeclarationError, Interrupted
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
 from skillweave.types import TrainEvent
@@ -301,7 +301,7 @@ def generator(event: TrainEvent) -> Any:
 def test_what_is_no_callback_is_refused_before_anything_is_written(
     callback: Any, says: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(SkillweaveError, match=says):
+    with pytest.raises(DeclarationError, match=says):
         agent().train(tmp_path / "run", callback=callback)
     assert not (tmp_path / "run").exists()
     agent(64).train(tmp_path / "other", quiet=True)

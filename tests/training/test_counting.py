@@ -6,7 +6,6 @@ import pytest
 from declaring import plainly
 
 import skillweave as sw
-from skillweave.envs import engine as engines
 from skillweave.evolution import Evolution
 from skillweave.runs.directory import RunDirectory
 
@@ -40,19 +39,6 @@ class Late(sw.Skill):
 
 class Always(sw.Skill):
     """May start anywhere."""
-
-
-@pytest.fixture
-def made(monkeypatch):
-    """Counts the steps that Gymnasium's engines make."""
-    count, plain = [0], engines.GymnasiumEngine.step
-
-    def step(self, action, ids=None):
-        count[0] += len(action)
-        return plain(self, action, ids)
-
-    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
-    return count
 
 
 def reported(run: sw.Run) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,11 @@ from toys import (
     Broken,
     Calls,
     Countdown,
+    Cut,
     Echo,
     Identity,
     Steady,
-    copied,
+    goes_on,
     learn,
     training,
 )
@@ -40,10 +41,6 @@ SETTINGS: dict[str, Any] = {
     "network": Network((8,)),
 }  # fmt: skip
 CONFIG = DQN(**SETTINGS)
-
-
-class Stop(Exception):
-    pass
 
 
 class Spy(DQNAlgorithm):
@@ -252,43 +249,12 @@ KINDS = {
 @pytest.mark.parametrize("name", KINDS)
 def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights(name):
     config, kind = KINDS[name]
-    told: list[Tick] = []
-    _, whole = learn(config, kind(4), 500, on_tick=told.append)
-    saved: list[tuple[Progress, Any, Any]] = []
-
-    def stop_at_second(found: Saved) -> None:
-        saved.append((replace(found.at), copied(found.states[0]), found.extra))
-        if len(saved) == 2:
-            raise Stop
-
-    first: list[Tick] = []
-    with pytest.raises(Stop):
-        learn(
-            config, kind(4), 500, checkpoint_every=120, on_tick=first.append,
-            on_checkpoint=stop_at_second,
-        )  # fmt: skip
-    at, state, extra = saved[-1]
-    assert (at.update, at.steps) == (60 // kind.row_steps, 240)
     algorithm = make_algorithm(config, kind.observation_space, kind.action_space)
-
-    def resumed(extra: dict[str, torch.Tensor]) -> Any:
-        again = training(algorithm, kind(4), state=copied(state), goes_on_at=at.steps)
-        now = Progress(at.update, at.steps)
-        again.resume(extra, now)
-        ticks.clear()
-        how = {"checkpoint_every": 120, "on_checkpoint": lambda saved: None}
-        again.run(500, resume_from=now, on_tick=ticks.append, **how)
-        return again.state
-
-    ticks: list[Tick] = []
-    found = resumed(extra)
-    for f in fields(state):
-        assert torch.equal(getattr(found, f.name), getattr(whole, f.name)), f.name
-        assert getattr(found, f.name).dtype == getattr(algorithm.init([Seeds(0)]), f.name).dtype
-    assert [(t.steps, t.metrics) for t in first + ticks] == [(t.steps, t.metrics) for t in told]
+    whole, saved, resumed = goes_on(algorithm, lambda: kind(4), 500, 120)
+    assert (saved.at.update, saved.at.steps) == (60 // kind.row_steps, 240)
     # The store is part of it:
-    without = {k: v for k, v in extra.items() if not k.startswith("learner.store.")}
-    assert not torch.equal(resumed(without).params, whole.params)
+    without = {k: v for k, v in saved.extra.items() if not k.startswith("learner.store.")}
+    assert not torch.equal(resumed(without).state.params, whole.state.params)
 
 
 def test_a_resumed_run_without_its_store_fills_it_by_what_it_has_learnt():
@@ -365,9 +331,9 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back():
 
     def stop(tick: Tick) -> None:
         assert torch.get_num_threads() == 2
-        raise Stop
+        raise Cut
 
-    with pytest.raises(Stop):
+    with pytest.raises(Cut):
         learn(replace(CONFIG, threads=2), Identity(4), 80, on_tick=stop)
     assert torch.get_num_threads() == 1
 

@@ -37,6 +37,7 @@ from skillweave import (
 from skillweave.cli import main
 from skillweave.envs.engine import SyncEnvs
 from skillweave.envs.infos import info_numbers
+from skillweave.errors import EnvError
 from skillweave.evolution import Evolution
 from skillweave.hierarchy import training
 from skillweave.reporting.report.curves import read_curves
@@ -224,7 +225,7 @@ def test_an_info_that_is_empty_is_said_to_be(tmp_path: Path) -> None:
 def test_a_key_that_is_no_number_stops_the_training(
     workers: int, key: str, what: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(SkillweaveError, match=rf"info\['{key}'\] is {what} at the end of an ep"):
+    with pytest.raises(EnvError, match=rf"info\['{key}'\] is {what} at the end of an ep"):
         Agent(spec(workers), ON, 320).train(tmp_path / "run", quiet=True, log_info=[key])
 
 

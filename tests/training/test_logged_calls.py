@@ -242,7 +242,6 @@ def test_environments_in_a_pool(tmp_path: Path) -> None:
 
 REFUSED: Any = [
     ({"log_calls": 0}, "log_calls is 0"),
-    ({"log_calls": True}, "log_calls is True"),
     ({"log_calls": 10**10}, "at most 4 GiB are recorded"),
     ({"log_calls_info": ["lean"]}, "set log_calls, too"),
     ({"log_calls": 50, "log_calls_info": "lean"}, "log_calls_info is 'lean'"),

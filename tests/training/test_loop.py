@@ -2,7 +2,7 @@
 
 import os
 import signal
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,13 +14,14 @@ from toys import (
     Calls,
     Clockwork,
     Countdown,
+    Cut,
     Identity,
     Masked,
     Recall,
     SeedsOfMember,
     Toy,
     Training,
-    copied,
+    goes_on,
     learn,
     training,
 )
@@ -32,7 +33,7 @@ from skillweave.collecting.acting import Acting
 from skillweave.collecting.group import Collectors
 from skillweave.collecting.processes import ProcessCollectors
 from skillweave.envs.make import EnvSpec, make_engine
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.networks.config import RNN, Network
 from skillweave.seeding import Seeds
 from skillweave.training.episodes import Episodes, Tick
@@ -406,10 +407,6 @@ def test_what_a_lost_worker_did_not_repeat_is_cut_before_rows_of_it_are_kept():
 # Checkpoints
 
 
-class Stop(Exception):
-    pass
-
-
 CUTS = {
     "ppo": (CONFIG, Identity),
     "ppo without overlap": (replace(CONFIG, overlap=False), Identity),
@@ -423,36 +420,9 @@ CUTS = {
 @pytest.mark.parametrize("name", CUTS)
 def test_a_run_resumed_at_a_checkpoint_ends_with_the_very_same_weights_and_metrics(name):
     config, env = CUTS[name]
-    rollout, told, saved = 256, [], []
-    whole = made(env(16), config)
-    whole.run(10 * rollout, on_tick=told.append)
-
-    def stop_at_second(found: Saved) -> None:
-        saved.append((replace(found.at), copied(found.states[0]), found.extra))
-        if len(saved) == 2:
-            raise Stop
-
-    stopped, first = made(env(16), config), []
-    with pytest.raises(Stop):
-        stopped.run(
-            10 * rollout,
-            checkpoint_every=3 * rollout,
-            on_tick=first.append,
-            on_checkpoint=stop_at_second,
-        )
-    at, state, extra = saved[-1]
-    assert (at.update, at.steps) == (6, 6 * rollout)
-    algorithm, again = PPOAlgorithm(config, env.observation_space, env.action_space), []
-    resumed = training(algorithm, env(16), state=state, goes_on_at=at.steps)
-    at = Progress(at.update, at.steps)
-    assert not len(resumed.resume(extra, at))
-    how = {"checkpoint_every": 3 * rollout, "on_checkpoint": lambda saved: None}
-    resumed.run(10 * rollout, resume_from=at, on_tick=again.append, **how)
-    for f in fields(State):
-        assert torch.equal(getattr(resumed.state, f.name), getattr(whole.state, f.name)), f.name
-    assert [(t.update, t.steps, t.metrics) for t in first + again] == [
-        (t.update, t.steps, t.metrics) for t in told
-    ]
+    algorithm, rollout = PPOAlgorithm(config, env.observation_space, env.action_space), 256
+    _, saved, _ = goes_on(algorithm, lambda: env(16), 10 * rollout, 3 * rollout)
+    assert (saved.at.update, saved.at.steps) == (6, 6 * rollout)
 
 
 def test_reported_returns_and_lengths_are_those_of_whole_episodes():
@@ -489,7 +459,7 @@ def test_a_checkpoint_of_other_environments_is_refused():
 @pytest.mark.parametrize("overlap", [True, False])
 def test_learning_that_diverges_is_an_error_that_says_what_where_and_when(on_tick, overlap):
     with pytest.raises(
-        SkillweaveError, match=r"of member 0 is nan at update 1: training has diverged"
+        TrainingError, match=r"of member 0 is nan at update 1: training has diverged"
     ):
         train(Broken(16), 3, replace(CONFIG, overlap=overlap), on_tick=on_tick)
 
@@ -531,8 +501,8 @@ def test_the_callback_may_stop_the_run_and_threads_are_given_back(overlap):
     torch.set_num_threads(1)
 
     def stop(tick: Tick) -> None:
-        raise Stop
+        raise Cut
 
-    with pytest.raises(Stop):
+    with pytest.raises(Cut):
         train(Identity(16), 5, replace(CONFIG, threads=2, overlap=overlap), on_tick=stop)
     assert torch.get_num_threads() == 1

@@ -18,7 +18,6 @@ from skillweave import (
     Hierarchy,
     Network,
     Skill,
-    SkillweaveError,
     TrainDefaults,
 )
 from skillweave.algorithms.policy import AgentPolicy, make_algorithm
@@ -140,17 +139,3 @@ def test_a_run_is_evaluated_at_every_level_and_that_changes_nothing(tmp_path, al
         weights.append(read_tensors(run.path / "policies" / "selector.safetensors")[0])
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(v, weights[1][k]) for k, v in weights[0].items())
-
-
-def test_a_wrong_number_is_named():
-    with pytest.raises(SkillweaveError, match="eval_every is 0"):
-        Hierarchy(
-            "CartPole-v1", [Balance()], train_defaults=TrainDefaults(eval_every=0), learn="apart"
-        )
-    with pytest.raises(SkillweaveError, match="eval_episodes is None"):
-        Hierarchy(
-            "CartPole-v1",
-            [Balance()],
-            train_defaults=TrainDefaults(eval_episodes=None),
-            learn="apart",
-        )

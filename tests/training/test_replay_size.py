@@ -4,7 +4,7 @@ import pytest
 from declaring import plainly
 
 from skillweave import DQN, SAC, Apart, Hierarchy, Network, train_agent
-from skillweave.errors import SkillweaveError
+from skillweave.errors import SkillweaveError, TrainingError
 from skillweave.evolution import Evolution
 from skillweave.skills import Skill
 
@@ -34,7 +34,7 @@ def test_a_hierarchy_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_pat
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
 def test_an_agent_whose_buffer_is_larger_than_the_memory_makes_no_run(tmp_path, env):
-    with pytest.raises(SkillweaveError, match=r"stage 'agent': .*lower buffer_size"):
+    with pytest.raises(TrainingError, match=r"stage 'agent': .*lower buffer_size"):
         train_agent(env, SAC(**HUGE), 100, tmp_path / "run", quiet=True)
     assert list(tmp_path.iterdir()) == []
 

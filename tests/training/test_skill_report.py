@@ -21,6 +21,7 @@ from reference_calls import (
     scripted,
     shy,
 )
+from toys import skills_of
 
 from skillweave import EnvSpec, Skill, evaluate
 from skillweave.collecting.skill_set import SkillSet
@@ -163,7 +164,7 @@ def test_by_hand_a_call_that_the_step_limit_cuts_ends_with_the_episode(limit, cu
     always = ScriptedPolicy(
         lambda obs: np.zeros(len(obs), int), Walk.observation_space, Discrete(2)
     )
-    policy = HierarchyPolicy(always, SkillSet(skills, tuple(s.policy for s in skills)))
+    policy = HierarchyPolicy(always, skills_of(*skills))
     found = evaluate(policy, EnvSpec(Endless), episodes=2, max_steps=limit)
     calls = 2 * (2 + cut)
     ended = NONE | {"limit": 4, "episode": 2 * cut}
@@ -218,7 +219,7 @@ class Move(Steady):
 
 def told(choose, *kinds, call_steps=50):
     skills = tuple(k() for k in kinds)
-    whole = SkillSet(skills, tuple(s.policy for s in skills), call_steps=call_steps)
+    whole = skills_of(*skills, call_steps=call_steps)
     selector = ScriptedPolicy(choose, Walk.observation_space, Discrete(len(kinds)))
     policy = HierarchyPolicy(selector, whole)
     return policy, evaluate(policy, EnvSpec(Walk), episodes=20)

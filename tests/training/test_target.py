@@ -26,7 +26,6 @@ from skillweave import (
     TrainDefaults,
     train_agent,
 )
-from skillweave.envs import engine as engines
 from skillweave.evolution import Evolution
 from skillweave.evolution.plan import plan
 from skillweave.hierarchy import training
@@ -69,19 +68,6 @@ class Start(Skill):
 
 
 WALK = EnvSpec(Walk, engine="sync")
-
-
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Counts the steps that Gymnasium's engines make."""
-    count, plain = [0], engines.GymnasiumEngine.step
-
-    def step(self: Any, action: Any, ids: Any = None) -> Any:
-        count[0] += len(action)
-        return plain(self, action, ids)
-
-    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
-    return count
 
 
 @pytest.mark.fast_cases(1)
@@ -222,17 +208,6 @@ def test_a_population_ends_at_its_stages_target(tmp_path: Path) -> None:
     ("settings", "says"),
     [
         ({"target_return": 1.0}, "stage 'agent': it has a target_return, .*set eval_every"),
-        ({"target_return": "x", "eval_every": 9}, r"Agent\.target_return is 'x'; it must be a"),
-        ({"target_return": float("nan"), "eval_every": 9}, "target_return is nan"),
-        (
-            {"target_return": -1e200, "eval_every": 9},
-            "target_return is -1e.200; .*above -3",
-        ),
-        ({"target_return": 10**400, "eval_every": 9}, r"Agent\.target_return is .*below 2\^63"),
-        (
-            {"target_success": 2, "eval_every": 9},
-            "target_success is 2; it must be more than 0",
-        ),
         (
             {"target_success": 0.5, "target_return": 1.0, "eval_every": 9},
             "target_return or target_success, not both",

@@ -1,0 +1,22 @@
+"""What tests of several stages share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from skillweave.envs import engine as engines
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts the steps that Gymnasium's engines make."""
+    count, plain = [0], engines.GymnasiumEngine.step
+
+    def step(self: Any, action: Any, ids: Any = None) -> Any:
+        count[0] += len(action)
+        return plain(self, action, ids)
+
+    monkeypatch.setattr(engines.GymnasiumEngine, "step", step)
+    return count
